@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent
 
 
 class BuildWithAddon(build_py):
-    """Copies ``addon/`` to ``limber/scene/addon/``; a checkout, also an editable one, has it."""
+    """Copies ``addon/`` to ``limber/results/scene/addon/``; a checkout has it."""
 
     def run(self):
         super().run()
@@ -23,7 +23,7 @@ class BuildWithAddon(build_py):
         if not sources:
             raise FileNotFoundError("The folder addon/ is not beside setup.py; the wheel needs it.")
         for source in sources:
-            target = Path(self.build_lib, "limber", "scene", "addon",
+            target = Path(self.build_lib, "limber", "results", "scene", "addon",
                           source.relative_to(ROOT / "addon"))
             self.mkpath(str(target.parent))
             self.copy_file(str(source), str(target))

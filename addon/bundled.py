@@ -16,6 +16,6 @@ if __name__ == "__main__":
     searched = [own_numpy, folder] if os.path.isdir(own_numpy) else [folder]
     os.environ["PYTHONPATH"] = os.pathsep.join(searched)
     sys.path[:1] = searched
-    from limber.cli import run
+    from limber.cli.main import run
 
     run()

@@ -16,7 +16,7 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 
 _LINES = 20_000
 """Lines of text that are read at a stretch: numpy holds the interpreter meanwhile."""
-# The worker's, of limber.geometry.cloud.text: the add-on reads files also where it has no worker.
+# The worker's, of limber.geometry.io.text_clouds: the add-on reads files also without a worker.
 _AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("pos_x", "pos_y", "pos_z"),
          ("easting", "northing", "height"), ("easting", "northing", "elevation"),
          ("easting", "northing", "altitude"), ("easting", "northing", "z"))

@@ -38,7 +38,8 @@ def _load_addon():
 def _end_with_parent() -> None:
     """End when whoever started this does: `limber` then closes our standard input.
 
-    The core says so by LIMBER_PARENT_PIPE; see limber.jobs.ending, which Blender's Python lacks.
+    The core says so by LIMBER_PARENT_PIPE; see limber.core.processes.ending, which Blender's
+    Python lacks.
     """
     if os.environ.pop("LIMBER_PARENT_PIPE", None) != "stdin":
         return

@@ -53,7 +53,7 @@ class SceneDataError(ValueError):
 
 @dataclass(frozen=True)
 class SceneData:
-    """Arrays by name, and what they are; the worker's limber.scene.data names them all."""
+    """Arrays by name, and what they are: limber.results.scene.contents names them all."""
 
     arrays: dict[str, np.ndarray]
     info: dict[str, Any]

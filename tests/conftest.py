@@ -10,7 +10,7 @@ import pytest
 from tests.subjects.meshes import box_mesh
 
 from benchmarks.paper_branches import Bench, PaperBranch, exact_pull
-from limber.estimation.virtual_pull import TrueBranch
+from limber.estimation.simulated_pull import TrueBranch
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.recordings.recording import (
     GraspEntry,
@@ -94,8 +94,8 @@ def plain_pull() -> Pull:
 @pytest.fixture(scope="session")
 def branch_template(tmp_path_factory, small, small_bench):
     """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
-    from limber.estimation.virtual_pull import VirtualPullSettings
-    from limber.stages.virtual_pull import virtual_pull
+    from limber.estimation.simulated_pull import VirtualPullSettings
+    from limber.stages.pulls.virtual_pull import virtual_pull
     from limber.store import Branch
 
     folder = tmp_path_factory.mktemp("branches") / "small.branch"

@@ -9,7 +9,7 @@ from benchmarks import table
 from benchmarks.budget import Budget, parsed_seconds, side_by_side
 from benchmarks.kept_trials import Numbers, numbers_of
 from benchmarks.table import Asked, Part, Row, Setting, allowance, rows_of, share_met
-from limber.progress import SILENT
+from limber.core.progress import SILENT
 
 
 class Clock:

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.batch.job_file import read_jobs
+from limber.batch.jobs.job_file import read_jobs
 from limber.recordings.recording import read_pull
-from limber.stages.export_pull import export_pull
+from limber.stages.pulls.export_pull import export_pull
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = ROOT / "scripts" / "examples"

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limber.core.progress import Progress
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
-from limber.estimation.virtual_pull import TrueBranch, simulate_pull
+from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
+from limber.mechanics.pull_simulation import load_case_of, motion_of
 from limber.mechanics.settings import SimulateSettings
-from limber.mechanics.simulate import load_case_of, motion_of
-from limber.progress import Progress
-from limber.recordings.alignment import frames_of
-from limber.recordings.grasping import grasp_on
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, PullEntry
-from limber.stages.loading import load_branch, load_grasp_model, load_subject
+from limber.recordings.synchronisation import frames_of
 from limber.store import Branch
+from limber.store.loading import load_branch, load_grasp_model, load_subject
 
 MOVE = np.array([0.05, -0.03, -0.02])
 GRAVITY = (0.0, -6.0, -7.76)

@@ -1,7 +1,7 @@
 """The main job as a user does it: every stage by its command, on one small generated branch.
 
 The commands run in this process, which loads the kernels once; as processes they run where that is
-what is tested, here and in tests/planning/test_killed.py, tests/batch and tests/jobs.
+what is tested, here and in tests/planning/test_killed.py, tests/batch and tests/core/processes.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.cli import call
+from limber.cli.main import call
 from limber.store import Branch
 
 # The fixture runs the whole pipeline within the first test, so the usual limit is too short.

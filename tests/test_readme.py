@@ -11,7 +11,7 @@ import click
 import pytest
 
 from benchmarks.worker_readme import shown_commands
-from limber.cli import main
+from limber.cli.main import main
 
 README = Path(__file__).parents[1] / "README.md"
 

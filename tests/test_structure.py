@@ -125,30 +125,30 @@ CORE = ROOT / "worker" / "limber"
 
 # What may import what: a layer imports those before it, never one beside it or after it.
 LAYERS = (
-    ("version", "constants", "errors", "lazy", "threads", "compiled", "sparse", "alignment",
-     "heartbeat", "machine_errors", "names", "optional", "owner", "files", "reading", "caches",
-     "plain", "present", "progress", "settings", "terminal"),
-    ("jobs",),
-    ("store", "geometry"),
-    ("mechanics",), ("exports",),
-    ("recordings",),
+    ("version",),
+    ("core",),
+    ("geometry",),
+    ("mechanics",),
+    ("reduced", "recordings"),
     ("perception",),
     ("estimation", "planning", "robot"),
-    ("stages.loading",),
+    ("store",),
     ("session",),
-    ("report", "scene"),
+    ("results",),
     ("stages",),
-    ("options",),
-    ("batch", "closed_loop"),
+    ("batch",),
     ("cli",),
-    ("commands", "__main__"),
+    ("__main__",),
 )
-NUMERICAL = ("geometry", "mechanics", "recordings", "perception", "estimation", "planning")
+NUMERICAL = ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation", "planning")
 # The same between the parts of two packages; what is a plain file there is not ordered.
-PARTS = {"geometry": ("cloud", "skeleton", "surface", "tets"),
-         "mechanics": ("elements", "linear", "statics", "dynamics", "reduced"),
-         "estimation": ("forward", "doubt", "online"),
-         "planning": ("field", "bound", "planners")}
+PARTS = {"core": ("numerics", "files", "processes"),
+         "geometry": ("cloud", "skeleton", "surface", "tets"),
+         "mechanics": ("materials", "elements", "linear", "statics", "dynamics", "loads"),
+         "estimation": ("forward", "fitting", "uncertainty", "online"),
+         "planning": ("field", "goals", "constraints", "certificate", "planners"),
+         "robot": ("ur", "cell", "motion", "driver", "virtual"),
+         "results": ("exports", "scene", "report")}
 
 
 @functools.cache
@@ -247,19 +247,20 @@ def test_no_file_imports_itself_in_a_circle():
 
 
 # Lines between processes of ours, and lines that a killed program may have left half written.
-OWN_LINES = {"robot", "session", "jobs", "batch.records", "store.lock", "estimation.evaluations",
+OWN_LINES = {"robot", "session", "core.processes", "batch.records", "store.lock",
+             "estimation.fitting.evaluations",
              "geometry.tets.tetwild_process"}
 
 
 @pytest.mark.slow
 def test_files_come_in_through_one_door():
-    """JSON, TOML and arrays are read by limber.reading, which checks them, and nowhere else."""
+    """JSON, TOML and arrays are read by limber.core.files.reading, which checks them, alone."""
     doors = ("json.loads", "json.load", "tomllib.loads", "tomllib.load", "np.load",
              "np.genfromtxt", "np.fromfile", "pickle.load")
     wrong = []
     for path in CORE.rglob("*.py"):
         module = ".".join(path.relative_to(CORE).with_suffix("").parts)
-        if module == "reading" or any(
+        if module == "core.files.reading" or any(
                 module == name or module.startswith(name + ".") for name in OWN_LINES):
             continue
         wrong += [f"limber.{module}, line {line}: {name}" for line, name in source(path).calls
@@ -278,7 +279,7 @@ def test_numerical_packages_know_no_branch_folder():
 @pytest.mark.slow
 def test_only_stages_open_branch_folders():
     """Branch.open and Branch.create are called by stages, the session and the store alone."""
-    allowed = {"stages", "session", "store", "commands", "closed_loop"}
+    allowed = {"stages", "session", "store", "cli"}
     wrong = []
     for path in CORE.rglob("*.py"):
         if path.relative_to(CORE).parts[0] in allowed:

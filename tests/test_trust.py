@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.files import file_digest
-from limber.scene.data import scene_data
-from limber.settings import checked_settings
+from limber.core.errors import InputError
+from limber.core.files.atomic import file_digest
+from limber.core.settings import checked_settings
+from limber.results.scene.contents import scene_data
 from limber.store import Branch
 
 EXAMPLE = Path(__file__).parents[1] / "blend_files" / "bending_branch"
@@ -65,7 +65,7 @@ def test_files_of_noise(damaged, name):
 def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
     """`limber predict` and the report refuse it, and say where."""
     from limber.estimation.settings import PredictSettings
-    from limber.stages.predict import predict
+    from limber.stages.moduli.predict import predict
 
     branch = damaged("estimate.json", _changed("estimate.json", *path, value=value))
     with pytest.raises(InputError, match=r"estimate\.json"):
@@ -77,7 +77,7 @@ def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
     [{"mass_kg": 1, "attached_m": [0, 0, None]}], [{"mass_kg": 1, "attached_m": [0, 0]}]])
 def test_point_masses(damaged, content):
     """No negative mass, no place without three numbers."""
-    from limber.stages.loading import load_point_masses
+    from limber.store.loading import load_point_masses
 
     with pytest.raises(InputError, match=r"point_masses\.json"):
         load_point_masses(damaged("point_masses.json", json.dumps(content).encode()))
@@ -86,7 +86,7 @@ def test_point_masses(damaged, content):
 def test_a_mesh_whose_data_are_no_numbers(damaged):
     """A modulus of NaN, and a tetrahedron of a node that is not there."""
     from limber.geometry.tets.tet_mesh import TetMesh
-    from limber.stages.loading import load_mesh
+    from limber.store.loading import load_mesh
 
     mesh = TetMesh.read(EXAMPLE / "mesh.vtu")
     for wrong in (mesh.with_data(cell_data={"young": np.full(mesh.tet_count, np.nan)}),
@@ -122,7 +122,7 @@ def test_lists_of_a_recording_stay_in_its_folder(tmp_path):
     """A depth list that names a file elsewhere is refused; so are turns of length 0."""
     from PIL import Image
 
-    from limber.recordings.frames import copy_rgbd
+    from limber.recordings.image_folders import copy_rgbd
     from limber.recordings.settings import ImportSettings
 
     (tmp_path / "in" / "depth").mkdir(parents=True)

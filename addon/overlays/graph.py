@@ -1,6 +1,7 @@
 """A graph in the 3D view's lower right corner: Young's modulus along the branch, energy, force.
 
-The worker says where everything stands in the frame (``limber.scene.graphs``); here it is drawn.
+The worker says where everything stands in the frame (``limber.results.scene.graphs``); here it is
+drawn.
 """
 
 import blf

@@ -5,8 +5,8 @@
 
 import sys
 
-from limber.stages.loading import load_branch
 from limber.store import Branch
+from limber.store.loading import load_branch
 
 branch = load_branch(Branch.read(sys.argv[1]))
 grasp = branch.marked_grasp("pinned")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import limber
-from limber.cli import call
+from limber.cli.main import call
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.store import Branch

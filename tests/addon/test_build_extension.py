@@ -90,9 +90,9 @@ def test_the_workers_numpy_is_found_by_the_worker_alone(build, tmp_path):
     with zipfile.ZipFile(made) as archive:
         assert not [name for name in archive.namelist() if "tests" in name]
         archive.extractall(folder)
-    (folder / "limber").mkdir()
+    (folder / "limber" / "cli").mkdir(parents=True)
     (folder / "limber" / "__init__.py").touch()
-    (folder / "limber" / "cli.py").write_text(
+    (folder / "limber" / "cli" / "main.py").write_text(
         "import subprocess, sys\nimport numpy\n\n\ndef run():\n"
         "    print(numpy.__version__, flush=True)\n"
         "    subprocess.run([sys.executable, '-c', 'import numpy; print(numpy.__version__)'])\n")

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from tests.addon.test_panels import Layout
 
-from limber.cli import call
+from limber.cli.main import call
 
 pytestmark = pytest.mark.usefixtures("worker_here")
 

@@ -216,9 +216,9 @@ def test_the_worker_of_the_extensions_own_wheels(addon, tmp_path, monkeypatch):
     worker = importlib.import_module("limber_addon.worker")
     monkeypatch.delenv("LIMBER_PYTHON", raising=False)
     package = tmp_path / "limber"
-    package.mkdir()
+    (package / "cli").mkdir(parents=True)
     (package / "__init__.py").touch()
-    (package / "cli.py").write_text(
+    (package / "cli" / "main.py").write_text(
         "import os, sys\n\n\ndef run():\n    print(sys.argv[1:], os.environ['PYTHONPATH'])\n")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: importlib.machinery.ModuleSpec(
         name, None, origin=str(package / "__init__.py")))

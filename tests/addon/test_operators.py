@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.files import file_digest
-from limber.geometry.cloud.files import read_cloud
+from limber.core.files.atomic import file_digest
+from limber.geometry.io.clouds import read_cloud
 from limber.store import Branch
 
 POINTS = np.random.default_rng(7).random((40, 3)) * 300

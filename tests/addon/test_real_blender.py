@@ -129,7 +129,7 @@ def test_the_worker_comes_along(blender, tmp_path):
 @pytest.mark.slow
 def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
     """`limber scene` by this Blender; the file opens in it and its frames are right."""
-    from limber.cli import call
+    from limber.cli.main import call
 
     monkeypatch.setenv("LIMBER_SCENE_BLENDER", blender)
     scene = beam.folder.parent / "scene.blend"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tests.subjects.processes import left_alive
 
-from limber.cli import call
+from limber.cli.main import call
 
 ADDON = Path(__file__).parents[2] / "addon"
 
@@ -31,7 +31,7 @@ def positions(bpy):
 
 def _scene_in_process(addon, branch, path, bpy, motion=None):
     """Build the scene here, as the process of `limber scene` does, without rendering."""
-    from limber.scene.data import scene_data
+    from limber.results.scene.contents import scene_data
     from limber.store import Branch
 
     scenes = importlib.import_module("limber_addon.scene")
@@ -154,8 +154,8 @@ def test_a_motion_plays_in_its_own_time(bpy, addon, beam, write_pc2, positions, 
 
 def test_targets_go_with_the_branch(bpy, addon, beam, tmp_path):
     """A named target is a ball of that name that follows its place on the branch."""
-    from limber.mechanics.loaded import NamedTarget
-    from limber.scene.data import scene_data
+    from limber.mechanics.loads.loaded_branch import NamedTarget
+    from limber.results.scene.contents import scene_data
     from limber.store import Branch
 
     scenes = importlib.import_module("limber_addon.scene")
@@ -288,7 +288,7 @@ def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     """Frames of another mesh end the process with code 3 and a reason, not with a still branch."""
-    from limber.scene.data import scene_data
+    from limber.results.scene.contents import scene_data
     from limber.store import Branch
 
     scene_data(Branch.open(beam.folder)).write(tmp_path / "data.npz")
@@ -305,7 +305,7 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
     """
     from mathutils import Vector
 
-    from limber.scene.data import scene_data as data_of
+    from limber.results.scene.contents import scene_data as data_of
     from limber.store import Branch
 
     shown_data = data_of(Branch.open(beam.folder))

@@ -8,8 +8,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from limber.scene.arrays import FORMAT
-from limber.scene.data import scene_data
+from limber.results.scene.arrays import FORMAT
+from limber.results.scene.contents import scene_data
 from limber.store import Branch
 
 

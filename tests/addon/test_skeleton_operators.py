@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.files import read_skeleton
+from limber.geometry.io.skeletons import read_skeleton
 
 pytestmark = pytest.mark.usefixtures("worker_here")
 

@@ -7,7 +7,7 @@ import pytest
 from tests.addon.conftest import ADDON
 from tests.stages.test_registry import NAMES, parsed, sample
 
-from limber.plain import plain
+from limber.core.json_values import plain
 from limber.stages.registry import all_schemas
 
 

@@ -7,9 +7,9 @@ from concurrent.futures import Future
 
 import pytest
 
-from limber.batch import course
-from limber.batch.task import run_task
-from limber.progress import SILENT
+from limber.batch import run
+from limber.batch.stage_task import run_task
+from limber.core.progress import SILENT
 
 
 class Here:
@@ -43,7 +43,7 @@ class Here:
 @pytest.fixture
 def here(monkeypatch):
     """Batches run in this process; returns what runs their tasks."""
-    monkeypatch.setattr(course, "_ThisProcess", Here)
+    monkeypatch.setattr(run, "_ThisProcess", Here)
     return Here
 
 

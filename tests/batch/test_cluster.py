@@ -11,11 +11,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from limber import cli
-from limber.batch.job_file import StageTask, read_jobs
-from limber.batch.lines import line_of_task, task_of_line
+from limber.batch.jobs.command_lines import line_of_task, task_of_line
+from limber.batch.jobs.job_file import StageTask, read_jobs
 from limber.batch.records import Records
-from limber.errors import InputError
+from limber.cli import main
+from limber.core.errors import InputError
 from limber.stages.registry import stage_description
 
 JOBS = """
@@ -66,7 +66,7 @@ def test_two_workers_on_loopback_one_killed(tmp_path, branch_template):
     task = jobs.branches[0].tasks[0]
     line = line_of_task(StageTask(task.stage, task.inputs.model_copy(
         update={"branch_folder": alone}), task.settings, task.options))
-    assert cli.call(line) == 0
+    assert main.call(line) == 0
     expected = _digests(alone)
     assert _digests(tmp_path / "one.branch") == _digests(tmp_path / "two.branch") == expected
 
@@ -106,7 +106,7 @@ def test_what_cannot_or_shall_not_run_is_refused(words, told, tmp_path, branch_t
     path.write_text(JOBS.replace('workers = 2\ncluster = "local"\n', "").replace(
         "*.branch", branch_template.name))
     shutil.copytree(branch_template, tmp_path / branch_template.name)
-    assert cli.call(["batch", str(path), *words]) == 2
+    assert main.call(["batch", str(path), *words]) == 2
     assert told in capsys.readouterr().err
 
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from limber import cli
-from limber.batch.course import run_jobs
-from limber.batch.job_file import read_jobs
+from limber.batch.jobs.job_file import read_jobs
 from limber.batch.records import Records, numbers_of, path_of_page
+from limber.batch.run import run_jobs
 from limber.batch.summary import write_page
-from limber.errors import BranchFolderError
-from limber.stages.target import TargetSettings, set_target
+from limber.cli import main
+from limber.core.errors import BranchFolderError
+from limber.stages.shape.target import TargetSettings, set_target
 from limber.store import Branch
 
 JOBS = """
@@ -48,7 +48,7 @@ def orchard(two_branches):
 
 
 def call(capsys, *arguments) -> tuple[int, dict]:
-    code = cli.call([*map(str, arguments), "--json"])
+    code = main.call([*map(str, arguments), "--json"])
     return code, json.loads(capsys.readouterr().out.splitlines()[-1])
 
 

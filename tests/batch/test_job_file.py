@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from limber.batch.job_file import NOT_IN_BATCHES, read_jobs
-from limber.batch.toml_lines import toml_lines
-from limber.batch.units import in_unit
-from limber.errors import InputError
+from limber.batch.jobs.job_file import NOT_IN_BATCHES, read_jobs
+from limber.batch.jobs.toml_positions import toml_lines
+from limber.core.errors import InputError
+from limber.core.units import in_unit
 from limber.stages.registry import stage_description, stage_summaries
 
 

@@ -6,9 +6,9 @@ import os
 
 import pytest
 
-from limber import cli
-from limber.batch.job_file import read_jobs
+from limber.batch.jobs.job_file import read_jobs
 from limber.batch.records import Records
+from limber.cli import main
 from limber.store import Branch, journal
 
 JOBS = """
@@ -34,7 +34,7 @@ def orchard(two_branches, here):
 def batch(orchard, capsys):
     """Runs the batch; returns exit code, result and the state of each task."""
     def run(*more):
-        code = cli.call(["batch", str(orchard / "jobs.toml"), "--json", *more])
+        code = main.call(["batch", str(orchard / "jobs.toml"), "--json", *more])
         told = json.loads(capsys.readouterr().out.splitlines()[-1])
         jobs = read_jobs(orchard / "jobs.toml")
         records = Records(jobs)
@@ -101,8 +101,8 @@ def test_lost_results_stop_the_batch(orchard, batch, here, monkeypatch, trouble)
             if trouble == "gone":
                 out.rename(orchard / "away")
             else:
-                from limber.store import streams
-                patch.setattr(streams.os, "fsync", no_room)
+                from limber.store import growing_files
+                patch.setattr(growing_files.os, "fsync", no_room)
 
     def no_room(_handle):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -10,15 +10,15 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.utils import infer_storage_options
 
-from limber import cli
 from limber.batch.addresses import checked_address, fetch, is_address, matching, plain_name
-from limber.batch.course import run_jobs
-from limber.batch.emit import write_script
-from limber.batch.job_file import BranchJob, JobFile, read_jobs
+from limber.batch.jobs.job_file import BranchJob, JobFile, read_jobs
+from limber.batch.jobs.scheduler_scripts import write_script
+from limber.batch.machines.staging import bring_in, put_out
 from limber.batch.records import Records
-from limber.batch.staging import bring_in, put_out
-from limber.errors import BranchFolderError, Cancelled, InputError, WorkError
-from limber.files import file_digest
+from limber.batch.run import run_jobs
+from limber.cli import main
+from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
+from limber.core.files.atomic import file_digest
 from limber.store import Branch
 
 BODY = "x_mm,y_mm,z_mm,width_mm,height_mm\n" + "".join(
@@ -39,7 +39,7 @@ def on() -> None:
 
 
 def call(capsys, *arguments) -> tuple[int, dict]:
-    code = cli.call([*map(str, arguments), "--json"])
+    code = main.call([*map(str, arguments), "--json"])
     return code, json.loads(capsys.readouterr().out.splitlines()[-1])
 
 

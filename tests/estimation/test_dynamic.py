@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench
-from limber.estimation.doubt.identifiability import identifiability, require_scale
-from limber.estimation.forward.dynamic import DynamicForward
-from limber.estimation.objective import Objective
-from limber.estimation.optimise import gauss_newton
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.optimise import gauss_newton
+from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.recordings.alignment import Frames
+from limber.estimation.uncertainty.identifiability import identifiability, require_scale
+from limber.recordings.synchronisation import Frames
 
 YOUNG = np.array([40e6, 30e6, 22e6, 16e6])
 EXTRA = ("density", "alpha", "beta")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from limber.estimation.field_form import YoungField, open_field
+from limber.estimation.interpolation_prior import YoungField, open_field
 from limber.estimation.parameters import ParameterSpace, Values
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

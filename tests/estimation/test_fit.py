@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import measured
-from limber.errors import Cancelled, InputError
-from limber.estimation.doubt.identifiability import identifiability, link_unresolved, require_scale
-from limber.estimation.doubt.uncertainty import uncertainty
-from limber.estimation.evaluations import EvaluationLog
+from limber.core.errors import Cancelled, InputError
+from limber.core.progress import Progress
 from limber.estimation.fit import best_so_far
-from limber.estimation.objective import Objective, Stopped
-from limber.estimation.optimise import gauss_newton, nelder_mead
+from limber.estimation.fit_preparation import require_scale_in_principle
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.objective import Objective, Stopped
+from limber.estimation.fitting.optimise import gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
-from limber.estimation.preparation import require_scale_in_principle
 from limber.estimation.settings import EstimateSettings
-from limber.progress import Progress
+from limber.estimation.uncertainty.covariance import uncertainty
+from limber.estimation.uncertainty.identifiability import (
+    identifiability,
+    link_unresolved,
+    require_scale,
+)
 from limber.recordings.recording import Observations
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=5)

@@ -54,7 +54,7 @@ def test_a_replay_keeps_its_pace(tmp_path, plain_pull):
 def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
     """A recorder's lines stand beside the folder's files until it has ended."""
     from limber.estimation.settings import EstimateSettings
-    from limber.stages.estimate import _followed
+    from limber.stages.moduli.estimate import _followed
 
     settings = EstimateSettings(pull=("live",))
     with bare_branch.stream("pulls/live/pull.toml") as lines:
@@ -72,7 +72,7 @@ def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_pa
                                                              monkeypatch):
     """Its files move into the branch then; slow preparations may even see nothing else of it."""
     from limber.estimation.settings import EstimateSettings
-    from limber.stages.estimate import _followed
+    from limber.stages.moduli.estimate import _followed
 
     monkeypatch.setattr(follow, "QUIET_SECONDS", 1.5)
     write_pull(tmp_path / "whole", plain_pull)

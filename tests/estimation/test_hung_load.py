@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.cli import call
-from limber.errors import InputError
+from limber.cli.main import call
+from limber.core.errors import InputError
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.grasping import grasp_on
 from limber.recordings.hung_load import settled
 from limber.recordings.importing import _against
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Observations, read_pull
 from limber.recordings.registration import read_nominal, register
 

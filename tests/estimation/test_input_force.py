@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import measured
-from limber.errors import InputError
-from limber.estimation.forward.dynamic import DynamicForward
+from limber.core.errors import InputError
+from limber.estimation.fitting.optimise import nelder_mead
+from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.forward.force_motion import motion_response
 from limber.estimation.forward.input_force import course_of, nodal_loads
-from limber.estimation.optimise import nelder_mead
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import VirtualPullSettings, simulate_pull
-from limber.mechanics.dynamics.simulate import simulate_dynamics
+from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
+from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.points import point_operator
-from limber.recordings.alignment import frames_of
-from limber.recordings.grasping import grasp_on
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry
+from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)

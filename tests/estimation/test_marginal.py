@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
 
-from limber.estimation.field_form import YoungField
-from limber.estimation.marginal import marginal_step
-from limber.estimation.objective import Evaluation
+from limber.estimation.fitting.objective import Evaluation
+from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.uncertainty.marginal import marginal_step
 
 FORMS = np.linspace(-4, 4, 17)
 

@@ -14,7 +14,8 @@ from benchmarks.silicone_beam import (
     TIPS,
     box_mesh,
 )
-from limber.estimation.doubt.model_error import (
+from limber.estimation.uncertainty.covariance import repeated
+from limber.estimation.uncertainty.model_error import (
     ModelError,
     SmallLoad,
     geometry_error,
@@ -22,12 +23,11 @@ from limber.estimation.doubt.model_error import (
     refined,
     total_interval,
 )
-from limber.estimation.doubt.uncertainty import repeated
-from limber.geometry.skeleton.files import write_cylinders
+from limber.geometry.io.skeletons import write_cylinders
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.grasping import grasp_on
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry
 
 YOUNG = np.array([40e6, 22e6, 12e6, 3e6])

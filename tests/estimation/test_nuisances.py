@@ -7,21 +7,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import measured
-from limber.errors import WorkError
-from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
-from limber.estimation.doubt.path_error import led_by_path, path_error
+from limber.core.errors import WorkError
 from limber.estimation.fit import fit_pulls
+from limber.estimation.fit_preparation import is_watched
+from limber.estimation.fitting.initial_modulus import FALL, led_start, standing_start
+from limber.estimation.fitting.nuisances import eliminated, in_words, unlikely
+from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward import quasi_static
-from limber.estimation.forward.watched import WatchedForward
-from limber.estimation.nuisances import eliminated, in_words, unlikely
-from limber.estimation.objective import Objective
+from limber.estimation.forward.observed_path import WatchedForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.preparation import is_watched
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.start import FALL, led_start, standing_start
-from limber.recordings.alignment import frames_of
-from limber.recordings.calibration import EXACT, CalibrationEntry
+from limber.estimation.uncertainty.path_error import led_by_path, path_error
+from limber.estimation.uncertainty.variance_parts import ADVICE, largest, variance_parts
+from limber.recordings.cell_errors import EXACT, CalibrationEntry
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
+from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench, measured
-from limber.estimation.online.exact import FullBranch, Here
 from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator, OnlineFrame
+from limber.estimation.online.full_model import FullBranch, Here
 from limber.estimation.settings import EstimateSettings
-from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, build_reduced
-from limber.mechanics.reduced.training import TrainingSettings
-from limber.recordings.alignment import frames_of
+from limber.recordings.synchronisation import frames_of
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings, build_reduced
+from limber.reduced.training import TrainingSettings
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 

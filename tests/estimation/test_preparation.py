@@ -8,8 +8,8 @@ import pytest
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.mechanics.statics.solve import solve_static
-from limber.stages.loading import load_estimated_subject, load_subject
 from limber.store import Branch
+from limber.store.loading import load_estimated_subject, load_subject
 
 
 def test_left_out_twigs_weigh_on_the_branch_that_is_fitted(branch_folder):

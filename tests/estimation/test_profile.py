@@ -7,12 +7,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from benchmarks.paper_branches import measured
-from limber.estimation.doubt.profile import bend_of, limit_of, profiled
-from limber.estimation.doubt.uncertainty import Uncertainty
-from limber.estimation.objective import Evaluation
+from limber.core.progress import Progress
+from limber.estimation.fitting.objective import Evaluation
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
-from limber.progress import Progress
+from limber.estimation.uncertainty.covariance import Uncertainty
+from limber.estimation.uncertainty.profile_likelihood import bend_of, limit_of, profiled
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
 NOISE = 40.0

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench, measured
-from limber.errors import InputError
-from limber.estimation import reduced_fit
+from limber.core.errors import InputError
+from limber.core.progress import Progress
 from limber.estimation.fit import fit_pulls
-from limber.estimation.optimise import gauss_newton
-from limber.estimation.reduced_fit import CorrectedForward, Reduction
+from limber.estimation.fitting import reduced_fit
+from limber.estimation.fitting.optimise import gauss_newton
+from limber.estimation.fitting.reduced_fit import CorrectedForward, Reduction
 from limber.estimation.settings import EstimateSettings
-from limber.progress import Progress
-from limber.stages.estimate import estimate
+from limber.stages.moduli.estimate import estimate
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=16)
 REDUCED = SETTINGS.model_copy(update={"forward": "reduced"})

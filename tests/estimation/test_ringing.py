@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.estimation.ringing import identify
+from limber.core.errors import InputError
+from limber.estimation.vibration.ringing import identify
 
 
 def record(rng, *, frequencies=(2.3, 7.9), damping=(0.02, 0.03), size=(1.0, 0.4), noise=0.05,

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from limber.estimation.objective import Evaluation
-from limber.estimation.optimise import WANDERING_STEP, gauss_newton
+from limber.estimation.fitting.objective import Evaluation
+from limber.estimation.fitting.optimise import WANDERING_STEP, gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values
 
 TRUTH = np.log([2e9, 5e8])

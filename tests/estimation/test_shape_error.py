@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import FRACTIONS, measured
-from limber.estimation.doubt import shape_error as module
-from limber.estimation.doubt.shape_error import hung_error, shape_error
-from limber.estimation.field_form import open_field
+from limber.core.progress import Progress
+from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import _tell_largest_part
-from limber.estimation.forward.watched import WatchedForward
-from limber.estimation.objective import Objective
+from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.forward.observed_path import WatchedForward
+from limber.estimation.interpolation_prior import open_field
 from limber.estimation.parameters import Values
-from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.subject import Subject
-from limber.mechanics.added import HungTwig
+from limber.estimation.uncertainty import shape_error as module
+from limber.estimation.uncertainty.shape_error import hung_error, shape_error
+from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.model import BranchModel
-from limber.progress import Progress
-from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.cell_errors import CalibrationEntry
 
 SETTINGS = EstimateSettings(hold_out=False, poisson=0.36)
 QUANTILE = 2.306 / 1.960  # Student's with 8 shapes over the normal one

@@ -6,17 +6,17 @@ import shutil
 import numpy as np
 import pytest
 
-from limber.cli import call
-from limber.errors import Cancelled, InputError
-from limber.estimation import reduced_fit
+from limber.cli.main import call
+from limber.core.errors import Cancelled, InputError
+from limber.core.progress import Progress
+from limber.estimation.fitting import reduced_fit
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.progress import Progress
 from limber.recordings.recording import read_pull
-from limber.report.estimate_figures import report_figures
-from limber.stages.estimate import EVALUATIONS, estimate, follow
-from limber.stages.virtual_pull import virtual_pull
+from limber.results.report.estimate_figures import report_figures
+from limber.stages.moduli.estimate import EVALUATIONS, estimate, follow
+from limber.stages.pulls.virtual_pull import virtual_pull
 from limber.store import Branch
 
 QUICK = EstimateSettings(key_frames=6)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
-from limber.errors import InputError
-from limber.estimation.swing import SwingSeen, first_guess, fit_swing
+from limber.core.errors import InputError
+from limber.estimation.vibration.free_swing import SwingSeen, first_guess, fit_swing
 from limber.mechanics import (
     BranchModel,
     EnergyMomentumSettings,

@@ -7,8 +7,8 @@ from benchmarks.paper_branches import measured
 from benchmarks.truth import _efficient
 from benchmarks.truth_branch import drawn_truth, exact_pull
 from benchmarks.truth_trials import FIRST_PULL, FIRST_TURN, SETTINGS, bounds, fitting_subject
-from limber.estimation.objective import Objective
-from limber.estimation.preparation import forwards_of, parameter_space
+from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.fitting.objective import Objective
 
 
 def test_moduli_that_err_together_count_as_one():

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench
-from limber.errors import InputError
-from limber.estimation.doubt.identifiability import identifiability
-from limber.estimation.forward.dynamic import DynamicForward
-from limber.estimation.objective import Objective
-from limber.estimation.optimise import gauss_newton
+from limber.core.errors import InputError
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.optimise import gauss_newton
+from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.estimation.uncertainty.identifiability import identifiability
 from limber.geometry.skeleton.control_points import control_points
-from limber.recordings.alignment import frames_of
 from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.synchronisation import frames_of
 
 TRUTH = (40e6, 22e6, 12e6, 3e6)
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)

@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.estimation.evaluations import EvaluationLog
+from limber.core.progress import Progress
+from limber.estimation.estimated_branch import subject_of
 from limber.estimation.fit import fit_branch, fit_pulls
+from limber.estimation.fit_preparation import forwards_of
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.forward.observed_path import WatchedForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.forward.watched import WatchedForward
-from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace
-from limber.estimation.preparation import forwards_of
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
-from limber.estimation.subject import subject_of
-from limber.estimation.virtual_pull import TrueBranch, simulate_pull
+from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
-from limber.mechanics.added import PointMass
-from limber.progress import Progress
-from limber.recordings.calibration import CalibrationEntry
-from limber.stages.mesh import mesh_surface
-from limber.stages.virtual_pull import virtual_pull
+from limber.mechanics.added_masses import PointMass
+from limber.recordings.cell_errors import CalibrationEntry
+from limber.stages.pulls.virtual_pull import virtual_pull
+from limber.stages.shape.mesh import mesh_surface
 from limber.store import Branch
 
 GRAVITY = (9.0, 0.0, -3.9)

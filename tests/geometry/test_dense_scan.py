@@ -9,13 +9,13 @@ import pytest
 
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import Prepared, prepare
-from limber.geometry.leafy import leaf_mask, without_leaves
+from limber.geometry.leaf_removal import leaf_mask, without_leaves
 
 COUNT = 150_000
 _RUN = """
 import json, resource, sys
 from limber.geometry.warm_up import warm_up
-from limber.stages.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import reconstruct
 warm_up()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 result = reconstruct(sys.argv[1], sys.argv[2])

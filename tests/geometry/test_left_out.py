@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from limber.errors import MeshingError
-from limber.geometry.left_out import tell_left_out, touching_runs, touching_texts, twig_mass
+from limber.core.errors import MeshingError
+from limber.core.progress import SILENT
+from limber.geometry.pruned_twigs import tell_left_out, touching_runs, touching_texts, twig_mass
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, tangents
 from limber.geometry.surface.tubes import branch_surface
-from limber.progress import SILENT
 
 
 def _tree(aside: float) -> Skeleton:

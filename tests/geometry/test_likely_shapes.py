@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.likely_shapes import likely_skeletons, reshaped
+from limber.geometry.shape_samples import likely_skeletons, reshaped
 from limber.geometry.skeleton.radii.axis_fit import fit_axes, fit_precision
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.cli import call
-from limber.errors import InputError
-from limber.geometry.mesh_model import is_model
+from limber.cli.main import call
+from limber.core.errors import InputError
+from limber.geometry.io.skeletons import read_skeleton
+from limber.geometry.mesh_skeleton import is_model
 from limber.geometry.settings import MeshSurfaceSettings
-from limber.geometry.skeleton.files import read_skeleton
-from limber.stages.export import ExportSettings, export
-from limber.stages.loading import load_branch, load_mesh, load_skeleton
-from limber.stages.mesh import mesh_surface
+from limber.stages.results.export import ExportSettings, export
+from limber.stages.shape.mesh import mesh_surface
 from limber.store import Branch
+from limber.store.loading import load_branch, load_mesh, load_skeleton
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.geometry.skeleton.files import read_skeleton
+from limber.core.errors import InputError
+from limber.geometry.io.skeletons import read_skeleton
 
 HEAD = """# measured by hand
 CODE :\tFORM-A

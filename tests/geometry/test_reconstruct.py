@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from limber.cli import call
-from limber.errors import Cancelled, InputError
+from limber.cli.main import call
+from limber.core.errors import Cancelled, InputError
+from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import generate_branch
+from limber.geometry.io.clouds import read_points
+from limber.geometry.io.skeletons import read_swc
 from limber.geometry.mesh_surface import MeshSurfaceSettings
-from limber.geometry.reconstruct import ReconstructSettings, reconstruct_cloud
-from limber.geometry.skeleton.files import read_swc
+from limber.geometry.reconstruction import ReconstructSettings, reconstruct_cloud
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static
-from limber.mechanics.simulate import SimulateSettings
-from limber.progress import Progress
-from limber.stages.generate import write_generated
-from limber.stages.loading import load_model
-from limber.stages.mesh import mesh_surface
-from limber.stages.reconstruct import reconstruct, reconstruct_folder
-from limber.stages.simulate import simulate
+from limber.mechanics.pull_simulation import SimulateSettings
+from limber.stages.motion.simulate import simulate
+from limber.stages.shape.generate import write_generated
+from limber.stages.shape.mesh import mesh_surface
+from limber.stages.shape.reconstruct import reconstruct, reconstruct_folder
 from limber.store import Branch
+from limber.store.loading import load_model
 
 KEYS = ("point_count", "node_count", "branch_count", "length_m", "radius_min_m", "radius_max_m",
         "surface_volume_m3", "mesh_volume_m3", "tet_count", "watertight", "clamped_radius_count",

@@ -8,7 +8,7 @@ from benchmarks.budget import Budget
 from benchmarks.scan_probabilities import TWIG_SIGNS, fitted
 from benchmarks.scan_runs import CaseRun
 from benchmarks.table import Row, Setting
-from limber.progress import SILENT
+from limber.core.progress import SILENT
 
 _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, "centre_m": 1e-4,
            "radius_error": 0.01, "radius_bias": 0.01, "covered": 0.95, "volume": 0.01, "shown": 1.0,

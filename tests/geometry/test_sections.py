@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid, trapezoid
 
-from limber.constants import STANDARD_GRAVITY
-from limber.errors import InputError
+from limber.core.constants import STANDARD_GRAVITY
+from limber.core.errors import InputError
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.sections import mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
-from limber.mechanics.added import PointMass
+from limber.mechanics.added_masses import PointMass
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.settings import ImportSettings
-from limber.recordings.streams import Stream, write_stream
-from limber.stages.estimate import estimate
-from limber.stages.import_pull import import_pull
-from limber.stages.loading import load_point_masses
-from limber.stages.mesh import mesh_surface
+from limber.recordings.time_series import Stream, write_stream
+from limber.stages.moduli.estimate import estimate
+from limber.stages.pulls.import_pull import import_pull
+from limber.stages.shape.mesh import mesh_surface
 from limber.store import Branch
+from limber.store.loading import load_point_masses
 
 LENGTH, YOUNG, DENSITY, HUNG = 0.5, 4e8, 800.0, 0.03
 WIDTH, HEIGHT = (0.024, 0.012), (0.014, 0.010)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from limber.errors import MeshingError
+from limber.core.errors import MeshingError
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import bending_factor, polygon_factor, rings
-from limber.geometry.surface.checks import check_surface
 from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.forks import crease_angles, smooth_forks
 from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.surface_checks import check_surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.cylinder_mesh import curved_beam, split_wedges, straight_beam
 from limber.geometry.tets.marks import mark

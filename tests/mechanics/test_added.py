@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.geometry.left_out import twig_mass
-from limber.geometry.reconstruct import mesh_skeleton
+from limber.geometry.pruned_twigs import twig_mass
+from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.cylinder_mesh import straight_beam

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
-from limber.mechanics.added import PointMass
-from limber.mechanics.dynamics.simulate import simulate_dynamics
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import static_sensitivities
@@ -155,7 +155,7 @@ def test_stress_at_rest_is_that_of_the_weight(mesh):
 def test_motion_keeps_still_and_swings_as_a_pendulum_would(mesh):
     """At rest nothing starts to move; released, energy of strain, weight and motion is kept."""
     from limber.mechanics.dynamics.motion import NewmarkSettings
-    from limber.mechanics.materials import RayleighDamping
+    from limber.mechanics.materials.materials import RayleighDamping
 
     model = hanging(mesh, SIDEWAYS, damping=RayleighDamping(0.0, 0.0))
     times = np.linspace(0.0, 0.2, 21)

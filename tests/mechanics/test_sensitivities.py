@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.mechanics import (
     BranchModel,
     Grasp,

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
-from limber.cli import call
-from limber.errors import ConvergenceError, InputError
+from limber.cli.main import call
+from limber.core.errors import ConvergenceError, InputError
+from limber.core.progress import Progress
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static
-from limber.mechanics.frames import read_pc2
-from limber.mechanics.simulate import SimulateSettings
-from limber.progress import Progress
-from limber.stages.loading import load_model
-from limber.stages.simulate import simulate
+from limber.mechanics.pull_simulation import SimulateSettings
+from limber.results.motion_files import read_pc2
+from limber.stages.motion.simulate import simulate
 from limber.store import Branch
+from limber.store.loading import load_model
 
 KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m",
         "min_det_f"}

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from limber.mechanics.dynamics.modes import lowest_modes
 from limber.mechanics.model import BranchModel
-from limber.mechanics.vibration import lowest_modes
 
 
 def test_a_cantilevers_lowest_frequencies(slender_beam):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.camera import depth_to_cloud, write_camera
 from limber.geometry.cloud.cloud import Cloud
 from limber.perception.observe import list_frames, observe, write_depth

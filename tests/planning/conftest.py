@@ -5,18 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
 from limber.mechanics import BranchModel
-from limber.mechanics.loaded import hang
-from limber.planning.bound import certificate
-from limber.planning.compare import PlanSettings
+from limber.mechanics.loads.loaded_branch import hang
+from limber.planning.certificate import lower_bound
 from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.field.grasp_model import grasp_model_of
-from limber.progress import Progress
-from limber.stages.energy import EnergySettings, sample_energy_field
-from limber.stages.plan import plan as plan_paths
+from limber.planning.two_paths import PlanSettings
+from limber.stages.paths.energy import EnergySettings, sample_energy_field
+from limber.stages.paths.plan import plan as plan_paths
 from limber.store import Branch
 
 STIFFNESS = np.array([8.0, 8.0, 30.0])  # [N/m] soft to the sides, stiff along the branch
@@ -125,4 +125,4 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
 @pytest.fixture
 def coarse_bound(monkeypatch):
     """The bound without its last, finest grid, where something else is tested: half a minute."""
-    monkeypatch.setattr(certificate, "_MOST_CELLS", 60_000)
+    monkeypatch.setattr(lower_bound, "_MOST_CELLS", 60_000)

@@ -8,8 +8,8 @@ import pytest
 from limber.planning.field import between
 from limber.planning.field.between import ask_between, disagreeing, jump
 from limber.planning.field.chart import Chart
-from limber.planning.field.crew import Crew
 from limber.planning.field.solved import Solved
+from limber.planning.field.solver_pool import Crew
 
 PLAIN = Chart.about(None, 0.0, np.zeros(3))
 LENGTH = 0.4

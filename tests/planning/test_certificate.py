@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.errors import Cancelled, NoPathError
-from limber.planning.bound import certificate
-from limber.planning.bound.certificate import certify
-from limber.planning.compare import plan_pair
+from limber.core.errors import Cancelled, NoPathError
+from limber.core.progress import Progress
+from limber.planning.certificate import lower_bound
+from limber.planning.certificate.lower_bound import certify
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import among_obstacles
 from limber.planning.field.trust import TrustRegion
-from limber.planning.goals import GraspGoal, TargetGoal
+from limber.planning.goals.goal import GraspGoal, TargetGoal
+from limber.planning.goals.regions import Ball
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import Limited, refine
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
-from limber.planning.regions import Ball
 from limber.planning.settings import PlanSettings
-from limber.progress import Progress
+from limber.planning.two_paths import plan_pair
 
 START = np.array([-0.06, -0.03, 0.02])
 GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)
@@ -66,17 +66,17 @@ def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across,
     """At random points of open cells |grad u| <= c, with c from the field and not from the grid."""
     problem, found = across
     seen = []
-    original = certificate.subsolution
+    original = lower_bound.subsolution
 
     def kept(ground, known, shape, inside, **options):
         result = original(ground, known, shape, inside, **options)
         seen.append((ground, result[0], inside))
         return result
 
-    monkeypatch.setattr(certificate, "subsolution", kept)
+    monkeypatch.setattr(lower_bound, "subsolution", kept)
     grids = []
-    bound = certificate._bound
-    monkeypatch.setattr(certificate, "_bound", lambda problem, grid, cell: (
+    bound = lower_bound._bound
+    monkeypatch.setattr(lower_bound, "_bound", lambda problem, grid, cell: (
         grids.append(grid), bound(problem, grid, cell))[1])
     certify(problem, lambda _path: found.cost)
     generator = np.random.default_rng(2)
@@ -205,7 +205,7 @@ def test_no_path_is_proven_where_a_limit_separates(well_field):
 @pytest.mark.parametrize("wrong_grids", [1, 5])
 def test_a_grid_too_coarse_for_a_valley_proves_nothing(well_field, monkeypatch, wrong_grids):
     """The next grid is asked; and a path that keeps the limits is a better proof than any."""
-    problem, spacings, bound = problem_on(well_field), [], certificate._bound
+    problem, spacings, bound = problem_on(well_field), [], lower_bound._bound
 
     def blind(problem, grid, cell):
         spacings.append(grid.spacing)
@@ -213,7 +213,7 @@ def test_a_grid_too_coarse_for_a_valley_proves_nothing(well_field, monkeypatch, 
             raise NoPathError("No path exists", "Proven on a grid")
         return bound(problem, grid, cell)
 
-    monkeypatch.setattr(certificate, "_bound", blind)
+    monkeypatch.setattr(lower_bound, "_bound", blind)
     found = plan_gentle(problem)
     assert found.cost == problem.cost(found.points) < np.inf
     assert spacings[1] < 0.4 * spacings[0]

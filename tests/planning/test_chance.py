@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from limber.errors import InputError
-from limber.planning.chance import Exposure, Surface, YoungDoubt, _chosen, _design
-from limber.planning.limits import Limits
-from limber.planning.resolve import resolve_path
+from limber.core.errors import InputError
+from limber.planning.constraints.chance import Exposure, Surface, YoungDoubt, _chosen, _design
+from limber.planning.constraints.limits import Limits
+from limber.planning.path_on_full_model import resolve_path
 from limber.planning.settings import PlanSettings
-from limber.stages.plan import plan as plan_paths
+from limber.stages.paths.plan import plan as plan_paths
 
 
 @pytest.fixture(scope="module")

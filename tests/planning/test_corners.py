@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.planning.bound import certificate
-from limber.planning.bound.corners import off_zero
-from limber.planning.bound.separation import judge
+from limber.planning.certificate import lower_bound
+from limber.planning.certificate.cell_bounds import off_zero
+from limber.planning.certificate.feasibility import judge
 from limber.planning.cost import CostWeights
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import GraspSamples, fit_field
-from limber.planning.goals import GraspGoal, allowed_points
+from limber.planning.goals.goal import GraspGoal, allowed_points
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem
@@ -84,7 +84,7 @@ def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
     poses = poses[allowed_points(poses, problem.limits)]
     assert len(poses) > 300
     rate = problem.weights.length + problem.weights.energy * bowing_field.energy(poses)
-    original, asked = certificate._bound, []
+    original, asked = lower_bound._bound, []
 
     def bound(problem, grid, cell):
         found = original(problem, grid, cell)
@@ -98,7 +98,7 @@ def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
         asked.append((within.sum(), lost.sum(), (least > rate[within] * (1 + 1e-9)).sum()))
         return found
 
-    monkeypatch.setattr(certificate, "_bound", bound)
+    monkeypatch.setattr(lower_bound, "_bound", bound)
     found = plan_gentle(problem)
     assert asked[0][0] > 300 and len(asked) > 2
     assert [lost for _, lost, _ in asked] == [0] * len(asked)

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.planning import compare
-from limber.planning.bound import separation
-from limber.planning.bound.separation import judge
+from limber.core.errors import InputError
+from limber.core.progress import Progress
+from limber.planning import two_paths
+from limber.planning.certificate import feasibility
+from limber.planning.certificate.feasibility import judge
+from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals import GraspGoal, TargetGoal
-from limber.planning.limits import Limits
+from limber.planning.goals.goal import GraspGoal, TargetGoal
+from limber.planning.goals.regions import Ball
 from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
-from limber.planning.regions import Ball
 from limber.planning.settings import PlanSettings
-from limber.progress import Progress
 
 START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
 LEVEL, RISE, ROUGH = 1.0, 2.0, 0.15
@@ -26,7 +26,7 @@ LEVEL, RISE, ROUGH = 1.0, 2.0, 0.15
 @pytest.fixture(autouse=True)
 def few_cells(monkeypatch):
     """The finest grids take seconds and add nothing here."""
-    monkeypatch.setattr(separation, "_MOST_CELLS", 40_000)
+    monkeypatch.setattr(feasibility, "_MOST_CELLS", 40_000)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     """With the limit looser by that error, for the full model to decide; and it is said. What is
     proven is not tried."""
     settings, limits, told, tried = PlanSettings(), Limits(strain=2.4), [], []
-    there = compare.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
+    there = two_paths.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
         tried.append(tried_limits.max_loads[0])
@@ -87,16 +87,16 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
         return there
 
     doubt = limits.doubts(rough_field)["strain"]
-    monkeypatch.setattr(compare, "plan_pair", plan_pair)
+    monkeypatch.setattr(two_paths, "plan_pair", plan_pair)
     arguments = rough_field, START, GOAL, settings, limits
     progress = Progress(on_warning=told.append)
     if UNPROVEN in seen:
-        found = compare.plan_within(*arguments, progress=progress)
+        found = two_paths.plan_within(*arguments, progress=progress)
         assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + doubt)
         assert any("as its error allows (strain 0." in words for words in told)
     else:
         with pytest.raises(NoWayError, match="No path exists"):
-            compare.plan_within(*arguments, progress=progress)
+            two_paths.plan_within(*arguments, progress=progress)
         assert max(tried) == 2.4
 
 

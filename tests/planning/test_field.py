@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.planning.conftest import small_grasp_model
 
-from limber.errors import InputError, WorkError
+from limber.core.errors import InputError, WorkError
 from limber.planning.field import energy_field
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, error_measures, fit_field

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from limber.planning.constraints.full_model_check import learnt
+from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import EnergyField, refit
-from limber.planning.full_check import learnt
-from limber.planning.limits import Limits
-from limber.planning.resolve import resolve_path
+from limber.planning.path_on_full_model import resolve_path
 
 
 def test_a_path_of_known_states_teaches_nothing_and_breaks_nothing(planned_branch, small_model):

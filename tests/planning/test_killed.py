@@ -13,8 +13,8 @@ import numpy as np
 import psutil
 import pytest
 
-from limber.cli import call
-from limber.owner import is_owned_name
+from limber.cli.main import call
+from limber.core.files.temporary_names import is_owned_name
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.mechanics.reduced import cache
-from limber.mechanics.reduced.cache import ReducedCache
-from limber.mechanics.reduced.state import ReducedSettings
-from limber.mechanics.reduced.training import TrainingSettings
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.field.learnt import CorrectedResult, LearntGraspModel
+from limber.planning.field.reduced_grasp import CorrectedResult, LearntGraspModel
 from limber.planning.field.solved import taken
-from limber.stages.energy import EnergySettings, sample_energy_field
+from limber.reduced import model_cache
+from limber.reduced.model_cache import ReducedCache
+from limber.reduced.state import ReducedSettings
+from limber.reduced.training import TrainingSettings
+from limber.stages.paths.energy import EnergySettings, sample_energy_field
 from limber.store import Branch
 
 FEW = ReducedSettings(size=40, field_count=70, training=TrainingSettings(
@@ -22,7 +22,7 @@ FEW = ReducedSettings(size=40, field_count=70, training=TrainingSettings(
 @pytest.fixture(scope="module")
 def learnt(small_model, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("limber.planning.field.learnt.SHARED", FEW)
+        patch.setattr("limber.planning.field.reduced_grasp.SHARED", FEW)
         return LearntGraspModel.learnt(small_model, ReducedCache(tmp_path_factory.mktemp("kept")))
 
 
@@ -93,8 +93,9 @@ def test_no_state_is_jumped_to(learnt):
 def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_skeleton, tmp_path,
                                                monkeypatch):
     """Sampled on a model that is learnt once; samples that are added later are the full model's."""
-    monkeypatch.setattr("limber.planning.field.learnt.SHARED", FEW)
-    monkeypatch.setattr("limber.planning.field.learnt.default_folder", lambda: tmp_path / "kept")
+    monkeypatch.setattr("limber.planning.field.reduced_grasp.SHARED", FEW)
+    monkeypatch.setattr("limber.planning.field.reduced_grasp.default_folder",
+                        lambda: tmp_path / "kept")
     branch = Branch.create(tmp_path / "small.branch")
     with branch.stage("mesh") as stage:
         small_mesh.write(stage.path("mesh.vtu"))
@@ -116,7 +117,7 @@ def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_sk
 
 def test_sessions_and_fields_learn_the_same():
     """So either finds what the other has learnt."""
-    from limber.session.loading import reduced_settings
+    from limber.session.opening import reduced_settings
     from limber.session.settings import SessionSettings
 
-    assert reduced_settings(SessionSettings()) == cache.SHARED
+    assert reduced_settings(SessionSettings()) == model_cache.SHARED

@@ -6,18 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import limber.planning.plan as plan_module
-from limber.errors import NoPathError
+import limber.planning.make_plan as plan_module
+from limber.core.errors import NoPathError
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings
-from limber.planning.limits import Limits
-from limber.planning.motion_check import MotionCheck, check_motion
-from limber.planning.obstacles import Box
+from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.motion_check import MotionCheck, check_motion
+from limber.planning.constraints.obstacles import Box
+from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
-from limber.planning.resolve import resolve_path
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import Pace, poses_at, time_law
-from limber.stages.plan import plan as plan_paths
+from limber.stages.paths.plan import plan as plan_paths
 
 BRISK = Pace(0.25, 2.0)
 

@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.planning import plan as planning
-from limber.planning.bound.separation import judge
-from limber.planning.compare import plan_within
+from limber.core.progress import Progress
+from limber.planning import make_plan as planning
+from limber.planning.certificate.feasibility import judge
+from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_field
-from limber.planning.goals import GraspGoal
-from limber.planning.limits import Limits
-from limber.planning.narrows import asked_in_doubt
+from limber.planning.goals.goal import GraspGoal
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
-from limber.progress import Progress
+from limber.planning.two_paths import plan_within
+from limber.planning.undecided_passages import asked_in_doubt
 
 RADIUS = 0.2  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.errors import InputError, WorkError
+from limber.core.errors import InputError, WorkError
 from limber.estimation import next_pull
 from limber.estimation.next_pull import (
     Cell,
@@ -19,12 +19,12 @@ from limber.estimation.next_pull import (
     suggest,
 )
 from limber.estimation.settings import EstimateSettings
-from limber.planning.chance import Exposure, Surface
-from limber.recordings.calibration import EXACT
+from limber.planning.constraints.chance import Exposure, Surface
+from limber.recordings.cell_errors import EXACT
 from limber.recordings.recording import SensorEntry
-from limber.stages.loading import load_subject
-from limber.stages.suggest_pull import SuggestPullSettings, suggest_pull, verdict
+from limber.stages.pulls.suggest_pull import SuggestPullSettings, suggest_pull, verdict
 from limber.store import Branch
+from limber.store.loading import load_subject
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ import shutil
 import numpy as np
 import pytest
 
-from limber.errors import InputError, NoPathError
-from limber.planning.compare import PlanSettings
+from limber.core.errors import InputError, NoPathError
 from limber.planning.plan_file import read_plan
-from limber.robot.cell import Cell, write_cell
-from limber.stages.plan import plan as plan_paths
-from limber.stages.plan_cell import region_of, require_taken
+from limber.planning.two_paths import PlanSettings
+from limber.robot.cell.cell import Cell, write_cell
+from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.plan_cell import region_of, require_taken
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.planning.limits import Limits
+from limber.core.errors import InputError
+from limber.planning.constraints.limits import Limits
+from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.plan_file import (
     limits_of_motion,
     plan_text,
@@ -16,7 +17,6 @@ from limber.planning.plan_file import (
     way_of,
     whole_motion,
 )
-from limber.planning.resolve import ResolvedPath, SolvedPoses
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import Pace
 

@@ -9,21 +9,27 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import limber.planning.plan as plan_module
-from limber.cli import call
-from limber.errors import BranchFolderError, Cancelled, ConvergenceError, InputError, NoPathError
+import limber.planning.make_plan as plan_module
+from limber.cli.main import call
+from limber.core.errors import (
+    BranchFolderError,
+    Cancelled,
+    ConvergenceError,
+    InputError,
+    NoPathError,
+)
+from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.planning.compare import PlanSettings
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals import default_goal, hemisphere_goal
-from limber.planning.plan import _doubts
-from limber.planning.resolve import resolve_path
-from limber.progress import Progress
-from limber.report.plan_figures import convergence, report_figures
-from limber.stages.energy import EnergySettings, sample_energy_field
-from limber.stages.loading import load_grasp_model
-from limber.stages.plan import plan as plan_paths
+from limber.planning.goals.goal import default_goal, hemisphere_goal
+from limber.planning.make_plan import _doubts
+from limber.planning.path_on_full_model import resolve_path
+from limber.planning.two_paths import PlanSettings
+from limber.results.report.plan_figures import convergence, report_figures
+from limber.stages.paths.energy import EnergySettings, sample_energy_field
+from limber.stages.paths.plan import plan as plan_paths
 from limber.store import Branch
+from limber.store.loading import load_grasp_model
 
 ENERGY = EnergySettings(samples=60)
 # No plan made anew because a field of 60 samples is rough.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import RBFInterpolator
 
-from limber.errors import WorkError
+from limber.core.errors import WorkError
 from limber.planning.field.radial import KERNELS, RadialInterpolant
 
 GENERATOR = np.random.default_rng(3)

@@ -7,10 +7,10 @@ import pytest
 
 from limber.planning.field import refining
 from limber.planning.field.energy_field import fit_field
+from limber.planning.field.low_energy_surface import Valley
 from limber.planning.field.refining import refined
 from limber.planning.field.sampling import Sampled
 from limber.planning.field.solved import Solved
-from limber.planning.field.valley import Valley
 
 
 @pytest.fixture

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.planning.compare import plan_pair
+from limber.core.errors import InputError
 from limber.planning.field.energy_field import fit_field
-from limber.planning.goals import TargetGoal, goal_points
-from limber.planning.plan import _goal
-from limber.planning.regions import Ball, BoxRegion, View
+from limber.planning.goals.goal import TargetGoal, goal_points
+from limber.planning.goals.regions import Ball, BoxRegion, View
+from limber.planning.make_plan import _goal
 from limber.planning.settings import PlanSettings
+from limber.planning.two_paths import plan_pair
 
 # A camera a metre along x that looks back at the origin; its picture is 0.6 m wide there.
 BACK = np.array([[0, 0, -1, 1], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)

@@ -6,14 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from limber.errors import Cancelled, NoPathError
+from limber.core.errors import Cancelled, NoPathError
+from limber.core.progress import Progress
 from limber.planning.cost import CostWeights, measure_path
-from limber.planning.goals import GraspGoal, TargetGoal, default_goal, goal_points
+from limber.planning.goals.goal import GraspGoal, TargetGoal, default_goal, goal_points
+from limber.planning.goals.regions import Ball
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import plan_path
-from limber.planning.regions import Ball
-from limber.progress import Progress
 
 START = np.array([-0.13, 0.0, 0.0])
 GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from tests.planning.conftest import small_grasp_model
 
-from limber.errors import Cancelled, WorkError
+from limber.core.errors import Cancelled, WorkError
+from limber.core.progress import Progress
 from limber.mechanics import Grasp, solve_static
 from limber.planning.field.chart import Chart, pulled_back_size
-from limber.planning.field.crew import Crew
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import Reach
+from limber.planning.field.low_energy_surface import Valley, walk_valley
 from limber.planning.field.sampling import (
     sample_branch,
     sample_field,
     sample_positions,
     without_taut,
 )
-from limber.planning.field.valley import Valley, walk_valley
-from limber.progress import Progress
-from limber.stages.energy import EnergySettings
-from limber.stages.loading import load_grasp_model
+from limber.planning.field.solver_pool import Crew
+from limber.stages.paths.energy import EnergySettings
 from limber.store import Branch
+from limber.store.loading import load_grasp_model
 
 REACH = Reach(np.zeros(3), 0.4, 0.38, np.array([0.0, 0.0, 0.6]))
 REST = np.array([0.0, 0.0, 0.38])

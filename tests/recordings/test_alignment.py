@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError
-from limber.recordings.alignment import estimate_offset, frames_of, poses_at
+from limber.core.errors import InputError
 from limber.recordings.recording import Observations
+from limber.recordings.synchronisation import estimate_offset, frames_of, poses_at
 
 
 def test_frames_are_the_observers_instants(plain_pull):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from limber.cli import call
+from limber.cli.main import call
 from limber.geometry.cloud.camera import D455, write_camera
 from limber.perception.observe import write_depth
 from limber.recordings.recording import read_pull, write_pull
-from limber.recordings.streams import Stream, read_stream, write_stream
+from limber.recordings.time_series import Stream, read_stream, write_stream
 
 
 @pytest.fixture

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError
+from limber.core.errors import InputError
+from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.perception.observe import read_depth, write_depth
-from limber.progress import SILENT
-from limber.recordings.bags.reading import read_bag
-from limber.recordings.bags.writing import _Messages, write_mcap
+from limber.recordings.bags.bag_reader import read_bag
+from limber.recordings.bags.bag_writer import _Messages, write_mcap
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.settings import ImportSettings
-from limber.stages.export_pull import export_pull
-from limber.stages.import_pull import import_pull
+from limber.stages.pulls.export_pull import export_pull
+from limber.stages.pulls.import_pull import import_pull
 
 pytest.importorskip("rosbags")
 
@@ -172,8 +172,8 @@ def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
 def test_joint_angles_need_the_cell(tmp_path, bare_folder):
     """In any order, with a robot's own names; the base's pose in the branch's frame is the
     cell's."""
-    from limber.robot.cell import Cell, write_cell
-    from limber.robot.kinematics import forward, pose_vectors
+    from limber.robot.cell.cell import Cell, write_cell
+    from limber.robot.ur.kinematics import forward, pose_vectors
 
     names = ["elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
              "wrist_2_joint", "wrist_3_joint"]
@@ -263,8 +263,8 @@ def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):
 def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
     """One command imports the bag under a name of its own, and estimates from it."""
     from limber.estimation.settings import EstimateSettings
-    from limber.stages import estimate as stage
     from limber.stages.inputs import BranchInputs
+    from limber.stages.moduli import estimate as stage
 
     pull = read_pull(branch_folder / "pulls" / "pull-1")
     write_mcap(tmp_path / "run 7.mcap", branch_folder / "pulls" / "pull-1", pull)
@@ -282,9 +282,9 @@ def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, bare_folder):
-    from limber.progress import Progress
-    from limber.recordings.calibration import CalibrationEntry
-    from limber.robot.cell import Cell, write_cell
+    from limber.core.progress import Progress
+    from limber.recordings.cell_errors import CalibrationEntry
+    from limber.robot.cell.cell import Cell, write_cell
 
     with Written(tmp_path / "theirs.mcap") as bag:
         pulled(bag)
@@ -310,10 +310,10 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
 @pytest.mark.slow
 def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_folder, plain_pull,
                                                           monkeypatch):
-    from limber.progress import Progress
-    from limber.recordings.bags import writing
+    from limber.core.progress import Progress
+    from limber.recordings.bags import bag_writer
 
-    monkeypatch.setattr(writing, "entry_text", lambda entry: "grasp = {radius_m = -1}")
+    monkeypatch.setattr(bag_writer, "entry_text", lambda entry: "grasp = {radius_m = -1}")
     write_mcap(tmp_path / "odd.mcap", tmp_path / "spring", plain_pull)
     said: list[str] = []
     import_pull(bare_folder, tmp_path / "odd.mcap", "odd", ImportSettings(),

@@ -5,14 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.constants import FORCE_UNITS_N
-from limber.recordings.checks import (
-    clean,
-    force_unit_suspicion,
-    unswapped,
-    work_done,
-)
+from limber.core.constants import FORCE_UNITS_N
 from limber.recordings.recording import Observations
+from limber.recordings.sensor_checks import clean, force_unit_suspicion, unswapped, work_done
 
 
 def with_force(pull, wrenches):

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.cli import call
-from limber.errors import InputError
+from limber.cli.main import call
+from limber.core.errors import InputError
 from limber.recordings.force_slope import force_slope, read_force_displacement
 
 DATA = Path(__file__).parents[1] / "data" / "blueberry_cane_push"

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from limber.cli import call
-from limber.errors import InputError
+from limber.cli.main import call
+from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, read_camera, write_camera
 from limber.perception.observe import list_frames, read_depth, write_depth
 from limber.recordings.importing import ImportSettings, markers_from_c3d
 from limber.recordings.masks import read_mask
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.registration import rigid_fit
-from limber.recordings.streams import Stream, read_stream, write_stream
-from limber.stages.import_pull import import_pull
-from limber.stages.loading import load_mesh
+from limber.recordings.time_series import Stream, read_stream, write_stream
+from limber.stages.pulls.import_pull import import_pull
 from limber.store import Branch
+from limber.store.loading import load_mesh
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from limber.errors import InputError, MissingDependencyError
+from limber.core.errors import InputError, MissingDependencyError
 from limber.recordings.masks import YoloSegmenter, read_mask, segment_by_depth
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.recordings.recording import Observations, read_entry, read_pull, write_pull
 
 

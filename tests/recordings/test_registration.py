@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.recordings.importing import _require_on_branch
 from limber.recordings.recording import GraspEntry
 from limber.recordings.registration import register

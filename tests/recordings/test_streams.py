@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.recordings.streams import (
+from limber.core.errors import InputError
+from limber.recordings.time_series import (
     Stream,
     gaps,
     inside_gap,

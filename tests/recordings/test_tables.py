@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.recordings.tables import (
     marker_stream,
     read_table,

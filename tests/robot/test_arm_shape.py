@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.errors import NoPathError
-from limber.planning.obstacles import Box
-from limber.robot.arm_shape import rods_of
-from limber.robot.arms import ARMS
-from limber.robot.cell import Cell
-from limber.robot.execution import robot_motion
-from limber.robot.expected import Predicted
-from limber.robot.kinematics import forward, matrices
-from limber.stages.plan_cell import blocked_by, cell_obstacles
+from limber.core.errors import NoPathError
+from limber.planning.constraints.obstacles import Box
+from limber.robot.cell.arm_shape import rods_of
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.execution import robot_motion
+from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.ur.arms import ARMS
+from limber.robot.ur.kinematics import forward, matrices
+from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 
 
 @pytest.mark.parametrize("name", sorted(ARMS))

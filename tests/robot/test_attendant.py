@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from limber.cli import stage_command
-from limber.errors import SafetyStop, WorkError
-from limber.progress import SILENT
-from limber.robot.attendant import retreat_if_chosen
-from limber.robot.cell import Cell
+from limber.cli.main import stage_command
+from limber.core.errors import SafetyStop, WorkError
+from limber.core.progress import SILENT
+from limber.robot.cell.cell import Cell
+from limber.robot.operator_decisions import retreat_if_chosen
 
 
 class Link:

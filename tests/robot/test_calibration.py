@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.commands.robot import command
-from limber.errors import InputError
-from limber.robot.calibration import fit_base, touched_place
-from limber.robot.cell import Cell, read_cell, write_cell
-from limber.robot.frames import pose_of
-from limber.robot.kinematics import forward, matrices, pose_vectors
-from limber.robot.samples import Sample
+from limber.cli.commands.robot import command
+from limber.core.errors import InputError
+from limber.core.numerics.rigid_kernels import pose_of
+from limber.robot.cell.base_calibration import fit_base, touched_place
+from limber.robot.cell.cell import Cell, read_cell, write_cell
+from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+from limber.robot.ur.samples import Sample
 from limber.robot.virtual.controller import HOME
 
 GRASP = (0.01, 0.0, 0.15, 0.0, 0.0, 0.3)

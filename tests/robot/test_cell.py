@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.robot.cell import Cell, read_cell, write_cell
-from limber.robot.kinematics import matrices, pose_vectors
+from limber.core.errors import InputError
+from limber.robot.cell.cell import Cell, read_cell, write_cell
+from limber.robot.ur.kinematics import matrices, pose_vectors
 
 TEXT = """\
 branch = "0d5a"

@@ -9,25 +9,25 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.robot_faults import restored
-from limber.errors import InputError, NoPathError, SafetyStop
+from limber.core.errors import InputError, NoPathError, SafetyStop
+from limber.core.progress import Progress
 from limber.mechanics.status import Status
-from limber.progress import Progress
-from limber.robot.arms import ARMS
-from limber.robot.belonging import check_plan
-from limber.robot.calibration import fit_base
-from limber.robot.cell import ApproachEntry, Cell
-from limber.robot.execution import across, followed, robot_motion
-from limber.robot.expected import Predicted
-from limber.robot.kinematics import forward, inverse, inverted, matrices, pose_vectors
-from limber.stages.execute import (
+from limber.robot.cell.base_calibration import fit_base
+from limber.robot.cell.cell import ApproachEntry, Cell
+from limber.robot.cell.compatibility import check_plan
+from limber.robot.motion.execution import across, followed, robot_motion
+from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.ur.arms import ARMS
+from limber.robot.ur.kinematics import forward, inverse, inverted, matrices, pose_vectors
+from limber.stages.paths.execute import (
     ExecuteOptions,
     ExecuteSettings,
     _as_slow_as_checked,
     _planned,
     execute,
 )
-from limber.stages.loading import load_grasp_model, load_skeleton
 from limber.store import Branch
+from limber.store.loading import load_grasp_model, load_skeleton
 
 FRACTION = 0.92
 
@@ -174,10 +174,10 @@ def planned_in(folder, force: float = 1.5) -> None:
 @pytest.fixture(scope="module")
 def planned_template(branch_template, tmp_path_factory):
     """The small branch with its true moduli in the mesh, and a plan."""
-    from limber.estimation.virtual_pull import VirtualPullSettings
-    from limber.mechanics.young_field import young_weights
-    from limber.stages.loading import load_mesh
-    from limber.stages.virtual_pull import load_truth
+    from limber.estimation.simulated_pull import VirtualPullSettings
+    from limber.mechanics.materials.young_field import young_weights
+    from limber.stages.pulls.virtual_pull import load_truth
+    from limber.store.loading import load_mesh
 
     folder = shutil.copytree(branch_template, tmp_path_factory.mktemp("plans") / "planned.branch")
     branch = Branch.open(folder)
@@ -240,7 +240,7 @@ def test_a_plan_that_was_checked_in_motion_is_followed_no_faster():
 def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folder, tmp_path,
                                                                    monkeypatch):
     """Solving the forces of a long path takes a minute; the plan's own poses tell the reach."""
-    from limber.stages import execute as stage
+    from limber.stages.paths import execute as stage
 
     def solved(*_arguments: object) -> None:
         raise AssertionError("forces were solved")
@@ -256,7 +256,7 @@ def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folde
 def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder, tmp_path,
                                                                   monkeypatch):
     """A box around the grasp, and a gripper with a shape: refused before any force is solved."""
-    from limber.stages import execute as stage
+    from limber.stages.paths import execute as stage
 
     monkeypatch.setattr(stage, "_predicted", lambda *_: pytest.fail("forces were solved"))
     branch = Branch.open(planned_folder)
@@ -342,7 +342,7 @@ def robot(planned_template, own_address, tmp_path_factory):
 @pytest.fixture
 def armed(planned_folder, tmp_path, robot, motion_settings, start_joints, monkeypatch):
     """Execute the plan; the arm stands with its start's joints, or those of ``stands`` [rad, 6]."""
-    monkeypatch.setattr("limber.stages.execute._TARE_SECONDS", 0.3)
+    monkeypatch.setattr("limber.stages.paths.execute._TARE_SECONDS", 0.3)
 
     def run(*, unexpected: float, stands=None):
         path = cell_file(cell_before(planned_folder, robot.address, unexpected_force_n=unexpected),

@@ -19,13 +19,13 @@ from benchmarks.robot_faults import (
     straight,
     tared,
 )
-from limber.compiled import cache_folder
-from limber.errors import LimberError, SafetyStop
-from limber.progress import SILENT
-from limber.robot.attendant import retreat_if_chosen
-from limber.robot.expected import ExpectedWrench
-from limber.robot.link import RobotLink
-from limber.robot.trajectory import Trajectory, along, densely
+from limber.core.errors import LimberError, SafetyStop
+from limber.core.numerics.compiled import cache_folder
+from limber.core.progress import SILENT
+from limber.robot.driver.link import RobotLink
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.operator_decisions import retreat_if_chosen
 
 pytest.importorskip("rtde_control")
 

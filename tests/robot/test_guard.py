@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from limber.errors import SafetyStop
-from limber.robot.arms import ARMS
-from limber.robot.cell import LimitsEntry, WorkspaceEntry
-from limber.robot.guard import Guard, GuardSettings, State, Verdict
-from limber.robot.samples import Sample
+from limber.core.errors import SafetyStop
+from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
+from limber.robot.driver.guard import Guard, GuardSettings, State, Verdict
+from limber.robot.ur.arms import ARMS
+from limber.robot.ur.samples import Sample
 
 ARM = ARMS["ur5e"]
 JOINTS = np.array([0.1, -1.57, 1.57, -1.57, -1.57, 0.0])

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError, NoPathError
-from limber.robot.arms import ARMS, arm_named
-from limber.robot.joint_path import follow, joint_path
-from limber.robot.kinematics import (
+from limber.core.errors import InputError, NoPathError
+from limber.robot.motion.joint_path import follow, joint_path
+from limber.robot.ur.arms import ARMS, arm_named
+from limber.robot.ur.kinematics import (
     forward,
     inverse,
     inverted,

@@ -6,12 +6,12 @@ import sys
 
 import pytest
 
-from limber.robot.real_time import keep_awake
+from limber.robot.driver.real_time import keep_awake
 
 _COUNTED = """
 import gc
-import limber.robot.driver
-from limber.robot.real_time import spare_what_is_loaded
+import limber.robot.driver.driver
+from limber.robot.driver.real_time import spare_what_is_loaded
 before = len(gc.get_objects())
 spare_what_is_loaded()
 print(before, len(gc.get_objects()))
@@ -29,8 +29,8 @@ def test_a_search_for_garbage_no_longer_goes_through_what_is_loaded():
 
 
 _KEPT = """
-import limber.robot.driver
-from limber.robot.real_time import spare_what_is_loaded
+import limber.robot.driver.driver
+from limber.robot.driver.real_time import spare_what_is_loaded
 kept = spare_what_is_loaded()
 lines = dict(line.split(":") for line in open("/proc/self/status") if line.startswith("Vm"))
 print(kept, lines["VmLck"].split()[0], lines["VmSize"].split()[0])
@@ -51,7 +51,7 @@ def test_what_is_loaded_stays_in_memory():
 _AWAKE = """
 import struct
 from pathlib import Path
-from limber.robot.real_time import keep_awake
+from limber.robot.driver.real_time import keep_awake
 print(keep_awake(), *struct.unpack("i", Path("/dev/cpu_dma_latency").read_bytes()[:4]))
 """
 
@@ -66,13 +66,13 @@ def test_processors_stay_awake_as_long_as_the_process_runs():
 
 
 def test_a_computer_without_that_device_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr("limber.robot.real_time._WAKING", tmp_path / "none")
+    monkeypatch.setattr("limber.robot.driver.real_time._WAKING", tmp_path / "none")
     assert not keep_awake()
 
 
 _STUCK = """
 import queue, threading, time
-import limber.robot.driver as driver
+import limber.robot.driver.driver as driver
 driver._LAST_SECONDS = 0.2
 threading.Thread(target=driver._read_orders, args=(queue.SimpleQueue(),), daemon=True).start()
 time.sleep(60)

@@ -13,18 +13,18 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.robot_faults import restored
-from limber.cli import command_of
-from limber.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
-from limber.progress import SILENT
+from limber.cli.main import command_of
+from limber.core.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
+from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
-from limber.robot.cell import Cell
-from limber.robot.kinematics import matrices
+from limber.robot.cell.cell import Cell
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
-from limber.stages.loading import load_skeleton
-from limber.stages.record import RecordOptions, RecordSettings, record
-from limber.stages.record_way import suggested_pull, there_and_back, way_on_arc, way_through
+from limber.robot.ur.kinematics import matrices
+from limber.stages.pulls.record import RecordOptions, RecordSettings, record
+from limber.stages.pulls.record_path import suggested_pull, there_and_back, way_on_arc, way_through
 from limber.stages.registry import stage_description
 from limber.store import Branch
+from limber.store.loading import load_skeleton
 
 pytest.importorskip("rtde_control")
 
@@ -52,8 +52,8 @@ def shared_robot(branch_template, worker_address, tmp_path_factory):
 @pytest.fixture
 def robot(shared_robot, monkeypatch):
     """Before a pull it is waited for less than beside a real branch."""
-    monkeypatch.setattr("limber.stages.record._TARE_SECONDS", 0.3)
-    monkeypatch.setattr("limber.stages.record._SETTLE_SECONDS", 0.2)
+    monkeypatch.setattr("limber.stages.pulls.record._TARE_SECONDS", 0.3)
+    monkeypatch.setattr("limber.stages.pulls.record._SETTLE_SECONDS", 0.2)
     restored(shared_robot)
     return shared_robot
 

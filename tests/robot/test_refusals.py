@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.robot_faults import cell_for, new_robot, restored, straight
-from limber.errors import InputError, SafetyStop, WorkError
-from limber.robot.cell import Cell
-from limber.robot.link import COLUMNS, RobotLink
+from limber.core.errors import InputError, SafetyStop, WorkError
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.link import COLUMNS, RobotLink
 
 pytest.importorskip("rtde_control")
 pytestmark = pytest.mark.slow

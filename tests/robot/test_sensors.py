@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError, WorkError
-from limber.robot.cell import Cell
-from limber.robot.frames import (
+from limber.core.errors import InputError, WorkError
+from limber.core.numerics.rigid_kernels import (
     frame_of,
     inverse_of,
     pose_between,
@@ -18,9 +17,8 @@ from limber.robot.frames import (
     turned_wrench,
     weight_wrench,
 )
-from limber.robot.kinematics import matrices
-from limber.robot.samples import Sample
-from limber.robot.sensors import (
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.force_sensors import (
     FT300_PORT,
     ControllerSensor,
     Ft300Sensor,
@@ -30,6 +28,8 @@ from limber.robot.sensors import (
     open_sensor,
     parsed_message,
 )
+from limber.robot.ur.kinematics import matrices
+from limber.robot.ur.samples import Sample
 
 TOOL = (0.02, -0.01, 0.15, 0.3, 0.1, -0.2)
 BASE = (0.6, 0.1, 0.0, 0.2, 0.1, 1.2)

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from limber.errors import SafetyStop
-from limber.robot.arms import ARMS
-from limber.robot.cell import Cell
-from limber.robot.expected import ExpectedWrench
-from limber.robot.frames import pose_of
-from limber.robot.kinematics import forward, inverse, matrices, pose_vectors
-from limber.robot.samples import Sample
-from limber.robot.start import require_start
-from limber.robot.trajectory import Trajectory, along, densely
+from limber.core.errors import SafetyStop
+from limber.core.numerics.rigid_kernels import pose_of
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.start_check import require_start
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.ur.arms import ARMS
+from limber.robot.ur.kinematics import forward, inverse, matrices, pose_vectors
+from limber.robot.ur.samples import Sample
 from limber.robot.virtual.controller import HOME
-from limber.robot.way_back import WayBack
-from limber.stages.record_way import there_and_back
+from limber.stages.pulls.record_path import there_and_back
 
 ARM = ARMS["ur5e"]
 JOINTS = np.array(HOME)

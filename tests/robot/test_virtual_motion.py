@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from tests.robot.conftest import Registers
 
-from limber.robot.kinematics import matrices
+from limber.robot.ur.kinematics import matrices
 from limber.robot.virtual.controller import HOME, Controller, RuntimeState, SafetyMode
-from limber.robot.virtual.sensor import E_SERIES, ForceSensor
+from limber.robot.virtual.force_sensor import E_SERIES, ForceSensor
 
 MOVE_JOINTS, MOVE_LINE, ZERO, SPEED, SERVO_JOINTS, SERVO_STOP = 1, 3, 8, 10, 11, 16
 PAYLOAD, STOP_LINE, STOP_JOINTS, WATCHDOG, PATH = 17, 33, 34, 35, 45

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from tests.robot.conftest import let_go
 
-from limber.errors import InputError, WorkError
-from limber.robot import rtde
+from limber.core.errors import InputError, WorkError
+from limber.robot.ur import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import answer
 from limber.robot.virtual.launch import VirtualRobot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.session.client import InteractiveSession
-from limber.session.frames import Status
+from limber.session.frame_buffer import Status
 
 SMALL = {"grasps": 24, "size": 36, "fields": 70}
 

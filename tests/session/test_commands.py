@@ -14,15 +14,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.subjects.processes import left_alive
 
-from limber.cli import call
-from limber.errors import InputError, WorkError
+from limber.cli.main import call
+from limber.core.errors import InputError, WorkError
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.session import client
 from limber.session.client import InteractiveSession
-from limber.session.frames import MAGIC, FrameReader, FrameWriter, HeldAt, Status
+from limber.session.frame_buffer import MAGIC, FrameReader, FrameWriter, HeldAt, Status
 from limber.session.protocol import PROTOCOL
-from limber.stages.loading import load_model
 from limber.store import Branch
+from limber.store.loading import load_model
 
 
 @pytest.fixture(scope="module")

@@ -9,20 +9,20 @@ from threading import Event
 import numpy as np
 import pytest
 
-from limber.errors import Cancelled, InputError, WorkError
+from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.progress import SILENT
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.mechanics.added import PointMass
-from limber.mechanics.load_effects import load_effects
-from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
-from limber.progress import SILENT
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.loads.load_effects import load_effects
+from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.session import protocol
-from limber.session.effects import EffectsTeller, effects_of, gusts_of
-from limber.session.held import HeldBranch
-from limber.session.loading import load_held
+from limber.session.opening import load_held
+from limber.session.outdoor_effects import EffectsTeller, effects_of, gusts_of
+from limber.session.session_branch import HeldBranch
 from limber.session.settings import SessionSettings
-from limber.stages.load import LoadSettings, load
-from limber.stages.loading import load_branch, load_skeleton
+from limber.stages.motion.load import LoadSettings, load
 from limber.store import Branch
+from limber.store.loading import load_branch, load_skeleton
 
 AXIS = Skeleton.from_edges(np.column_stack([np.zeros((21, 2)), np.linspace(0, 0.2, 21)]),
                            np.arange(-1, 20), np.linspace(0.004, 0.003, 21))

@@ -13,12 +13,12 @@ import psutil
 import pytest
 from tests.subjects.processes import left_alive
 
-from limber.errors import InputError, WorkError
+from limber.core.errors import InputError, WorkError
 from limber.mechanics import Grasp, solve_static
 from limber.session.client import InteractiveSession
-from limber.session.frames import FrameReader, FrameWriter
-from limber.stages.loading import load_model
+from limber.session.frame_buffer import FrameReader, FrameWriter
 from limber.store import Branch
+from limber.store.loading import load_model
 
 SMALL = {"grasps": 24, "size": 36, "fields": 70, "cache": False}
 

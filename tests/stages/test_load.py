@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from limber.errors import InputError
-from limber.mechanics.added import PointMass
-from limber.mechanics.load_effects import load_effects
-from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
-from limber.plain import plain
-from limber.stages.load import LoadSettings, _inputs, load
-from limber.stages.loading import load_branch, load_skeleton
+from limber.core.errors import InputError
+from limber.core.json_values import plain
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.loads.load_effects import load_effects
+from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
+from limber.stages.motion.load import LoadSettings, _inputs, load
 from limber.store import Branch
+from limber.store.loading import load_branch, load_skeleton
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
@@ -103,9 +103,9 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
 @pytest.mark.slow
 def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     """Its table and picture on the page, its frames in the scene; a damaged file is named."""
-    from limber.report.loads import read_load
-    from limber.report.page import draw_page
-    from limber.scene.data import scene_data
+    from limber.results.report.loads_section import read_load
+    from limber.results.report.page import draw_page
+    from limber.results.scene.contents import scene_data
 
     folder = Path(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
     result = load(folder, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.2, name="gale"))

@@ -7,8 +7,8 @@ import sys
 import click
 import pytest
 
-from limber import cli
-from limber.options import command_line
+from limber.cli import main
+from limber.stages.command_line import command_line
 from limber.stages.registry import (
     all_schemas,
     stage_description,
@@ -41,7 +41,7 @@ def parsed(name, arguments):
         return {}
     stage = stage_description(name)
     caught = type(stage)(**{**vars(stage), "run": run, "tables": None})
-    command = cli.command_of(caught, stage_module(name).__doc__)
+    command = main.command_of(caught, stage_module(name).__doc__)
     with pytest.raises(SystemExit) as stop:
         command.main(arguments, standalone_mode=False)
     assert stop.value.code == 0
@@ -111,10 +111,10 @@ def test_units_and_experts_are_in_the_schema():
 
 def test_help_hides_what_is_for_experts(capsys):
     """--help leaves experts' options out and says so; --help-all has them."""
-    assert cli.call(["simulate", "--help"]) == 0
+    assert main.call(["simulate", "--help"]) == 0
     short = capsys.readouterr().out
     assert "--newmark-beta" not in short and "--help-all" in short and "Material:" in short
-    assert cli.call(["simulate", "--help-all"]) == 0
+    assert main.call(["simulate", "--help-all"]) == 0
     assert "--newmark-beta" in capsys.readouterr().out
 
 
@@ -138,10 +138,10 @@ def test_a_file_is_a_stage(tmp_path, monkeypatch):
         '"""Looks at something.\n\nMore."""\n'
         'STAGE = StageDescription("probe", 5, run, Inputs, Settings, Options)\n')
     monkeypatch.setattr(registry, "__file__", str(tmp_path / "registry.py"))
-    registry.stage_summaries.cache_clear()
+    registry._stages.cache_clear()
     try:
         assert registry.stage_summaries() == {"probe": "Looks at something."}
-        assert "probe" in cli.main.list_commands(click.Context(cli.main))
+        assert "probe" in main.main.list_commands(click.Context(main.main))
     finally:
         monkeypatch.undo()
-        registry.stage_summaries.cache_clear()
+        registry._stages.cache_clear()

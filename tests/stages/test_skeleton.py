@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 
 from limber import store
-from limber.cli import call
-from limber.errors import InputError, MeshingError
-from limber.geometry import reconstruct as reconstruction
+from limber.cli.main import call
+from limber.core.errors import InputError, MeshingError
+from limber.core.json_values import plain
+from limber.core.progress import Progress
+from limber.geometry import reconstruction
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.generated import generate_branch
+from limber.geometry.io.skeletons import read_skeleton, read_swc
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.files import read_skeleton, read_swc
-from limber.geometry.skeleton.found import FoundSkeleton
+from limber.geometry.skeleton.checkpoint import FoundSkeleton
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import given_skeleton
-from limber.plain import plain
-from limber.progress import Progress
-from limber.scene.data import scene_data
-from limber.scene.shape import EDITED
-from limber.stages.reconstruct import load_search, reconstruct
-from limber.stages.skeleton import review_skeleton
+from limber.results.scene.contents import scene_data
+from limber.results.scene.still_objects import EDITED
+from limber.stages.shape.edit_skeleton import review_skeleton
+from limber.stages.shape.reconstruct import load_search, reconstruct
 from limber.store import Branch
 
 # Map coordinates in millimetres, its z along the file's y.
@@ -127,7 +127,7 @@ import os, sys
 from pathlib import Path
 from limber.geometry import reconstruct as reconstruction
 from limber.geometry.settings import ReconstructSettings
-from limber.stages.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import reconstruct
 reconstruction.mesh_skeleton = lambda *given: os._exit(9)
 scan, target = map(Path, sys.argv[1:3])
 reconstruct(scan, target, ReconstructSettings.model_validate_json(sys.argv[3]))

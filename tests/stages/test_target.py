@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from limber.cli import call
-from limber.errors import InputError
+from limber.cli.main import call
+from limber.core.errors import InputError
+from limber.core.progress import Progress
+from limber.core.settings import checked_settings
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.progress import Progress
-from limber.settings import checked_settings
-from limber.stages.loading import load_branch, load_targets
-from limber.stages.target import TargetSettings, set_target
+from limber.stages.shape.target import TargetSettings, set_target
 from limber.store import Branch
+from limber.store.loading import load_branch, load_targets
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.cli import call
-from limber.errors import InputError
-from limber.mechanics.vibration import lowest_modes
-from limber.report.ringing import vibration_rows
-from limber.stages.loading import load_branch, load_mesh
-from limber.stages.vibration import VibrationSettings, vibration
+from limber.cli.main import call
+from limber.core.errors import InputError
+from limber.mechanics.dynamics.modes import lowest_modes
+from limber.results.report.ringing_section import vibration_rows
+from limber.stages.moduli.vibration import VibrationSettings, vibration
 from limber.store import Branch
+from limber.store.loading import load_branch, load_mesh
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 

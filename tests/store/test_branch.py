@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.alignment import Alignment
-from limber.errors import BranchFolderError, InputError
-from limber.files import write_atomically
-from limber.plain import plain
+from limber.core.alignment import Alignment
+from limber.core.errors import BranchFolderError, InputError
+from limber.core.files.atomic import write_atomically
+from limber.core.json_values import plain
 from limber.store import FORMAT_VERSION, Branch
 
 

@@ -4,8 +4,8 @@ from typing import ClassVar
 
 import pytest
 
-from limber.errors import WorkError
-from limber.settings import Settings
+from limber.core.errors import WorkError
+from limber.core.settings import Settings
 from limber.store import Branch
 from limber.store import branch as module
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from limber.cli import call
-from limber.errors import BranchFolderError, InputError
-from limber.names import inside, relative_name
+from limber.cli.main import call
+from limber.core.errors import BranchFolderError, InputError
+from limber.core.files.safe_names import inside, relative_name
 from limber.store import Branch, journal
 from limber.store.lock import commit_lock
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from limber.errors import BranchFolderError
+from limber.core.errors import BranchFolderError
 from limber.store import Branch
 
 _HOLDER = """

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from limber.errors import BranchFolderError, InputError, LimberError, WorkError
-from limber.machine_errors import machine_error
+from limber.core.errors import BranchFolderError, InputError, LimberError, WorkError
+from limber.core.machine_errors import machine_error
 from limber.store import Branch
 
 _WRITING = ("mkdir", "fsync", "open")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from limber.errors import BranchFolderError, InputError, WorkError
+from limber.core.errors import BranchFolderError, InputError, WorkError
 from limber.store import Branch, Stream, stream_lines
 
 _WRITER = """

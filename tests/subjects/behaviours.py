@@ -11,8 +11,8 @@ import signal
 import sys
 import time
 
-from limber.errors import LimberError, WorkError
-from limber.progress import SILENT, JsonSink, Progress
+from limber.core.errors import LimberError, WorkError
+from limber.core.progress import SILENT, JsonSink, Progress
 
 RUBBISH = (b"fTetWild says hello\n" b"[1, 2]\n" b"{broken\n" b"\xff\xfe\x00\xf0\n"
            + b"[" * 100_000 + b"\n" + b"9" * 10_000 + b"\n"
@@ -80,7 +80,7 @@ def _interrupted(_signal: int, _frame: object) -> None:
 
 def main(name: str) -> int:
     """Run one as a program; returns the exit code."""
-    from limber.jobs.ending import end_with_parent_pipe
+    from limber.core.processes.ending import end_with_parent_pipe
 
     signal.signal(signal.SIGTERM, _interrupted)
     end_with_parent_pipe(grace_seconds=0.3)

@@ -3,9 +3,9 @@
 import os
 import time
 
-from limber.errors import ConvergenceError, InputError
-from limber.jobs import core_budget, run_tasks
-from limber.progress import Progress
+from limber.core.errors import ConvergenceError, InputError
+from limber.core.processes import core_budget, run_tasks
+from limber.core.progress import Progress
 
 
 def late_square(number: int) -> int:

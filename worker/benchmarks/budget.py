@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TypeVar
 
-from limber.jobs import Pool, core_budget
+from limber.core.processes import Pool, core_budget
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

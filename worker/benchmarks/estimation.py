@@ -25,24 +25,20 @@ from benchmarks.paper_branches import (
     measured,
 )
 from benchmarks.table import Asked, Part, Row, Setting
+from limber.core.processes import run_tasks
+from limber.core.progress import SILENT
+from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import Estimate
-from limber.estimation.online.exact import Beside
+from limber.estimation.fitting.initial_modulus import scaled_start
+from limber.estimation.fitting.optimise import gauss_newton, nelder_mead
 from limber.estimation.online.filter import OnlineFrame
 from limber.estimation.online.follow import begin
-from limber.estimation.optimise import gauss_newton, nelder_mead
+from limber.estimation.online.full_model import Beside
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.start import scaled_start
-from limber.estimation.subject import Subject
-from limber.estimation.virtual_pull import (
-    VirtualPullSettings,
-    simulate_pull,
-    write_depth_frames,
-)
-from limber.jobs import run_tasks
-from limber.progress import SILENT
-from limber.recordings.alignment import frames_of
+from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull, write_depth_frames
 from limber.recordings.recording import Pull
+from limber.recordings.synchronisation import frames_of
 
 SETTINGS = EstimateSettings(hold_out=False)
 _BEAM_YOUNG_PA = (1.6e5, 4.0e5)

@@ -15,15 +15,15 @@ import numpy as np
 from benchmarks.budget import Budget
 from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
-from limber.errors import LimberError
+from limber.core.errors import LimberError
+from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch
-from limber.progress import SILENT, Progress
-from limber.stages.estimate import estimate
-from limber.stages.generate import write_generated
-from limber.stages.reconstruct import reconstruct
-from limber.stages.virtual_pull import virtual_pull
+from limber.stages.moduli.estimate import estimate
+from limber.stages.pulls.virtual_pull import virtual_pull
+from limber.stages.shape.generate import write_generated
+from limber.stages.shape.reconstruct import reconstruct
 from limber.store import Branch
 
 VIEWS = ("round", "one-sided")

@@ -18,10 +18,11 @@ from benchmarks.geometry_crowns import CROWN_ROWS, against_graph, crown_rows, ex
 from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.scan_scores import Dense, score
 from benchmarks.table import Asked, Part, Row, Setting
-from limber.geometry.cloud.files import read_points
+from limber.core.json_values import plain
 from limber.geometry.generated import GeneratedBranch, generate_branch
+from limber.geometry.io.clouds import read_points
+from limber.geometry.io.skeletons import read_cylinders, read_swc
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
-from limber.geometry.skeleton.files import read_cylinders, read_swc
 from limber.geometry.skeleton.radii.axis_fit import median_radii
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -29,7 +30,6 @@ from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.tetrahedra import mesh_branch
-from limber.plain import plain
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 _LEAFY = ("--unexplained", "1", "--leaves", "cut")
@@ -221,7 +221,7 @@ import sys, time, numpy as np
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.skeleton.skeletonise import skeletonise
-from limber.geometry.reconstruct import peak_memory_mb
+from limber.geometry.reconstruction import peak_memory_mb
 points = np.load(sys.argv[1])
 started = time.perf_counter()
 prepared = prepare(Cloud(points), 1.0)
@@ -337,14 +337,14 @@ def _against_qsm(folder: Path) -> list[Row]:
 
 def _in_file_frame(folder: Path, skeleton: Skeleton) -> Skeleton:
     """Return a branch folder's skeleton in its scan file's axes, origin and unit."""
-    from limber.alignment import Alignment
+    from limber.core.alignment import Alignment
 
     manifest = json.loads((folder / "branch.json").read_text())
     return skeleton.moved(Alignment.model_validate(manifest["alignment"]).undo(skeleton.nodes))
 
 
 def _is_tree(path: Path) -> bool:
-    from limber.errors import InputError
+    from limber.core.errors import InputError
 
     try:
         read_cylinders(path)

@@ -11,8 +11,8 @@ import subprocess
 import sys
 from typing import Literal
 
-from limber.jobs.ending import end_by_closing
-from limber.robot.real_time import (
+from limber.core.processes.ending import end_by_closing
+from limber.robot.driver.real_time import (
     VIRTUAL_ROBOT_PRIORITY,
     claim_real_time,
     spare_what_is_loaded,

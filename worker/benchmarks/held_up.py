@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TypeVar
 
-from limber.errors import LimberError
+from limber.core.errors import LimberError
 
 HELD_UP_SECONDS = 0.03
 """From here on a loop that may be silent for 50 ms can come to be: chosen."""
@@ -26,7 +26,7 @@ _Result = TypeVar("_Result")
 
 _WATCHING = """
 import os, sys, time
-from limber.robot.real_time import claim_real_time
+from limber.robot.driver.real_time import claim_real_time
 if sys.argv[1:]:
     os.sched_setaffinity(0, [int(sys.argv[1])])
 claim_real_time(30)

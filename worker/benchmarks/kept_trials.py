@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks.budget import Budget, side_by_side
-from limber.plain import plain
-from limber.progress import SILENT, Progress
+from limber.core.json_values import plain
+from limber.core.progress import SILENT, Progress
 
 Trial = TypeVar("Trial")
 Task = TypeVar("Task")

@@ -44,7 +44,7 @@ def _problem() -> tuple:
 def _felupe_row() -> Row:
     import felupe
 
-    from limber.mechanics.materials import lame
+    from limber.mechanics.materials.materials import lame
 
     beam, loads, ours, our_seconds = _problem()
     mesh = felupe.Mesh(beam.mesh.nodes, beam.mesh.tets, "tetra10")

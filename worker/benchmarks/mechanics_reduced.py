@@ -10,23 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import Asked, Row, Setting
+from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, young_weights
-from limber.mechanics.dynamics.simulate import simulate_dynamics
-from limber.mechanics.reduced.cache import ReducedCache, model_key
-from limber.mechanics.reduced.dynamics import ReducedMotion, simulate_reduced
-from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
-from limber.mechanics.reduced.training import (
-    Snapshots,
-    Trainer,
-    TrainingSettings,
-    sample_poses,
-    sample_young,
-)
-from limber.progress import Progress
+from limber.mechanics.dynamics.integration import simulate_dynamics
+from limber.reduced.model_cache import ReducedCache, model_key
+from limber.reduced.reduced_dynamics import ReducedMotion, simulate_reduced
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings, reduce_snapshots
+from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses, sample_young
 from limber.session.client import InteractiveSession
-from limber.session.loading import load_held, reduced_settings
+from limber.session.opening import load_held, reduced_settings
 from limber.session.settings import SessionSettings
 from limber.store import Branch
 

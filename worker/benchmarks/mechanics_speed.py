@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.mechanics_exact import DENSITY, LENGTH, YOUNG
 from benchmarks.mechanics_reduced import bench_branch
 from benchmarks.table import Asked, Row, Setting
+from limber.core.processes import Pool
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.jobs import Pool
 from limber.mechanics import (
     BranchModel,
     Grasp,

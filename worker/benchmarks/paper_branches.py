@@ -5,22 +5,22 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.core.progress import Progress
 from limber.estimation.fit import Estimate, fit_pulls
+from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import base_nodes
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.materials.young_field import young_weights
 from limber.mechanics.model import BranchModel
-from limber.mechanics.young_field import young_weights
-from limber.progress import Progress
-from limber.recordings.alignment import frames_of
 from limber.recordings.recording import Observations, Pull
+from limber.recordings.synchronisation import frames_of
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)
 

@@ -24,16 +24,16 @@ from benchmarks.planning_confidence import SURE_ROW, Sure, run_sure, sure_rows
 from benchmarks.planning_detours import DETOUR_ROWS, Detour, detour_rows, run_detour
 from benchmarks.planning_trials import Trial, no_path_seconds, run_trial
 from benchmarks.table import Asked, Part, Row, Setting
-from limber.errors import LimberError
-from limber.mechanics.reduced.cache import ReducedCache
-from limber.plain import plain
+from limber.core.errors import LimberError
+from limber.core.json_values import plain
+from limber.core.progress import Progress
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.learnt import LearntGraspModel
+from limber.planning.field.reduced_grasp import LearntGraspModel
 from limber.planning.field.sampling import Sampled, sample_field, sample_positions
-from limber.planning.goals import GraspGoal, default_goal
+from limber.planning.goals.goal import GraspGoal, default_goal
 from limber.planning.settings import EnergySettings
-from limber.progress import Progress
+from limber.reduced.model_cache import ReducedCache
 
 _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8), "%"),
            ("tip", "target position", 1e3, (1, 4), "mm"))

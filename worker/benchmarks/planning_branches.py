@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.paper_branches import BRANCHES, FRACTIONS, PaperBranch
+from limber.core.progress import SILENT, Progress
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.control_points import control_points
@@ -13,9 +14,8 @@ from limber.geometry.tets.marks import mark
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import mesh_branch
 from limber.mechanics import BranchModel, young_weights
-from limber.mechanics.loaded import hang
+from limber.mechanics.loads.loaded_branch import hang
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
-from limber.progress import SILENT, Progress
 
 ARC_NAMES = tuple(branch.name for branch in BRANCHES)
 _GRAVITY = (0.0, 0.0, -9.80665)

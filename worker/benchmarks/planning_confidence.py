@@ -6,13 +6,13 @@ import numpy as np
 
 from benchmarks.planning_branches import Subject
 from benchmarks.table import Asked, Row
-from limber.errors import LimberError, NoPathError
-from limber.planning.chance import YoungDoubt
+from limber.core.errors import LimberError, NoPathError
+from limber.planning.constraints.chance import YoungDoubt
+from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.goals import GraspGoal
-from limber.planning.limits import Limits
-from limber.planning.plan import PlannedMotion, plan_motion
-from limber.planning.resolve import ResolvedPath, SolvedPoses
+from limber.planning.goals.goal import GraspGoal
+from limber.planning.make_plan import PlannedMotion, plan_motion
+from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.settings import PlanSettings
 
 CONFIDENCE = 0.95

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from benchmarks.table import Asked, Row
-from limber.errors import LimberError
-from limber.planning.compare import plan_pair, random_start
+from limber.core.errors import LimberError
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.goals import GraspGoal
+from limber.planning.goals.goal import GraspGoal
 from limber.planning.settings import PlanSettings
+from limber.planning.two_paths import plan_pair, random_start
 
 SAVED, ADDED = 35.69, 8.10
 """Percent, means over the paper's three branches."""

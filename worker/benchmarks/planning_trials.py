@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.planning_optimum import best_cost
-from limber.errors import LimberError, NoPathError
-from limber.planning.compare import plan_within, random_start
+from limber.core.errors import LimberError, NoPathError
+from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals import GraspGoal, goal_points
-from limber.planning.limits import Limits
-from limber.planning.plan import plan_motion
+from limber.planning.goals.goal import GraspGoal, goal_points
+from limber.planning.make_plan import plan_motion
+from limber.planning.path_on_full_model import resolve_path
 from limber.planning.problem import GentleProblem
-from limber.planning.resolve import resolve_path
 from limber.planning.settings import PlanSettings
+from limber.planning.two_paths import plan_within, random_start
 
 _OPTIMUM_STARTS = 3
 

@@ -28,12 +28,12 @@ from benchmarks.robot_faults import (
 from benchmarks.robot_loop import LOOP_ROWS, closed_loops
 from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
 from benchmarks.table import Asked, Part, Row, Setting
-from limber.errors import LimberError
-from limber.robot.arms import ARMS
-from limber.robot.expected import ExpectedWrench
-from limber.robot.kinematics import forward, inverse
-from limber.robot.link import RobotLink
-from limber.robot.trajectory import Trajectory, along, densely
+from limber.core.errors import LimberError
+from limber.robot.driver.link import RobotLink
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.ur.arms import ARMS
+from limber.robot.ur.kinematics import forward, inverse
 from limber.robot.virtual.launch import VirtualRobot
 
 _ADDRESS = "127.0.0.71"

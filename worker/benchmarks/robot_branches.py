@@ -17,20 +17,20 @@ from benchmarks.held_up import Voided
 from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.table import Asked, Row, Setting
-from limber.errors import LimberError, SafetyStop
-from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.core.errors import LimberError, SafetyStop
+from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch
 from limber.geometry.tets.marks import base_nodes
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.mechanics import solve_static
-from limber.mechanics.young_field import young_weights
-from limber.robot.cell import ApproachEntry
-from limber.robot.execution import across
+from limber.mechanics.materials.young_field import young_weights
+from limber.robot.cell.cell import ApproachEntry
+from limber.robot.motion.execution import across
 from limber.robot.virtual.launch import VirtualRobot
-from limber.stages.execute import ExecuteOptions, ExecuteSettings, execute
-from limber.stages.loading import load_grasp_model, load_skeleton
-from limber.stages.virtual_pull import load_truth
+from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
+from limber.stages.pulls.virtual_pull import load_truth
 from limber.store import Branch
+from limber.store.loading import load_grasp_model, load_skeleton
 
 FRACTION = 0.85
 # So short that a solution of the virtual branch takes tens of milliseconds: over one that takes

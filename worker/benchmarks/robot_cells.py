@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.estimation.virtual_pull import VirtualPullSettings
-from limber.robot.arms import arm_named
-from limber.robot.cell import Cell, write_cell
-from limber.robot.execution import across
-from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
+from limber.estimation.simulated_pull import VirtualPullSettings
+from limber.robot.cell.cell import Cell, write_cell
+from limber.robot.motion.execution import across
+from limber.robot.ur.arms import arm_named
+from limber.robot.ur.kinematics import forward, inverted, matrices, pose_vectors
 from limber.robot.virtual.controller import HOME
-from limber.robot.virtual.held_branch import BranchSetting
+from limber.robot.virtual.gripped_branch import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
-from limber.stages.loading import load_skeleton
-from limber.stages.virtual_pull import load_truth
+from limber.stages.pulls.virtual_pull import load_truth
 from limber.store import Branch
+from limber.store.loading import load_skeleton
 
 GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import LimberError
-from limber.robot.cell import Cell
-from limber.robot.expected import ExpectedWrench
-from limber.robot.link import RobotLink
-from limber.robot.trajectory import Trajectory, along, densely
+from limber.core.errors import LimberError
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.link import RobotLink
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import SCRIPT_PORT
 

@@ -12,12 +12,12 @@ import numpy as np
 from benchmarks.held_up import Voided
 from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
-from limber.closed_loop.loop import GOAL_TOLERANCE_M, OPEN_FACTOR, ClosedLoop, comparison
-from limber.errors import LimberError
-from limber.progress import Progress
-from limber.terminal import table_lines
+from limber.cli.closed_loop.loop import GOAL_TOLERANCE_M, OPEN_FACTOR, ClosedLoop, comparison
+from limber.cli.terminal import table_lines
+from limber.core.errors import LimberError
+from limber.core.progress import Progress
 
-_PACKAGES = ("closed_loop", "robot", "planning", "estimation", "mechanics", "stages")
+_PACKAGES = ("cli", "robot", "planning", "estimation", "mechanics", "stages")
 
 
 @dataclass(frozen=True)

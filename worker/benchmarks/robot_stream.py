@@ -14,8 +14,8 @@ import psutil
 from benchmarks.robot_branches import FRACTION, random_branch
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.table import Asked, Row, Setting
-from limber.recordings.streams import read_stream
-from limber.stages.record import RecordOptions, RecordSettings, record
+from limber.recordings.time_series import read_stream
+from limber.stages.pulls.record import RecordOptions, RecordSettings, record
 from limber.store import Branch
 
 _DISTANCE_M = 0.012  # 20 times there and back with pauses take 630 s

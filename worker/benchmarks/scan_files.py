@@ -13,10 +13,10 @@ from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.scan_cases import one_sided_case, round_case
 from benchmarks.scan_scores import Dense
 from benchmarks.table import Asked, Row, Setting
-from limber.errors import LimberError
+from limber.core.errors import LimberError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.files import read_points
-from limber.geometry.reconstruct import Reconstruction, ReconstructSettings, reconstruct_cloud
+from limber.geometry.io.clouds import read_points
+from limber.geometry.reconstruction import Reconstruction, ReconstructSettings, reconstruct_cloud
 from limber.geometry.skeleton.skeleton import BRIDGED
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"

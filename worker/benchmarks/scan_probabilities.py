@@ -22,14 +22,14 @@ from benchmarks.kept_trials import keep, read_trials
 from benchmarks.scan_cases import ScanCase
 from benchmarks.scan_runs import KINDS, case_source
 from benchmarks.scan_scores import Dense, doubled, fork_matches, seen_part
-from limber.errors import LimberError
+from limber.core.errors import LimberError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import prepare
-from limber.geometry.leafy import without_leaves
-from limber.geometry.reconstruct import seen_skeleton
+from limber.geometry.io.skeletons import read_fitted, write_cylinders
+from limber.geometry.leaf_removal import without_leaves
+from limber.geometry.reconstruction import seen_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.confidence import evidence
-from limber.geometry.skeleton.files import read_fitted, write_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 

@@ -24,13 +24,13 @@ from benchmarks.scan_cases import (
 from benchmarks.scan_plants import crown_case, leafy_case
 from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_part
 from benchmarks.table import Setting
-from limber.alignment import Alignment
-from limber.errors import LimberError
-from limber.geometry.reconstruct import ReconstructSettings
-from limber.geometry.skeleton.files import read_fitted
+from limber.core.alignment import Alignment
+from limber.core.errors import LimberError
+from limber.geometry.io.skeletons import read_fitted
+from limber.geometry.reconstruction import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.stages.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import reconstruct
 
 KINDS: dict[str, Callable[[int], ScanCase]] = {
     "one-sided": one_sided_case, "2-mm": lambda seed: one_sided_case(seed, 0.002),

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from limber.estimation.predict import PredictSettings
+from limber.estimation.prediction import PredictSettings
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.mesh_surface import MeshSurfaceSettings
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -23,11 +23,11 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.importing import ImportSettings
-from limber.recordings.streams import Stream, write_stream
-from limber.stages.estimate import estimate
-from limber.stages.import_pull import import_pull
-from limber.stages.mesh import mesh_surface
-from limber.stages.predict import predict
+from limber.recordings.time_series import Stream, write_stream
+from limber.stages.moduli.estimate import estimate
+from limber.stages.moduli.predict import predict
+from limber.stages.pulls.import_pull import import_pull
+from limber.stages.shape.mesh import mesh_surface
 
 FOLDER = Path(__file__).parents[3] / "shared/data/silicone_beam"
 RECORDING, RECORDING_C3D = FOLDER / "beam_load52_V2_a.csv", FOLDER / "beam_load52_V2_a.c3d"

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.budget import Budget, parsed_seconds
-from limber.errors import Cancelled
-from limber.plain import plain
-from limber.progress import SILENT, BarSink, Progress
+from limber.core.errors import Cancelled
+from limber.core.json_values import plain
+from limber.core.progress import SILENT, BarSink, Progress
 
 NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans", "viewport",
          "worker")

@@ -9,7 +9,7 @@ from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Part, Row, Setting, share_met
 from benchmarks.truth_recordings import BAD_RECORDINGS, bad_recordings_row
 from benchmarks.truth_trials import Trial, trial
-from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.cell_errors import CalibrationEntry
 
 CELL = CalibrationEntry()
 CALIBRATED = CalibrationEntry(pose_sigma_m=2e-4, pose_sigma_rad=3.5e-3)

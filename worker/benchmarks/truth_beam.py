@@ -11,23 +11,23 @@ from benchmarks import silicone_beam
 from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.silicone_beam import BeamResult
 from benchmarks.table import Asked, Row, Setting
-from limber.errors import Cancelled, LimberError
+from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, PredictSettings, SwingSettings
 from limber.geometry.sections import Sections, mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import mark
-from limber.mechanics.added import PointMass
+from limber.mechanics.added_masses import PointMass
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.settings import ImportSettings
-from limber.recordings.streams import Stream, write_stream
-from limber.stages.estimate import estimate
-from limber.stages.import_pull import import_pull
-from limber.stages.mesh import mesh_surface
-from limber.stages.predict import predict
-from limber.stages.swing import swing
+from limber.recordings.time_series import Stream, write_stream
+from limber.stages.moduli.estimate import estimate
+from limber.stages.moduli.predict import predict
+from limber.stages.moduli.swing import swing
+from limber.stages.pulls.import_pull import import_pull
+from limber.stages.shape.mesh import mesh_surface
 from limber.store import Branch
 
 SWING_MESH = (6, 2, 2)

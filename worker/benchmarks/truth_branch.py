@@ -18,8 +18,8 @@ from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
-from limber.recordings.calibration import CalibrationEntry
-from limber.recordings.grasping import grasp_on
+from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import (
     GraspEntry,
     Observations,

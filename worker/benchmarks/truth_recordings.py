@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import PaperBranch
 from benchmarks.table import Asked, Row, Setting
-from limber.cli import call
+from limber.cli.main import call
 from limber.geometry.tets.marks import mark
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.grasping import grasp_on
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry
-from limber.recordings.streams import Stream, write_stream
+from limber.recordings.time_series import Stream, write_stream
 from limber.store import Branch
 
 YOUNG, WEIGHT = 2.5e7, 0.4

@@ -17,18 +17,18 @@ from benchmarks import truth_branch
 from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
 from benchmarks.truth_branch import drawn_cell, recorded
-from limber.errors import Cancelled, LimberError
+from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
-from limber.estimation.virtual_pull import simulate_pull
+from limber.estimation.simulated_pull import simulate_pull
 from limber.geometry.generated import generate_branch
-from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import write_pull
 from limber.recordings.settings import ImportSettings
-from limber.stages.estimate import estimate
-from limber.stages.generate import write_generated
-from limber.stages.import_pull import import_pull
-from limber.stages.reconstruct import reconstruct
-from limber.stages.virtual_pull import load_truth
+from limber.stages.moduli.estimate import estimate
+from limber.stages.pulls.import_pull import import_pull
+from limber.stages.pulls.virtual_pull import load_truth
+from limber.stages.shape.generate import write_generated
+from limber.stages.shape.reconstruct import reconstruct
 from limber.store import Branch
 
 VIEWS = ("round", "one-sided")

@@ -20,8 +20,8 @@ from limber.mechanics import (
     simulate_dynamics,
     solve_static,
 )
-from limber.mechanics.reduced.refresh import checked, estimate_error
-from limber.mechanics.reduced.training import TrainingSettings, sample_poses
+from limber.reduced.refresh import checked, estimate_error
+from limber.reduced.training import TrainingSettings, sample_poses
 
 _AMPLITUDES = (0.01, 0.25, 0.6)
 _STEPS = 1000

@@ -25,25 +25,25 @@ from benchmarks.truth_branch import (
     exact_pull,
     recorded,
 )
-from limber.errors import Cancelled, LimberError
-from limber.estimation.doubt.model_error import total_interval
-from limber.estimation.doubt.uncertainty import inverse_information
-from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.field_form import open_field
+from limber.core.errors import Cancelled, LimberError
+from limber.core.json_values import plain
+from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import Estimate, fit_branch, judge_model, require_result
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.interpolation_prior import open_field
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
-from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.subject import Subject
 from limber.estimation.summary import details, summary
+from limber.estimation.uncertainty.covariance import inverse_information
+from limber.estimation.uncertainty.model_error import total_interval
 from limber.geometry.skeleton.control_points import control_points
+from limber.mechanics.materials.young_field import young_weights
 from limber.mechanics.model import BranchModel
-from limber.mechanics.young_field import young_weights
-from limber.plain import plain
-from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull
-from limber.stages.suggest_pull import SuggestPullSettings
+from limber.stages.pulls.suggest_pull import SuggestPullSettings
 
 SETTINGS = EstimateSettings(hold_out=False)
 FIRST_PULL, FIRST_TURN = PullChoice(0.92, 0.0, 0.4), 2.0

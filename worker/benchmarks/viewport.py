@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.table import Asked, Part, Row, Setting
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
-from limber.scene.data import scene_data
+from limber.results.scene.contents import scene_data
 from limber.store import Branch
 
 _ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ from benchmarks.worker_branch_readers import Reader
 
 
 def _mcap(template: Path, folder: Path) -> list[Path]:
-    from limber.stages.export_pull import export_pull
+    from limber.stages.pulls.export_pull import export_pull
 
     path = folder / "pull.mcap"
     export_pull(template, "pull-1", path)
@@ -21,8 +21,8 @@ def _mcap(template: Path, folder: Path) -> list[Path]:
 
 def _bag(_template: Path, path: Path) -> Any:
     """A bag up to the pull that is made of it."""
-    from limber.recordings.bags.pull import pull_of_bag
-    from limber.recordings.bags.reading import read_bag
+    from limber.recordings.bags.bag_pull import pull_of_bag
+    from limber.recordings.bags.bag_reader import read_bag
     from limber.recordings.settings import ImportSettings
 
     with tempfile.TemporaryDirectory() as folder:

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import Asked, Row, Setting
-from limber.batch.job_file import StageTask
-from limber.batch.task import run_task
-from limber.jobs import Pool
-from limber.progress import SILENT
-from limber.stages.generate import GenerateInputs, GenerateSettings
+from limber.batch.jobs.job_file import StageTask
+from limber.batch.stage_task import run_task
+from limber.core.processes import Pool
+from limber.core.progress import SILENT
 from limber.stages.registry import stage_description
+from limber.stages.shape.generate import GenerateInputs, GenerateSettings
 
 RECONSTRUCT = '[[job.stage]]\nrun = "reconstruct"\n'
 _ESTIMATE = ('[[job.stage]]\nrun = "virtual-pull"\nname = "pull-1"\n'

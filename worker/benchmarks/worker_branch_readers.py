@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.files import file_digest
+from limber.core.files.atomic import file_digest
 from limber.store import Branch
 
 
@@ -73,8 +73,8 @@ def _in_folder(name: str, act: Callable[[Branch], Any], template: Path, path: Pa
 
 
 def _shown(branch: Branch) -> Any:
-    from limber.scene.data import scene_data
-    from limber.stages.loading import load_targets
+    from limber.results.scene.contents import scene_data
+    from limber.store.loading import load_targets
 
     data = scene_data(branch, targets=load_targets(branch))
     return {name: values for name, values in data.arrays.items()
@@ -82,7 +82,7 @@ def _shown(branch: Branch) -> Any:
 
 
 def _computed(branch: Branch) -> Any:
-    from limber.stages.loading import load_branch, load_skeleton
+    from limber.store.loading import load_branch, load_skeleton
 
     load_skeleton(branch)
     return load_branch(branch, gravity=False).model.mesh
@@ -93,7 +93,7 @@ def _shown_and_computed(branch: Branch) -> Any:
 
 
 def _masses(branch: Branch) -> Any:
-    from limber.stages.loading import load_masses, load_point_masses
+    from limber.store.loading import load_masses, load_point_masses
 
     return load_masses(branch), load_point_masses(branch)
 
@@ -101,7 +101,7 @@ def _masses(branch: Branch) -> Any:
 def _planned(branch: Branch) -> Any:
     """A plan's JSON and tables as scene and report show them."""
     from limber.planning.plan_file import read_plan
-    from limber.report.tables import comparison_rows
+    from limber.results.report.tables import comparison_rows
 
     plan = read_plan(branch.path("plans/to-goal.json"))
     comparison_rows(plan.summary)
@@ -118,7 +118,7 @@ def _sampled(branch: Branch) -> Any:
 def _estimated(branch: Branch) -> Any:
     """An estimate as the report tells it, and as `limber predict` takes it up to its solve."""
     from limber.estimation.estimate_file import read_estimate
-    from limber.report.tables import cause_rows, deviation_rows, held_out_rows, modulus_rows
+    from limber.results.report.tables import cause_rows, deviation_rows, held_out_rows, modulus_rows
 
     known = read_estimate(branch.path("estimate.json"))
     modulus_rows(known, None), cause_rows(known), deviation_rows(known), held_out_rows(known)
@@ -126,8 +126,8 @@ def _estimated(branch: Branch) -> Any:
 
 
 def _pulled(branch: Branch) -> Any:
-    from limber.recordings.checks import clean
     from limber.recordings.recording import read_pull
+    from limber.recordings.sensor_checks import clean
 
     return clean(read_pull(branch.path("pulls/pull-1"))), _shown(branch)
 
@@ -156,9 +156,9 @@ _TARGETS = {"format_version": 1, "targets": [
 
 def _search_file(template: Path, folder: Path) -> list[Path]:
     """What a search of the template's cloud would have come to, with a bit of everything."""
-    from limber.geometry.cloud.files import read_points
-    from limber.geometry.skeleton.files import read_skeleton
-    from limber.geometry.skeleton.found import FoundSkeleton
+    from limber.geometry.io.clouds import read_points
+    from limber.geometry.io.skeletons import read_skeleton
+    from limber.geometry.skeleton.checkpoint import FoundSkeleton
     from limber.geometry.skeleton.skeletonise import given_skeleton
 
     found = given_skeleton(read_skeleton(template / "skeleton.csv"),
@@ -175,26 +175,26 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
 
 def _searched(branch: Branch) -> Any:
     """A search as reconstruct takes it over: moved, told, and matched with points."""
-    from limber.geometry.skeleton.found import FoundSkeleton
+    from limber.geometry.skeleton.checkpoint import FoundSkeleton
 
     found = FoundSkeleton.read(branch.path("scan_skeleton.npz")).result
     return found.moved(lambda points: points + 1.0).report(), found.warnings, found.residual
 
 
 def _load(branch: Branch) -> Any:
-    from limber.report.loads import load_rows, read_load
+    from limber.results.report.loads_section import load_rows, read_load
 
     return load_rows(read_load(branch.path("loads/gale.json")))
 
 
 def _ringing(branch: Branch) -> Any:
-    from limber.report.ringing import vibration_rows
+    from limber.results.report.ringing_section import vibration_rows
 
     return vibration_rows(branch.path("vibration.json"))
 
 
 def _swing(branch: Branch) -> Any:
-    from limber.report.swings import along_its_way, read_swing, swing_rows
+    from limber.results.report.swing_section import along_its_way, read_swing, swing_rows
 
     swing = read_swing(branch.path("swing.json"))
     return swing_rows(swing), along_its_way(swing)

@@ -12,18 +12,18 @@ from scipy.linalg import eigh
 
 from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.table import Asked, Row, Setting
-from limber.exports.abaqus import inp_text
-from limber.exports.mjcf import mjcf_text
-from limber.exports.usd import as_deformable
+from limber.core.progress import SILENT
 from limber.geometry.generated import generate_branch
-from limber.geometry.reconstruct import mesh_skeleton
+from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.mechanics.dynamics.modes import lowest_modes
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
-from limber.mechanics.rods import matched, rod_tree
 from limber.mechanics.statics.solve import solve_static
-from limber.mechanics.vibration import lowest_modes
-from limber.progress import SILENT
+from limber.results.exports.abaqus import inp_text
+from limber.results.exports.mjcf import mjcf_text
+from limber.results.exports.rigid_links import matched, rod_tree
+from limber.results.exports.usd import as_deformable
 
 _LINKS = 30
 _SHARE = 0.01
@@ -46,7 +46,7 @@ EXPORT_ROWS = tuple(Asked(f"export in {label}, worst: static tip; first frequenc
 
 def exported(setting: Setting) -> list[Row]:
     """Generated branches, weightless and hanging, in MuJoCo; weightless in CalculiX."""
-    source = source_digest(("exports", "mechanics", "geometry"), __file__)
+    source = source_digest(("results/exports", "mechanics", "geometry"), __file__)
     trials = numbers_of("exports", setting.seeds(20, 2), partial(_bent, source=source), source,
                         setting.kept / "worker-exports.jsonl", setting.budget,
                         progress=setting.progress)
@@ -75,7 +75,7 @@ def _bent(seed: int, source: str) -> Numbers:
             found[usd] = _apart(ours, bent_as_usd(model, node, load))
             if (theirs := bent_in_calculix(model, node, load)) is not None:
                 found[calculix] = _apart(ours, theirs)
-    return Numbers("exports", seed, source, found)
+    return Numbers("results/exports", seed, source, found)
 
 
 def _row(asked: Asked, errors: list[tuple[float, float]]) -> Row:

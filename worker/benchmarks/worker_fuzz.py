@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.table import Setting
 from benchmarks.worker_mutations import mutated
 from benchmarks.worker_readers import READERS, Reader
-from limber.errors import LimberError
+from limber.core.errors import LimberError
 
 MOST_SECONDS = 10.0
 MOST_BYTES = 2 << 30
@@ -192,7 +192,7 @@ def _not_finite(value: Any, may_lack: bool, place: str = "result", depth: int = 
 
 
 def _main(template: Path) -> None:
-    import limber.stages.loading  # noqa: F401  (imports take memory that no file asked for)
+    import limber.store.loading  # noqa: F401  (imports take memory that no file asked for)
 
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

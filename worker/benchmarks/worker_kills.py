@@ -65,7 +65,7 @@ def killed(setting: Setting) -> list[Row]:
 
     Only those count at which the batch was still running; those that an earlier run made count too.
     """
-    sources = source_digest(("store", "batch", "jobs", "stages", "geometry"), __file__)
+    sources = source_digest(("store", "batch", "core", "stages", "geometry"), __file__)
     kept, kills = setting.kept / "kills.jsonl", setting.at_most(30, 3)
     made = {kill.number: kill for kill in read_trials(Kill, kept)
             if (kill.seed, kill.sources) == (setting.seed, sources) and kill.number < kills}

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.worker_bag_readers import BAG_READERS
 from benchmarks.worker_branch_readers import BRANCH_READERS, Reader, template_file
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.store import Branch
 
 
@@ -89,7 +89,7 @@ def _arrays(suffix: str, _template: Path, folder: Path) -> list[Path]:
 
 
 def _cloud(_template: Path, path: Path) -> Any:
-    from limber.geometry.cloud.files import read_points
+    from limber.geometry.io.clouds import read_points
 
     cloud = read_points(path)
     return cloud.points
@@ -106,7 +106,7 @@ def _pixels(_template: Path, folder: Path) -> list[Path]:
 
 
 def _depth(_template: Path, path: Path) -> Any:
-    from limber.geometry.cloud.depth_files import read_depth
+    from limber.geometry.io.depth_images import read_depth
 
     with tempfile.TemporaryDirectory() as folder:
         return read_depth(path, _camera_file(_template, Path(folder))[0]).points
@@ -143,7 +143,7 @@ def _intrinsics(_template: Path, folder: Path) -> list[Path]:
 
 def _rgbd(name: str, _template: Path, path: Path) -> Any:
     """An RGB-D folder with one of its lists changed."""
-    from limber.recordings.frames import copy_rgbd
+    from limber.recordings.image_folders import copy_rgbd
     from limber.recordings.settings import ImportSettings
 
     with tempfile.TemporaryDirectory() as place:
@@ -235,7 +235,7 @@ def _calipers(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_calipers(_template: Path, path: Path) -> Any:
-    from limber.geometry.skeleton.qsm import read_calipers
+    from limber.geometry.skeleton.qsm_tables import read_calipers
 
     return read_calipers(path)
 
@@ -249,15 +249,15 @@ def _decay(name: str, column: str, _template: Path, folder: Path) -> list[Path]:
 
 
 def _ring(_template: Path, path: Path) -> Any:
-    from limber.estimation.ringing import identify, read_record
+    from limber.estimation.vibration.ringing import identify, read_record
 
     record = read_record(path)
     return identify(record.times, record.values)
 
 
 def _wind(_template: Path, path: Path) -> Any:
-    from limber.mechanics.gust_loads import WindRecord
-    from limber.mechanics.gusts import Swaying, recorded
+    from limber.mechanics.loads.gust_loads import WindRecord
+    from limber.mechanics.loads.gust_response import Swaying, recorded
 
     wind = WindRecord.read(path)
     return recorded(Swaying(np.ones(1), np.full(1, 0.05), np.ones(1)), wind.times, wind.speeds)
@@ -288,7 +288,7 @@ def _jobs(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_jobs(_template: Path, path: Path) -> Any:
-    from limber.batch.job_file import read_jobs
+    from limber.batch.jobs.job_file import read_jobs
 
     (path.parent / "a.xyz").write_text("0 0 0\n")
     read_jobs(path)
@@ -296,7 +296,7 @@ def _read_jobs(_template: Path, path: Path) -> Any:
 
 def _cell(_template: Path, folder: Path) -> list[Path]:
     from benchmarks.robot_faults import cell_for
-    from limber.robot.cell import write_cell
+    from limber.robot.cell.cell import write_cell
 
     path = folder / "cell.toml"
     write_cell(path, cell_for("127.0.0.71"))
@@ -304,7 +304,7 @@ def _cell(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_cell(_template: Path, path: Path) -> Any:
-    from limber.robot.cell import read_cell
+    from limber.robot.cell.cell import read_cell
 
     return read_cell(path)
 
@@ -339,7 +339,7 @@ def _read_commands(_template: Path, path: Path) -> Any:
     return understood
 
 def _cylinder_models(suffix: str, template: Path, folder: Path) -> list[Path]:
-    from limber.stages.export import ExportSettings, export
+    from limber.stages.results.export import ExportSettings, export
 
     files = [folder / f"tree{suffix}"]
     export(template, files[0], ExportSettings())
@@ -347,7 +347,7 @@ def _cylinder_models(suffix: str, template: Path, folder: Path) -> list[Path]:
 
 
 def _skeleton(_template: Path, path: Path) -> Any:
-    from limber.geometry.skeleton.files import read_skeleton
+    from limber.geometry.io.skeletons import read_skeleton
 
     return read_skeleton(path)
 
@@ -376,7 +376,7 @@ def _addon_read(module: str, function: str, _template: Path, path: Path) -> Any:
 
 
 def _scene_file(template: Path, folder: Path) -> list[Path]:
-    from limber.scene.data import scene_data
+    from limber.results.scene.contents import scene_data
 
     path = folder / "scene.npz"
     scene_data(Branch.open(template)).write(path)
@@ -418,7 +418,7 @@ def _log(_template: Path, path: Path) -> Any:
 
 
 def _swc(_template: Path, path: Path) -> Any:
-    from limber.geometry.skeleton.files import read_swc
+    from limber.geometry.io.skeletons import read_swc
 
     return read_swc(path)
 

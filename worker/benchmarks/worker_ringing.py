@@ -7,15 +7,15 @@ import numpy as np
 
 from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
-from limber.estimation.ringing import identify
+from limber.core.progress import SILENT
+from limber.estimation.vibration.ringing import identify
 from limber.geometry.generated import generate_branch
-from limber.geometry.reconstruct import mesh_skeleton
+from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.mechanics.dynamics.modes import Modes, lowest_modes
 from limber.mechanics.model import BranchModel
-from limber.mechanics.vibration import Modes, lowest_modes
-from limber.progress import SILENT
-from limber.stages.vibration import VibrationSettings, young_of
+from limber.stages.moduli.vibration import VibrationSettings, young_of
 
 _DENSITY, _POISSON, _YOUNG = 800.0, 0.35, 1e9
 _EACH = 10

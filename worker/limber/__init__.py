@@ -4,7 +4,7 @@ The core and the headless worker. Nothing in this package imports ``bpy``: the B
 (folder ``addon``) is one of its callers, the command ``limber`` is another.
 """
 
-from limber.threads import one_thread as _one_thread
+from limber.core.threads import one_thread as _one_thread
 from limber.version import VERSION as __version__
 
 # Before any module of Limber loads a library, in each process: no result may depend on threads.

@@ -1,6 +1,6 @@
 """``python -m limber``: the command ``limber``, for where scripts are not on the PATH."""
 
-from limber.cli import run
+from limber.cli.main import run
 
 if __name__ == "__main__":
     run()

@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.geometry.cloud.apart import read_apart
-from limber.geometry.cloud.files import read_points
+from limber.core.errors import InputError
+from limber.geometry.io.clouds import read_points
+from limber.geometry.io.isolated_readers import read_apart
 
 PLY = "ply\nformat {form} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n" \
       "property float z\nend_header\n"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.camera import (
     D455,
     Camera,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.depth_files import read_depth
-from limber.geometry.cloud.files import read_cloud, read_points
+from limber.geometry.io.clouds import read_cloud, read_points
+from limber.geometry.io.depth_images import read_depth
 
 POINTS = np.random.default_rng(0).normal(size=(200, 3)).round(5)
 

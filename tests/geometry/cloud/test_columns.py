@@ -5,7 +5,7 @@ import pytest
 
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
-from limber.geometry.cloud.files import read_points
+from limber.geometry.io.clouds import read_points
 
 COUNT = 40
 POINTS = np.random.default_rng(1).normal(size=(COUNT, 3)).round(3)

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 from benchmarks.scan_cases import one_sided_case
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.files import read_cloud
 from limber.geometry.cloud.leaves import Leaf, _with_rims, find_leaves
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.generated import generate_branch
-from limber.geometry.leafy import check_agreed, without_leaves
-from limber.geometry.reconstruct import _MOSTLY, reconstruct_cloud
+from limber.geometry.io.clouds import read_cloud
+from limber.geometry.leaf_removal import check_agreed, without_leaves
+from limber.geometry.reconstruction import _MOSTLY, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import skeletonise
-from limber.stages.loading import load_point_masses
-from limber.stages.reconstruct import reconstruct
-from limber.stages.skeleton import review_skeleton
+from limber.stages.shape.edit_skeleton import review_skeleton
+from limber.stages.shape.reconstruct import reconstruct
 from limber.store import Branch
+from limber.store.loading import load_point_masses
 
 LONG, WIDE = 0.07, 0.02
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.geometry.cloud.own_frame import OwnFrame
+from limber.geometry.cloud.canonical_frame import OwnFrame
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(3000, 3)) ** 3 * [1.0, 0.3, 0.1]

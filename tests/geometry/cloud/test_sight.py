@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.scan_scores import score
 from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.files import read_points
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
-from limber.geometry.cloud.sight import find_sight, flying_pixels
+from limber.geometry.cloud.single_view import find_sight, flying_pixels
 from limber.geometry.generated import GeneratedBranch, generate_branch
+from limber.geometry.io.clouds import read_points
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.perception.simulated_camera import render_depth, with_noise
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubts import start_angle
-from limber.geometry.skeleton.mending.backwards import without_backward_starts
+from limber.geometry.skeleton.doubtful_parts import start_angle
+from limber.geometry.skeleton.repair.backwards import without_backward_starts
 from limber.geometry.skeleton.skeleton import Skeleton
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from limber.geometry.io.skeletons import read_fitted, write_cylinders
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
-from limber.geometry.skeleton.files import read_fitted, write_cylinders
 from limber.geometry.skeleton.radii.along_runs import tapered
 from limber.geometry.skeleton.skeleton import (
     BRIDGED,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubts import DoubtKind, doubtful_parts
+from limber.geometry.skeleton.doubtful_parts import DoubtKind, doubtful_parts
 from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.alignment import Alignment
-from limber.errors import InputError
+from limber.core.alignment import Alignment
+from limber.core.errors import InputError
 from limber.geometry.skeleton.edits import EDITS, edited, edits_text, read_edits
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 

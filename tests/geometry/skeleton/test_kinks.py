@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubts import KINK, DoubtKind, doubtful_parts, turns
-from limber.geometry.skeleton.mending.kinks import without_kinks
+from limber.geometry.skeleton.doubtful_parts import KINK, DoubtKind, doubtful_parts, turns
+from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.errors import InputError, MissingDependencyError
-from limber.geometry.skeleton.cylinder_models import (
+from limber.core.errors import InputError, MissingDependencyError
+from limber.geometry.io.cylinder_models import (
     TREEQSM_FIELDS,
     mat_v73_fields,
     read_treeqsm,

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.reconstruct import reconstruct_cloud
+from limber.geometry.reconstruction import reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.contraction.pieces import join_pieces, second_base
 from limber.geometry.skeleton.skeleton import Skeleton

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.skeleton.plausibility import shows_round
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
-from limber.geometry.skeleton.qsm import (
+from limber.core.errors import InputError
+from limber.geometry.skeleton.qsm_tables import (
     Caliper,
     against_calipers,
     by_order,

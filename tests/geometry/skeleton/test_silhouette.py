@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
-from limber.geometry.cloud.sight import View
+from limber.geometry.cloud.single_view import View
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 from limber.perception.simulated_camera import render_depth, with_noise
-from limber.stages.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import reconstruct
 
 EYE = np.array([1.0, 0.0, 0.3])
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
+from limber.geometry.io.skeletons import read_cylinders, read_swc, write_cylinders
 from limber.geometry.skeleton.control_points import control_points
-from limber.geometry.skeleton.files import read_cylinders, read_swc, write_cylinders
 from limber.geometry.skeleton.radii.axis_fit import attached
 from limber.geometry.skeleton.skeleton import Skeleton
 

@@ -5,7 +5,8 @@ import pytest
 
 from benchmarks.scan_cases import round_case
 from benchmarks.scan_scores import score
-from limber.errors import Cancelled, InputError
+from limber.core.errors import Cancelled, InputError
+from limber.core.progress import Progress
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import cloud_laplacian, contract
 from limber.geometry.skeleton.contraction.tangent_laplacian import tangent_laplacian
@@ -17,7 +18,6 @@ from limber.geometry.skeleton.skeletonise import (
     skeletonise,
     thinned,
 )
-from limber.progress import Progress
 
 RNG = np.random.default_rng(0)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from limber.cli import call
-from limber.errors import InputError
+from limber.cli.main import call
+from limber.core.errors import InputError
+from limber.geometry.io.surfaces import usable_surface
 from limber.geometry.mesh_surface import MeshSurfaceSettings
-from limber.geometry.surface.input import usable_surface
 from limber.geometry.surface.surface import Surface
-from limber.stages.mesh import mesh_surface
+from limber.stages.shape.mesh import mesh_surface
 
 FILE = Path("bar.stl")
 

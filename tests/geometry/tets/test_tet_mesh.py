@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import EDGES, FACES, TetMesh
 from limber.geometry.tets.tree_sweep import sweep_tree

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements import shapes as elements
 

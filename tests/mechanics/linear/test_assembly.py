@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 from tests.subjects.meshes import box_mesh
 
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp
 from limber.mechanics.grasp import rotation_matrix
@@ -16,7 +17,6 @@ from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.linear.fronts import make_fronts, postordered
 from limber.mechanics.statics.solve import solve_prescribed
 from limber.mechanics.strain import deformation_gradients, principal_stretch
-from limber.sparse import NotPositiveDefiniteError
 
 MATERIALS = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")
 

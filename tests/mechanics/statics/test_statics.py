@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh, round_mesh
 
-from limber.errors import ConvergenceError, InputError
+from limber.core.errors import ConvergenceError, InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import (
     BranchModel,

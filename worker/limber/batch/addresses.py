@@ -15,10 +15,10 @@ from typing import Any
 
 from filelock import FileLock
 
-from limber.errors import InputError, LimberError, MissingDependencyError, WorkError
-from limber.files import write_atomically
-from limber.optional import require_extra
-from limber.owner import owned_name, sweep_beside
+from limber.core.errors import InputError, LimberError, MissingDependencyError, WorkError
+from limber.core.files.atomic import write_atomically
+from limber.core.files.temporary_names import owned_name, sweep_beside
+from limber.core.optional import require_extra
 from limber.store.branch import LEAST_FREE_BYTES
 
 # One letter before the colon is a drive.

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import LimberError
-from limber.geometry.skeleton.files import read_swc
+from limber.core.errors import LimberError
+from limber.geometry.io.skeletons import read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.scene.colours import colour_scale, css_colours
+from limber.results.scene.colours import colour_scale, css_colours
 
 HEIGHT = 150
 """Of a picture [pixels]."""

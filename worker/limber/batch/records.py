@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from limber.batch.job_file import BranchJob, JobFile, StageTask
-from limber.owner import is_alive
-from limber.present import present
-from limber.store.streams import Stream, stream_lines
+from limber.batch.jobs.job_file import BranchJob, JobFile, StageTask
+from limber.core.files.temporary_names import is_alive
+from limber.core.present import present
+from limber.store.growing_files import Stream, stream_lines
 
 _LEAST_LINES, _MOST_TIMES = 2000, 4
 """The file is shortened when it has so many lines, and so many times those that still count."""

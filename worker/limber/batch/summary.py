@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from limber.batch.job_file import BranchJob, JobFile
+from limber.batch.jobs.job_file import BranchJob, JobFile
 from limber.batch.pictures import pictures
 from limber.batch.records import (
     DONE,
@@ -22,7 +22,7 @@ from limber.batch.records import (
     path_of_page,
     path_of_table,
 )
-from limber.files import write_atomically
+from limber.core.files.atomic import write_atomically
 from limber.version import VERSION
 
 _COLORS = {DONE: "#2d7a3a", KEPT: "#6c9a74", FAILED: "#b3261e", RUNNING: "#1f5fa8",

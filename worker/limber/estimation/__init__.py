@@ -11,21 +11,21 @@ Traceback (most recent call last):
 pydantic_core._pydantic_core.ValidationError: ...
 """
 
-from limber.lazy import exports
+from limber.core.lazy import exports
 
 _PLACES = {
     "Estimate": "fit",
     "EstimateSettings": "settings",
-    "EvaluationLog": "evaluations",
+    "EvaluationLog": "fitting.evaluations",
     "OnlineEstimator": "online.filter",
     "PredictSettings": "settings",
-    "Subject": "subject",
+    "Subject": "estimated_branch",
     "VirtualPullSettings": "settings",
     "fit_branch": "fit",
-    "predict_rest": "predict",
-    "simulate_pull": "virtual_pull",
-    "subject_of": "subject",
-    "true_branch": "virtual_pull",
+    "predict_rest": "prediction",
+    "simulate_pull": "simulated_pull",
+    "subject_of": "estimated_branch",
+    "true_branch": "simulated_pull",
 }
 
 __getattr__, __dir__ = exports(__name__, _PLACES)

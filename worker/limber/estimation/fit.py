@@ -9,46 +9,50 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled, InputError, WorkError
-from limber.estimation.doubt.causes import largest, variance_parts
-from limber.estimation.doubt.grip_error import grip_error
-from limber.estimation.doubt.identifiability import (
+from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_preparation import (
+    forwards_of,
+    parameter_space,
+    require_scale_in_principle,
+)
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.initial_modulus import led_start, scaled_start, standing_start
+from limber.estimation.fitting.nuisances import in_words, told, unlikely
+from limber.estimation.fitting.objective import Objective, Stopped, held_out, without
+from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
+from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
+from limber.estimation.forward.forward_model import Forward, under_its_weight
+from limber.estimation.parameters import Values
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.uncertainty.covariance import Uncertainty, outliers, uncertainty
+from limber.estimation.uncertainty.grip_error import grip_error
+from limber.estimation.uncertainty.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
     identifiability,
     link_unresolved,
     require_scale,
 )
-from limber.estimation.doubt.model_error import (
+from limber.estimation.uncertainty.marginal import averaged
+from limber.estimation.uncertainty.model_error import (
     ModelError,
     geometry_error,
     mesh_error,
     observer,
     steady_loads,
 )
-from limber.estimation.doubt.path_error import led_by_path, path_error
-from limber.estimation.doubt.profile import profiled
-from limber.estimation.doubt.shape_error import hung_error, shape_error
-from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
-from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.forward.forward import Forward, under_its_weight
-from limber.estimation.marginal import averaged
-from limber.estimation.nuisances import in_words, told, unlikely
-from limber.estimation.objective import Objective, Stopped, held_out, without
-from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
-from limber.estimation.parameters import Values
-from limber.estimation.preparation import forwards_of, parameter_space, require_scale_in_principle
-from limber.estimation.reduced_fit import Reduction, fit_reduced
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.start import led_start, scaled_start, standing_start
-from limber.estimation.subject import Subject
-from limber.present import present
-from limber.progress import SILENT, Progress
-from limber.recordings.calibration import calibration_of
-from limber.recordings.checks import force_unit_suspicion
-from limber.recordings.grasping import grasp_on
+from limber.estimation.uncertainty.path_error import led_by_path, path_error
+from limber.estimation.uncertainty.profile_likelihood import profiled
+from limber.estimation.uncertainty.shape_error import hung_error, shape_error
+from limber.estimation.uncertainty.variance_parts import largest, variance_parts
+from limber.recordings.cell_errors import calibration_of
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
-from limber.sparse import NotPositiveDefiniteError
+from limber.recordings.sensor_checks import force_unit_suspicion
 
 MISFIT_FACTOR = 4.0
 """Mean squared residual over the expected one from which model and pull do not belong together:
@@ -236,7 +240,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
 
     Args:
         cache, digest: Where bases of reduced models are kept, and what they depend on; see
-            :class:`limber.estimation.reduced_fit.Reduction`.
+            :class:`limber.estimation.fitting.reduced_fit.Reduction`.
     """
     require_scale_in_principle(objective.forwards)
     reduction = None

@@ -14,13 +14,13 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from limber.errors import WorkError
+from limber.core.errors import WorkError
+from limber.core.progress import SILENT, Progress
+from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult
-from limber.mechanics.dynamics.simulate import NewmarkSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.progress import SILENT, Progress
 
 SETTINGS = StaticSettings(tolerance=1e-8)
 TURNED_PART = 0.7

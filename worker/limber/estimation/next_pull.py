@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from limber.errors import LimberError, WorkError
+from limber.core.errors import LimberError, WorkError
+from limber.core.processes import run_tasks
+from limber.core.progress import SILENT, Progress
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.fitting.objective import Objective
 from limber.estimation.gripper_path import MotionWanted, moved
-from limber.estimation.objective import Objective
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
-from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.subject import Subject
-from limber.jobs import run_tasks
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.strain import strain_state
-from limber.progress import SILENT, Progress
-from limber.recordings.calibration import CalibrationEntry, calibration_of
-from limber.recordings.grasping import grasp_on
+from limber.recordings.cell_errors import CalibrationEntry, calibration_of
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import (
     GraspEntry,
     Observations,

@@ -23,7 +23,7 @@ class Values:
         density: [kg/m^3].
         damping: Rayleigh's alpha [1/s] and beta [s].
         form: How the modulus runs between the control points, in deviations from what is
-            expected (:mod:`limber.estimation.field_form`); empty: as expected.
+            expected (:mod:`limber.estimation.interpolation_prior`); empty: as expected.
     """
 
     young: np.ndarray

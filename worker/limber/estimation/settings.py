@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.settings import Groups, Settings
+from limber.core.settings import Groups, Settings
 
 if TYPE_CHECKING:
     import numpy as np

@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from limber.estimation.doubt.causes import largest
-from limber.estimation.doubt.model_error import total_interval
-from limber.estimation.doubt.uncertainty import outliers
+from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import Estimate
-from limber.estimation.objective import Evaluation, Objective
+from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.subject import Subject
+from limber.estimation.uncertainty.covariance import outliers
+from limber.estimation.uncertainty.model_error import total_interval
+from limber.estimation.uncertainty.variance_parts import largest
 from limber.recordings.recording import Pull
 
 

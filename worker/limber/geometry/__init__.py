@@ -8,14 +8,14 @@ A generated branch and its scan, with the truth beside it:
 (1, True, (4,))
 """
 
-from limber.lazy import exports
+from limber.core.lazy import exports
 
 _PLACES = {
     "BranchSpec": "settings",
     "Cloud": "cloud.cloud",
     "MeshSurfaceSettings": "settings",
     "ReconstructSettings": "settings",
-    "Reconstruction": "reconstruct",
+    "Reconstruction": "reconstruction",
     "Skeleton": "skeleton.skeleton",
     "Surface": "surface.surface",
     "TetMesh": "tets.tet_mesh",
@@ -23,8 +23,8 @@ _PLACES = {
     "generate_branch": "generated",
     "mesh_body": "mesh_surface",
     "mesh_branch": "tets.tetrahedra",
-    "read_points": "cloud.files",
-    "reconstruct_cloud": "reconstruct",
+    "read_points": "io.clouds",
+    "reconstruct_cloud": "reconstruction",
     "straight_beam": "tets.cylinder_mesh",
 }
 

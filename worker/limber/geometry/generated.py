@@ -8,14 +8,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
+from limber.core.files.reading import checked_as, read_json
+from limber.core.settings import checked_settings
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.settings import BranchSpec
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, tangents
 from limber.geometry.surface.surface import Surface
-from limber.reading import checked_as, read_json
-from limber.settings import checked_settings
 
 _Positive = Annotated[float, Field(gt=0)]
 _STEP = 0.004  # [m] between nodes of the true axes

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from limber.alignment import Alignment
-from limber.constants import UNIT_METRES
-from limber.errors import InputError, MeshingError
-from limber.geometry.reconstruct import gravity_after, peak_memory_mb
+from limber.core.alignment import Alignment
+from limber.core.constants import UNIT_METRES
+from limber.core.errors import InputError, MeshingError
+from limber.core.progress import SILENT, Progress
+from limber.geometry.reconstruction import gravity_after, peak_memory_mb
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -18,7 +19,6 @@ from limber.geometry.tets.marks import mark
 from limber.geometry.tets.quality import measure_quality
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
-from limber.progress import SILENT, Progress
 
 
 @dataclass(frozen=True)

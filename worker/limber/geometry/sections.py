@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from limber.constants import UNIT_METRES
-from limber.errors import InputError
+from limber.core.constants import UNIT_METRES
+from limber.core.errors import InputError
+from limber.core.files.reading import read_text
 from limber.geometry.mesh_surface import MeshedBody, aligned_body, numbers_of
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
@@ -22,7 +23,6 @@ from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.cylinder_mesh import swept
 from limber.geometry.tets.marks import mark
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.reading import read_text
 
 COLUMNS = ("x", "y", "z", "width", "height")
 MASS = "mass_kg"

@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from limber.settings import Direction, Groups, Settings
+from limber.core.settings import Direction, Groups, Settings
 
 GRASP_FRACTION = 2.0 / 3.0
 """Where a branch is held, along its main path, if nothing is said."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.contraction.pieces import join_pieces
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
@@ -9,7 +10,6 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.tubes import branch_surface
-from limber.progress import SILENT, Progress
 
 
 def warm_up(progress: Progress = SILENT) -> None:

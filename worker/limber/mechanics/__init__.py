@@ -13,28 +13,28 @@ A beam of 20 cm, its end pushed aside by a centimetre:
 (True, True)
 """
 
-from limber.lazy import exports
+from limber.core.lazy import exports
 
 _PLACES = {
     "BranchModel": "model",
-    "DynamicResult": "dynamics.simulate",
+    "DynamicResult": "dynamics.integration",
     "Grasp": "grasp",
-    "Material": "materials",
+    "Material": "materials.materials",
     "EnergyMomentumSettings": "dynamics.motion",
     "NewmarkSettings": "dynamics.motion",
     "ParameterSet": "sensitivities",
-    "HungTwig": "added",
-    "PointMass": "added",
-    "RayleighDamping": "materials",
+    "HungTwig": "added_masses",
+    "PointMass": "added_masses",
+    "RayleighDamping": "materials.materials",
     "StaticResult": "statics.solve",
     "StaticSensitivities": "sensitivities",
     "StaticSettings": "statics.solve",
     "follow_poses": "statics.solve",
-    "simulate_dynamics": "dynamics.simulate",
+    "simulate_dynamics": "dynamics.integration",
     "solve_static": "statics.solve",
     "static_sensitivities": "sensitivities",
     "unloaded_rest_shape": "statics.rest_shape",
-    "young_weights": "young_field",
+    "young_weights": "materials.young_field",
 }
 
 __getattr__, __dir__ = exports(__name__, _PLACES)

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements.shapes import node_weights
 from limber.mechanics.grip import nodes_between, parts_between

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from limber.compiled import for_kernels
-from limber.constants import GRAVITY
-from limber.errors import InputError
+from limber.core.constants import GRAVITY
+from limber.core.errors import InputError
+from limber.core.numerics.compiled import for_kernels
+from limber.geometry.tets.mesh_checks import check_mesh, fixed_mask
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.added import PointMass, Tied, mass_entries, nodal_masses, tied
+from limber.mechanics.added_masses import PointMass, Tied, mass_entries, nodal_masses, tied
 from limber.mechanics.elements import shapes as elements
 from limber.mechanics.elements.forces import (
     ForceLayout,
@@ -26,9 +27,8 @@ from limber.mechanics.elements.forces import (
 from limber.mechanics.elements.principal import largest_principal_strains
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.grip import stiffening
-from limber.mechanics.hanging import Hanging, carried
 from limber.mechanics.linear.equations import Equations, Viscous
-from limber.mechanics.materials import (
+from limber.mechanics.materials.materials import (
     Material,
     RayleighDamping,
     check_poisson,
@@ -36,7 +36,7 @@ from limber.mechanics.materials import (
     lame,
     per_tet,
 )
-from limber.mechanics.mesh_checks import check_mesh, fixed_mask
+from limber.mechanics.prestress import Hanging, carried
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
@@ -110,9 +110,9 @@ class BranchModel:
         density: Density [kg/m^3], likewise.
         fixed: Fixed nodes, mask [node_count] or indices; default the mesh's point data ``fixed``.
         gravity: Acceleration [m/s^2], or None.
-        material: Name of a limber.mechanics.materials.Material.
+        material: Name of a limber.mechanics.materials.materials.Material.
         damping: Rayleigh damping, used in dynamics.
-        point_masses: Added masses, and twigs (:class:`limber.mechanics.added.HungTwig`).
+        point_masses: Added masses, and twigs (:class:`limber.mechanics.added_masses.HungTwig`).
         lumped_mass: Diagonal mass matrix instead of the consistent one, but for twigs.
 
     Attributes:
@@ -225,7 +225,7 @@ class BranchModel:
     def as_scanned(self) -> "BranchModel":
         """Return the model that hangs in its mesh's shape: weight acts, and is carried there.
 
-        Weight of what is hung on later bends it further. See :mod:`limber.mechanics.hanging`.
+        Weight of what is hung on later bends it further. See :mod:`limber.mechanics.prestress`.
 
         Raises:
             NotPositiveDefiniteError: the mesh cannot bear anything.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from limber.mechanics.materials import Material
+from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import BranchModel
 
 ALL = slice(None)

@@ -2,13 +2,12 @@
 
 import numpy as np
 
+from limber.core.progress import SILENT, Progress
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.dynamics.simulate import simulate_dynamics
-from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.dynamics.integration import simulate_dynamics
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.mechanics.reduced.strain import compile_kernels
 from limber.mechanics.sensitivities import ParameterSet
-from limber.progress import SILENT, Progress
 
 
 def warm_up(progress: Progress = SILENT) -> None:
@@ -20,13 +19,11 @@ def warm_up(progress: Progress = SILENT) -> None:
     corners = 0.01 * np.vstack([np.zeros(3), np.eye(3)])
     mesh = TetMesh(corners, np.array([[0, 1, 2, 3]])).quadratic()
     for number, damping in enumerate((RayleighDamping(), RayleighDamping(0.0, 0.0))):
-        progress(number / 3, "compiling kernels")
+        progress(number / 2, "compiling kernels")
         model = BranchModel(mesh, young=1e7, poisson=0.3, density=900.0, damping=damping,
                             fixed=np.array([0, 1, 2]))
         simulate_dynamics(model, times=np.array([0.0, 0.01]), sensitivities=ParameterSet())
     rest = np.zeros_like(mesh.nodes)
     # Nothing is solved for forces that are 0.
     model.equations().tangent(model, rest).solve_all(3 * [rest + 1.0])
-    progress(2 / 3, "compiling kernels")
-    compile_kernels()
     progress(1.0, "compiling kernels")

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError
+from limber.core.errors import InputError
+from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera
 from limber.geometry.cloud.pixels import read_pixels
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
-from limber.progress import SILENT, Progress
-from limber.recordings.alignment import poses_at
 from limber.recordings.masks import read_mask, segment_by_depth
 from limber.recordings.recording import Observations, Pull
+from limber.recordings.synchronisation import poses_at
 
 CAMERA_OFFSET_M = 4e-3
 """A camera pose that is off by more at the branch is corrected, with a warning [m]."""
@@ -135,7 +135,7 @@ def _loader(folder: Path, kind: str) -> Callable[[Path], SeenCloud]:
 
 
 def _read_cloud(path: Path, camera: Camera | None) -> SeenCloud:
-    from limber.geometry.cloud.files import read_cloud
+    from limber.geometry.io.clouds import read_cloud
 
     try:
         points = read_cloud(path, unit="m").points

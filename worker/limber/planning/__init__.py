@@ -5,27 +5,27 @@ Positions for the grasp within a branch's reach:
 >>> import numpy as np
 >>> from limber.planning import sample_positions
 >>> from limber.planning.field.grasp_model import Reach
->>> from limber.planning.field.valley import Valley
+>>> from limber.planning.field.low_energy_surface import Valley
 >>> reach = Reach(np.zeros(3), arc_length=0.5, chord=0.48, tip=np.array([0, 0, 0.6]))
 >>> shell = Valley(np.array([0, 0, 0.1]), radius=0.38)
 >>> sample_positions(reach, np.array([0, 0, 0.48]), 32, shell, deflection=0.4).shape
 (32, 3)
 """
 
-from limber.lazy import exports
+from limber.core.lazy import exports
 
 _PLACES = {
     "EnergyField": "field.energy_field",
     "EnergySettings": "settings",
-    "GraspGoal": "goals",
+    "GraspGoal": "goals.goal",
     "GraspModel": "field.grasp_model",
     "GraspSamples": "field.energy_field",
     "PlanSettings": "settings",
-    "PlannedMotion": "plan",
-    "TargetGoal": "goals",
+    "PlannedMotion": "make_plan",
+    "TargetGoal": "goals.goal",
     "fit_field": "field.energy_field",
     "grasp_model_of": "field.grasp_model",
-    "plan_motion": "plan",
+    "plan_motion": "make_plan",
     "sample_branch": "field.sampling",
     "sample_field": "field.sampling",
     "sample_positions": "field.sampling",

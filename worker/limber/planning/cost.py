@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
 
 STEP = 0.005

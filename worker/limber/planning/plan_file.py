@@ -28,12 +28,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from limber.errors import InputError
-from limber.plain import plain
-from limber.planning.limits import Limits, with_unit
-from limber.planning.resolve import ResolvedPath, SolvedPoses
+from limber.core.errors import InputError
+from limber.core.files.reading import checked_as, read_json
+from limber.core.json_values import plain
+from limber.planning.constraints.limits import Limits, with_unit
+from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.timing import DEFAULT_PACE, Pace, times_along
-from limber.reading import checked_as, read_json
 
 FORMAT = 2
 _WAYS = ("baseline", "plan")

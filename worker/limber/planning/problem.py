@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.errors import NoPathError
+from limber.core.errors import NoPathError
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
-from limber.planning.goals import Goal
+from limber.planning.goals.goal import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
 
@@ -29,8 +29,8 @@ class GentleProblem:
     may be longer than ``longest`` [m]; bounds do without that limit, and hold with it as well.
 
     ``beyond`` are limits that the field exceeds only where the branch exceeds those that were
-    asked for (:meth:`~limber.planning.limits.Limits.beyond`). Bounds and proofs count on them
-    alone; without them no limit proves anything.
+    asked for (:meth:`~limber.planning.constraints.limits.Limits.beyond`). Bounds and proofs count
+    on them alone; without them no limit proves anything.
     """
 
     energy_field: EnergyField

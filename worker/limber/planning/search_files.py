@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import BranchFolderError
-from limber.reading import read_arrays, read_text, require_shapes
+from limber.core.errors import BranchFolderError
+from limber.core.files.reading import read_arrays, read_text, require_shapes
 
 _POSITION = ("x_m", "y_m", "z_m")
 _WHAT = "a plan's bound"

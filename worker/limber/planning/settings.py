@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from limber.settings import Groups, Settings
+from limber.core.settings import Groups, Settings
 
 
 class EnergySettings(Settings):

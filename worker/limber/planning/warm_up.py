@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from limber.planning.compare import PlanSettings, plan_pair
+from limber.core.progress import SILENT, Progress
 from limber.planning.field.energy_field import GraspSamples, fit_field
-from limber.planning.goals import GraspGoal
-from limber.progress import SILENT, Progress
+from limber.planning.goals.goal import GraspGoal
+from limber.planning.two_paths import PlanSettings, plan_pair
 
 
 def warm_up(progress: Progress = SILENT) -> None:

@@ -8,7 +8,7 @@ How a recording is described, in SI units:
 ('pose', 'quasi_static')
 """
 
-from limber.lazy import exports
+from limber.core.lazy import exports
 
 _PLACES = {
     "GraspEntry": "recording",
@@ -17,9 +17,9 @@ _PLACES = {
     "Pull": "recording",
     "PullEntry": "recording",
     "SensorEntry": "recording",
-    "clean": "checks",
+    "clean": "sensor_checks",
     "force_slope": "force_slope",
-    "frames_of": "alignment",
+    "frames_of": "synchronisation",
     "import_recording": "importing",
     "read_pull": "recording",
     "read_table": "tables",

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from limber.constants import FORCE_UNITS_N
-from limber.errors import InputError
-from limber.recordings.streams import saturated
+from limber.core.constants import FORCE_UNITS_N
+from limber.core.errors import InputError
 from limber.recordings.tables import (
     FORCE_NAMES_N,
     LENGTH_UNITS_M,
@@ -18,6 +17,7 @@ from limber.recordings.tables import (
     scale_of,
     split_title,
 )
+from limber.recordings.time_series import saturated
 
 NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
 """Force over the unloaded reading that counts as contact [N]; a drop of twice as much is a slip."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.recordings.recording import Observations
 
 FRAMES = 4

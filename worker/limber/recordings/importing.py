@@ -9,21 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from limber.alignment import Alignment
-from limber.constants import GRAVITY
-from limber.errors import InputError
-from limber.geometry.cloud.apart import read_apart
-from limber.names import refuse_links
-from limber.present import present
-from limber.progress import SILENT, Progress
-from limber.recordings.alignment import estimate_offset
-from limber.recordings.bags.pull import JointPoses, pull_of_bag
-from limber.recordings.bags.reading import LIMBER, Bag, is_bag, read_bag
-from limber.recordings.calibration import WITHOUT_GRIPPER, CalibrationEntry
-from limber.recordings.checks import clean
+from limber.core.alignment import Alignment
+from limber.core.constants import GRAVITY
+from limber.core.errors import InputError
+from limber.core.files.safe_names import refuse_links
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.geometry.io.isolated_readers import read_apart
+from limber.recordings.bags.bag_pull import JointPoses, pull_of_bag
+from limber.recordings.bags.bag_reader import LIMBER, Bag, is_bag, read_bag
+from limber.recordings.cell_errors import WITHOUT_GRIPPER, CalibrationEntry
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
-from limber.recordings.frames import copy_clouds, copy_rgbd, moved_into
 from limber.recordings.hung_load import settled, swung
+from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into
 from limber.recordings.recording import (
     POSE_COLUMNS,
     WRENCH_COLUMNS,
@@ -39,8 +37,9 @@ from limber.recordings.recording import (
     write_pull,
 )
 from limber.recordings.registration import Registration, read_nominal, register
+from limber.recordings.sensor_checks import clean
 from limber.recordings.settings import ImportSettings
-from limber.recordings.streams import MAD_TO_SIGMA, Stream
+from limber.recordings.synchronisation import estimate_offset
 from limber.recordings.tables import (
     LENGTH_UNITS_M,
     is_robot_table,
@@ -50,6 +49,7 @@ from limber.recordings.tables import (
     split_title,
     with_columns,
 )
+from limber.recordings.time_series import MAD_TO_SIGMA, Stream
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from limber.errors import InputError, MissingDependencyError, WorkError
+from limber.core.errors import InputError, MissingDependencyError, WorkError
 from limber.geometry.cloud.pixels import read_pixels
 
 

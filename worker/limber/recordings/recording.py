@@ -13,11 +13,11 @@ import numpy as np
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from limber.errors import InputError
-from limber.plain import plain
-from limber.reading import read_toml
-from limber.recordings.calibration import CalibrationEntry
-from limber.recordings.streams import Stream, read_stream, write_stream
+from limber.core.errors import InputError
+from limber.core.files.reading import read_toml
+from limber.core.json_values import plain
+from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.time_series import Stream, read_stream, write_stream
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 WRENCH_COLUMNS = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split_title
 
 POOR_FIT_M = 5e-3

@@ -1,6 +1,6 @@
 """Tables of other programs: where header, columns, units and time are, whatever they are called.
 
-A recorder's own CSV has what :mod:`limber.recordings.streams` reads. Others separate by
+A recorder's own CSV has what :mod:`limber.recordings.time_series` reads. Others separate by
 semicolons or tabs, write a preamble above the header, put units in brackets, call time "Time
 Stamp" and count it in milliseconds; here they become streams in SI units, at the door.
 """
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.constants import FORCE_UNITS_N
-from limber.errors import InputError
+from limber.core.constants import FORCE_UNITS_N
+from limber.core.errors import InputError
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
-from limber.recordings.streams import Stream, in_order
+from limber.recordings.time_series import Stream, in_order
 
 LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "metres": 1.0,
                   "meters": 1.0, "millimetres": 1e-3, "millimeters": 1e-3, "inch": 0.0254}

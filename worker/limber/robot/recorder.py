@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from limber.errors import WorkError
-from limber.recordings.calibration import CalibrationEntry
+from limber.core.errors import WorkError
+from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, SensorEntry
-from limber.robot.cell import Cell
-from limber.robot.kinematics import inverted, matrices, pose_vectors
+from limber.robot.cell.cell import Cell
+from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
 
 _FRAMES_FOR_NOISE = 15
 _LEAST_NOISE_M = 1e-4  # a tracker that smooths its points hides their noise
@@ -36,7 +36,7 @@ class PullRecorder:
     Attributes:
         count: Samples written.
         peak_force: [N].
-        last: The last sample taken, shape [37] as in :data:`limber.robot.link.COLUMNS`.
+        last: The last sample taken, shape [37] as in :data:`limber.robot.driver.link.COLUMNS`.
     """
 
     def __init__(self, lines: Lines, point: np.ndarray, compliance: float = 0.0):

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import InputError, WorkError
-from limber.present import present
-from limber.session.frames import Frame, FrameReader
+from limber.core.errors import InputError, WorkError
+from limber.core.present import present
+from limber.session.frame_buffer import Frame, FrameReader
 from limber.session.protocol import PROTOCOL
 from limber.session.settings import SessionSettings
 from limber.version import VERSION
@@ -151,7 +151,7 @@ class InteractiveSession:
         record = question.get("gust_record")
         if isinstance(record, str | os.PathLike):
             # It loads the mechanics, which a client has no other need of.
-            from limber.mechanics.gust_loads import WindRecord
+            from limber.mechanics.loads.gust_loads import WindRecord
 
             wind = WindRecord.read(Path(record))
             question["gust_record"] = {"time_s": wind.times.tolist(),

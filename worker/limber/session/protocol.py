@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 
 PROTOCOL = 2
 """Of commands, events and the frames' file; a client of another one is told so."""

@@ -10,7 +10,7 @@ It holds the full model, so that the session never waits for it. JSON lines, as 
   whenever a model is ready, and ``{"event": "check", "position_error", "energy_error", "certain",
    "good", "learned"}``.
 
-A model is kept in the cache of :mod:`limber.mechanics.reduced.cache`.
+A model is kept in the cache of :mod:`limber.reduced.model_cache`.
 """
 
 import argparse
@@ -26,19 +26,19 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled, LimberError
+from limber.core.errors import Cancelled, LimberError
+from limber.core.progress import JsonSink, Progress
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.reduced.cache import (
+from limber.reduced.model_cache import (
     LearntModel,
     ReducedCache,
     default_folder,
     learnt_model,
     model_key,
 )
-from limber.mechanics.reduced.model import as_control_points
-from limber.mechanics.reduced.refresh import RefreshingModel
-from limber.progress import JsonSink, Progress
-from limber.session.loading import load_held, reduced_settings
+from limber.reduced.reduced_model import as_control_points
+from limber.reduced.refresh import RefreshingModel
+from limber.session.opening import load_held, reduced_settings
 from limber.session.settings import SessionSettings
 
 

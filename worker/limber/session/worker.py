@@ -44,7 +44,7 @@ Events, one JSON object a line on standard output; a client may leave them unrea
 
 - ``{"event": "hello", "protocol": 2, "limber", "positions": PATH, "vertex_count", "control_count",
   "targets", "grasps", "rest_pose", "young_pa", "gravity_on", "extent_m"}``: frames are in the file
-  PATH (limber.session.frames); the first shows the branch as it hangs.
+  PATH (limber.session.frame_buffer); the first shows the branch as it hangs.
 - ``{"event": "compiling"}``: before ``hello``, where what is fast later has to be compiled first:
   once after an installation, for up to a minute.
 - ``{"event": "reply", "id", "command", ...}`` and ``{"event": "error", "id", "command",
@@ -78,22 +78,22 @@ from typing import Any
 
 import numpy as np
 
-from limber.compiled import when_compiling
-from limber.errors import InputError, LimberError
-from limber.mechanics.added import PointMass
-from limber.mechanics.outdoors import Outdoors
-from limber.mechanics.reduced.strain import compile_kernels
-from limber.progress import Progress
+from limber.core.errors import InputError, LimberError
+from limber.core.numerics.compiled import when_compiling
+from limber.core.progress import Progress
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.loads.outdoor import Outdoors
+from limber.reduced.strain_polynomial import compile_kernels
 from limber.session import protocol
-from limber.session.answering import Answering
-from limber.session.effects import EffectsTeller
-from limber.session.events import Events
-from limber.session.frames import FrameWriter
-from limber.session.held import Answer
+from limber.session.event_writer import Events
+from limber.session.frame_buffer import FrameWriter
 from limber.session.inbox import Inbox, Received, read_commands
-from limber.session.learning import Checked, Learnt
-from limber.session.loading import load_held
+from limber.session.model_choice import Answering
+from limber.session.opening import load_held
+from limber.session.outdoor_effects import EffectsTeller
+from limber.session.session_branch import Answer
 from limber.session.settings import SessionSettings
+from limber.session.trainer_process import Checked, Learnt
 from limber.version import VERSION
 
 _SWITCH_SECONDS = 0.001

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from limber.settings import Groups, Settings
+from limber.core.settings import Groups, Settings
 
 
 def argument(description: str) -> Any:

@@ -1,6 +1,6 @@
 """The registry of stages: the one source of commands, options, schemas and job tables.
 
-A stage is a module of this folder that assigns ``STAGE = StageDescription("name", ...)``. Its
+A stage is a module below this folder that assigns ``STAGE = StageDescription("name", ...)``. Its
 docstring is the command's help, the first line what ``limber --help`` says of it. The names are
 found without importing anything, so that ``limber --help`` waits for no package.
 """
@@ -13,10 +13,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from limber.progress import Progress
+from limber.core.progress import Progress
 
 if TYPE_CHECKING:
-    from limber.settings import Settings
+    from limber.core.settings import Settings
 
 FORMAT = 1
 """Of the schemas that :func:`all_schemas` returns."""
@@ -54,23 +54,30 @@ class StageDescription:
 
 
 @cache
-def stage_summaries() -> dict[str, str]:
-    """Return what each stage does in one line, by name, in the order in which they run."""
+def _stages() -> dict[str, tuple[str, str]]:
+    """Return the module and the summary of each stage, in the order in which they run."""
     found = []
-    for path in Path(__file__).parent.glob("*.py"):
+    folder = Path(__file__).parent
+    for path in folder.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in tree.body:
             if (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
                     and getattr(node.targets[0], "id", "") == "STAGE"):
                 name, position = (ast.literal_eval(part) for part in node.value.args[:2])
                 summary = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
-                found.append((position, name, summary))
-    return {name: summary for _position, name, summary in sorted(found)}
+                module = ".".join(path.relative_to(folder).with_suffix("").parts)
+                found.append((position, name, module, summary))
+    return {name: (module, summary) for _position, name, module, summary in sorted(found)}
+
+
+def stage_summaries() -> dict[str, str]:
+    """Return what each stage does in one line, by name, in the order in which they run."""
+    return {name: summary for name, (_module, summary) in _stages().items()}
 
 
 def stage_module(name: str) -> Any:
     """Return the module of a stage."""
-    return importlib.import_module(f"limber.stages.{name.replace('-', '_')}")
+    return importlib.import_module(f"limber.stages.{_stages()[name][0]}")
 
 
 def stage_description(name: str) -> StageDescription:

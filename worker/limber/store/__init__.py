@@ -1,12 +1,12 @@
 """The branch folder on disk: manifest, stages that enter whole or not at all, locks, streams."""
 
-from limber.alignment import Alignment
-from limber.constants import GRAVITY
-from limber.files import file_digest, write_atomically
-from limber.plain import plain
+from limber.core.alignment import Alignment
+from limber.core.constants import GRAVITY
+from limber.core.files.atomic import file_digest, write_atomically
+from limber.core.json_values import plain
 from limber.store.branch import Branch, BranchFolderError, Stage
+from limber.store.growing_files import Stream, stream_lines
 from limber.store.manifest import FORMAT_VERSION, MANIFEST, program_versions
-from limber.store.streams import Stream, stream_lines
 from limber.store.verify import Damage, damage_error, unlisted
 
 __all__ = [

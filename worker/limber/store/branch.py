@@ -26,14 +26,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from limber.constants import GRAVITY
-from limber.errors import BranchFolderError, InputError, WorkError
-from limber.files import file_digest, flush_folder, write_atomically
-from limber.machine_errors import machine_error
-from limber.names import inside, refuse_links
-from limber.owner import is_owned_name, owned_name, sweep, sweep_beside
-from limber.plain import plain
+from limber.core.constants import GRAVITY
+from limber.core.errors import BranchFolderError, InputError, WorkError
+from limber.core.files.atomic import file_digest, flush_folder, write_atomically
+from limber.core.files.safe_names import inside, refuse_links
+from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
+from limber.core.json_values import plain
+from limber.core.machine_errors import machine_error
 from limber.store import journal
+from limber.store.growing_files import Stream
 from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, run_lock, wait_for_commit
 from limber.store.manifest import (
     MANIFEST,
@@ -44,12 +45,11 @@ from limber.store.manifest import (
     program_versions,
     read_manifest,
 )
-from limber.store.streams import Stream
 from limber.store.verify import Checker, Damage, damage_error
 
 _STREAMS = ".streams"
 RESULTS = "results"
-"""Among a stage's programs: the version of its settings' results; see limber.settings."""
+"""Among a stage's programs: the version of its settings' results; see limber.core.settings."""
 LEAST_FREE_BYTES = 200e6
 """A stage does not begin with less room on the disk: it would lose its work at the end."""
 

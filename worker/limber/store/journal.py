@@ -10,9 +10,9 @@ import shlex
 import shutil
 from pathlib import Path
 
-from limber.errors import BranchFolderError
-from limber.files import flush_folder, flush_tree
-from limber.names import inside
+from limber.core.errors import BranchFolderError
+from limber.core.files.atomic import flush_folder, flush_tree
+from limber.core.files.safe_names import inside
 from limber.store.manifest import MANIFEST, Manifest, read_manifest
 
 _COMMIT = ".commit"

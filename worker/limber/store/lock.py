@@ -17,8 +17,8 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, Timeout
 
-from limber.errors import BranchBusyError, BranchFolderError
-from limber.files import write_atomically
+from limber.core.errors import BranchBusyError, BranchFolderError
+from limber.core.files.atomic import write_atomically
 
 COMMIT_LOCK = ".lock"
 RUN_LOCK = ".run.lock"

@@ -11,11 +11,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from limber.alignment import Alignment
-from limber.errors import BranchFolderError, InputError
-from limber.machine_errors import machine_error
-from limber.names import relative_name
-from limber.reading import read_json
+from limber.core.alignment import Alignment
+from limber.core.errors import BranchFolderError, InputError
+from limber.core.files.reading import read_json
+from limber.core.files.safe_names import relative_name
+from limber.core.machine_errors import machine_error
 from limber.version import VERSION
 
 FORMAT_VERSION = 2

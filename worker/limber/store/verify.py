@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from limber.errors import BranchFolderError
-from limber.files import file_digest
-from limber.owner import is_owned_name
+from limber.core.errors import BranchFolderError
+from limber.core.files.atomic import file_digest
+from limber.core.files.temporary_names import is_owned_name
 from limber.store import journal
 from limber.store.manifest import MANIFEST, FileEntry, Manifest, read_manifest
 

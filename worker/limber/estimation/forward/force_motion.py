@@ -7,9 +7,9 @@ of the undeformed branch: the change is small, and wanted as a weight, not as a 
 
 import numpy as np
 
+from limber.mechanics.dynamics.modes import subspace_round
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.model import BranchModel
-from limber.mechanics.vibration import subspace_round
 
 MODES = 16
 """That carry the change of a motion; the rest follows statically. Chosen, not measured."""

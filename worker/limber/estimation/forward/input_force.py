@@ -19,8 +19,8 @@ from limber.estimation.forward.key_frames import key_frames, smoothed
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import refined_solve
-from limber.recordings.alignment import Frames
 from limber.recordings.recording import GraspEntry
+from limber.recordings.synchronisation import Frames
 
 COURSE_MISFIT = 1.5
 """Mean squared deviation of readings from their course, over the stated, from which the course

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.errors import InputError, WorkError
-from limber.estimation.field_form import YoungField
-from limber.estimation.forward.forward import Forward, Simulated, under_its_weight
+from limber.core.errors import InputError, WorkError
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.present import present
+from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import (
     Course,
     Response,
@@ -17,19 +18,18 @@ from limber.estimation.forward.input_force import (
 )
 from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.gripper_path import force_for_travel
+from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import rotation_matrix
-from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.present import present
-from limber.recordings.alignment import Frames
-from limber.recordings.grasping import grasp_on, pose_on
+from limber.recordings.recorded_grasp import grasp_on, pose_on
 from limber.recordings.recording import PullEntry
-from limber.sparse import NotPositiveDefiniteError
+from limber.recordings.synchronisation import Frames
 
 SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200, way_back=False)
 """From the state before, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch of

@@ -4,7 +4,7 @@ Each frame adds its linearised residuals to what is known. A linearisation made 
 were still wrong would stay wrong for ever; so a number of frames spread over the pull are kept,
 and with every new one an old one is linearised again at the moduli of now.
 
-What the reduced model gets wrong is measured beside (limber.estimation.online.exact): the full
+What the reduced model gets wrong is measured beside (limber.estimation.online.full_model): the full
 model at a few of the kept frames, interpolated between them. How well a new one was foretold by
 those before widens the intervals: an error of the model is the same in all frames, and does not
 average out as noise does.
@@ -17,14 +17,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy
 
-from limber.estimation.online.exact import Beside, ExactFrame, Here
+from limber.core.present import present
+from limber.estimation.online.full_model import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
-from limber.mechanics.reduced.model import ReducedModel, ReducedState, ReducedStaticSettings
-from limber.present import present
-from limber.recordings.grasping import pose_on
+from limber.recordings.recorded_grasp import pose_on
 from limber.recordings.recording import GraspEntry
+from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
 
 STEP_LIMIT = 0.7
 """Largest change of a log E by one frame."""

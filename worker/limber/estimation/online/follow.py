@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled, InputError
-from limber.estimation.doubt.model_error import ModelError, geometry_error, total_interval
-from limber.estimation.forward.forward import under_its_weight
-from limber.estimation.objective import Objective
-from limber.estimation.online.exact import Beside, FullBranch, Here
+from limber.core.errors import Cancelled, InputError
+from limber.core.progress import SILENT, Progress
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_preparation import forwards_of
+from limber.estimation.fitting.initial_modulus import scaled_start
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.optimise import gauss_newton
+from limber.estimation.forward.forward_model import under_its_weight
 from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
-from limber.estimation.optimise import gauss_newton
+from limber.estimation.online.full_model import Beside, FullBranch, Here
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.preparation import forwards_of
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.start import scaled_start
-from limber.estimation.subject import Subject
-from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, build_reduced
-from limber.mechanics.reduced.training import TrainingSettings
-from limber.progress import SILENT, Progress
-from limber.recordings.alignment import frames_of
-from limber.recordings.checks import clean
-from limber.recordings.grasping import grasp_on
+from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval
+from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import Observations, Pull, read_pull
+from limber.recordings.sensor_checks import clean
+from limber.recordings.synchronisation import frames_of
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings, build_reduced
+from limber.reduced.training import TrainingSettings
 
 SAID = {
     "enough": "every modulus is known to 2 %; another pull would add nothing that matters.",

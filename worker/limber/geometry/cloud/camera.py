@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from limber.errors import InputError
-from limber.reading import read_toml
+from limber.core.errors import InputError
+from limber.core.files.reading import read_toml
 
 _MOST = 1e6
 """No camera's number is larger, whatever its unit; or smaller than one over it."""

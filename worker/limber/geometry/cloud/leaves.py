@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from limber.geometry.cloud.own_frame import OwnFrame
+from limber.geometry.cloud.canonical_frame import OwnFrame
 from limber.geometry.cloud.preparation import voxel_thinned
 
 _CELL = 0.25  # of a scale: as finely is the cloud looked at there

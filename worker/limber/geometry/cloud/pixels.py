@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 LARGEST_PIXELS = 100_000_000

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.ground import find_ground
 from limber.geometry.cloud.scan_lines import scan_line_view
 from limber.geometry.cloud.sheets import find_sheet
-from limber.geometry.cloud.sight import Sight, View, find_sight, flying_pixels
+from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels
 from limber.geometry.settings import PreparationSettings
 
 POINT_MINIMUM = 50

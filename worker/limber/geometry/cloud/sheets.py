@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.geometry.cloud.own_frame import own_order
+from limber.geometry.cloud.canonical_frame import own_order
 
 _SAMPLE = 400
 _ENOUGH = 150  # points that tell a plane

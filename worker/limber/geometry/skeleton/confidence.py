@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.doubts import start_angle
+from limber.geometry.skeleton.doubtful_parts import start_angle
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import (
     BRIDGED,

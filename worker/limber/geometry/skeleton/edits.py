@@ -17,8 +17,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scipy.spatial import cKDTree
 
-from limber.alignment import Alignment
-from limber.errors import InputError
+from limber.core.alignment import Alignment
+from limber.core.errors import InputError
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 
 Place = tuple[float, float, float]

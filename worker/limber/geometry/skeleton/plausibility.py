@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
 from limber.geometry.skeleton.contraction.laplacian_contraction import ContractionStatus
 from limber.geometry.skeleton.skeleton import Skeleton

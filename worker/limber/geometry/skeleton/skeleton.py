@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.alignment import Alignment
-from limber.errors import InputError
+from limber.core.alignment import Alignment
+from limber.core.errors import InputError
 
 MEASURED, LIMITED, INTERPOLATED, UNRESOLVED, BRIDGED = 0, 1, 2, 3, 4
 """Values of ``radius_state``: fitted to points, limited to the cloud's scale, filled in, too

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.geometry.cloud.own_frame import OwnFrame, own_axes
+from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.canonical_frame import OwnFrame, own_axes
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
 from limber.geometry.skeleton.contraction.curve_graph import (
@@ -24,8 +25,6 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import (
 )
 from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
 from limber.geometry.skeleton.contraction.pieces import second_base
-from limber.geometry.skeleton.mending.backwards import without_backward_starts
-from limber.geometry.skeleton.mending.kinks import without_kinks
 from limber.geometry.skeleton.plausibility import (
     Where,
     check_no_sheet,
@@ -49,9 +48,10 @@ from limber.geometry.skeleton.radii.axis_fit import (
     resampled,
 )
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.repair.backwards import without_backward_starts
+from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 from limber.geometry.skeleton.totals import totals
-from limber.progress import SILENT, Progress
 
 FIT_POINT_LIMIT = 60_000
 """More points than that do not make the fit better, only slower."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.skeleton.confidence import given_carrier
-from limber.geometry.skeleton.qsm import cylinders
+from limber.geometry.skeleton.qsm_tables import cylinders
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
 _TOGETHER = 10.0  # median radii of a run, over which errors of its radii go together

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import MeshingError
+from limber.core.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import polygon_factor, tangents
-from limber.geometry.surface.checks import SurfaceCheck, check_surface, crossings
 from limber.geometry.surface.cross_sections import SPACING, run_axis, sides_of_runs
 from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.rounded_union import distances, fillet_level, near_box, segments
 from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.surface_checks import SurfaceCheck, check_surface, crossings
 from limber.geometry.surface.tubes import largest_piece, solid
 
 ROUNDING = 0.5

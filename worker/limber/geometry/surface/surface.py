@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import InputError
-from limber.geometry.cloud.announced import check_ply
+from limber.core.errors import InputError
+from limber.core.files.declared_sizes import check_ply
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import MeshingError
+from limber.core.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, polygon_factor, rings, tangents
-from limber.geometry.surface.checks import crossings
 from limber.geometry.surface.cross_sections import SPACING, run_axis, sides_of_runs
 from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.surface_checks import crossings
 
 
 @dataclass(frozen=True)

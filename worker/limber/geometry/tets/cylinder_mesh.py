@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.skeleton.sweep import frames, resample, rings, tangents
 from limber.geometry.tets.tet_mesh import TetMesh
 

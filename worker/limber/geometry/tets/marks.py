@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import MeshingError
+from limber.core.errors import MeshingError
 from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton

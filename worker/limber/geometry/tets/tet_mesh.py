@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 
 EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
 """Corners of the six edges of a tetrahedron, in VTK's order of the mid-side nodes."""

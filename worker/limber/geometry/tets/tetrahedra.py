@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.caches import TETRAHEDRA_BYTES, cache_folder, trim
-from limber.errors import InputError, MeshingError, MissingDependencyError
+from limber.core.errors import InputError, MeshingError, MissingDependencyError
+from limber.core.files.caches import TETRAHEDRA_BYTES, cache_folder, trim
+from limber.core.files.reading import read_arrays, require_shapes
+from limber.core.progress import SILENT, Progress
 from limber.geometry.settings import MeshSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetwild_process import run_tetwild
-from limber.progress import SILENT, Progress
-from limber.reading import read_arrays, require_shapes
 
 _CACHE_VERSION = 1
 _LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTetWild's time

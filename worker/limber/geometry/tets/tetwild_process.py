@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import MeshingError, MissingDependencyError
-from limber.jobs.ending import end_by_kernel, kill_tree
-from limber.jobs.pool import memory_mb
-from limber.progress import SILENT, Progress
+from limber.core.errors import MeshingError, MissingDependencyError
+from limber.core.processes.ending import end_by_kernel, kill_tree
+from limber.core.processes.pool import memory_mb
+from limber.core.progress import SILENT, Progress
 
 
 def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, epsilon: float,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import MeshingError
+from limber.core.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import any_normal, bending_factor, frames, rings, tangents
 from limber.geometry.tets.cylinder_mesh import split_wedges

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
+from limber.core.present import present
 from limber.mechanics.dynamics.pose_path import PosePath
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Equations
@@ -13,7 +14,6 @@ from limber.mechanics.motion_state import MotionState
 from limber.mechanics.statics.problem import checked_forces
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
-from limber.present import present
 
 
 class Drive:

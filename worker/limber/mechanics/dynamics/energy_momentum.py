@@ -17,15 +17,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.present import present
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
-from limber.mechanics.materials import Material, neo_hookean_energy, neo_hookean_stress
+from limber.mechanics.materials.materials import Material, neo_hookean_energy, neo_hookean_stress
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
-from limber.present import present
-from limber.sparse import NotPositiveDefiniteError
 
 _STRAIN_CHANGE = 1e-6
 """Under this change of the strain in a step its cube, which Gonzalez' part is of, is round-off."""

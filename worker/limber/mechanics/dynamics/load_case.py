@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.mechanics.dynamics.simulate import MotionSettings, simulate_dynamics
+from limber.core.present import present
+from limber.core.progress import Progress
+from limber.mechanics.dynamics.integration import MotionSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
-from limber.present import present
-from limber.progress import Progress
 
 
 @dataclass(frozen=True)

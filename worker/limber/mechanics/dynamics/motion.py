@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from limber.errors import ConvergenceError, InputError
+from limber.core.errors import ConvergenceError, InputError
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
 

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.present import present
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
-from limber.present import present
-from limber.sparse import NotPositiveDefiniteError
 
 _GOOD_TANGENT = 1e-3
 """Part of the residual that a tangent's own solve may leave for the next step to begin with it:

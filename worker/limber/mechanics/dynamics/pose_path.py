@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp
 
 _DIFFERENCE = 2e-5

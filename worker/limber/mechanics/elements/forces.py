@@ -9,7 +9,7 @@ Shared arguments:
     displacement: Node displacements [m], shape [node_count, 3].
     gradients, weights, nodes: From :class:`ForceLayout`.
     lame_lambda, lame_mu: Lamé coefficients [Pa], shape [batch, LANES].
-    material: limber.mechanics.materials.Material as int.
+    material: limber.mechanics.materials.materials.Material as int.
     growth, memory: In motion the stress is that of the strain ``growth * E + memory``: viscous
         stress (Kelvin-Voigt) follows the strain's rate, and a difference formula gives that rate
         from the strain now and the strains before, which are the memory, [tet_count, q, 6] (00
@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 from limber.mechanics.elements.stiffness import deformation, gather, gradient, green_strain
 from limber.mechanics.elements.stiffness_pairs import LANES
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 from limber.mechanics.elements.stiffness import deformation, gather, green_strain
 from limber.mechanics.elements.stiffness_pairs import LANES
 

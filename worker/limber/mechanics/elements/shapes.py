@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 CURVED_TOLERANCE = 1e-6

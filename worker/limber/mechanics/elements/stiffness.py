@@ -12,7 +12,7 @@ behind the end of the values.
 
 import numpy as np
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 from limber.mechanics.elements.stiffness_pairs import (
     LANES,
     STRAIN_ROWS,

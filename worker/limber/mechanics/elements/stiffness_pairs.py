@@ -10,7 +10,7 @@ A block's nine runs are its columns one after the other: 00 10 20 01 11 21 02 12
 
 from collections.abc import Callable
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 
 LANES = 16
 """Elements a run."""

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from limber.compiled import for_kernels
+from limber.core.numerics.compiled import for_kernels
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.mechanics.elements.stiffness import tangent_stiffness
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.factor import Factor, make_factor
 from limber.mechanics.linear.pattern import LaneLayout, Pattern
 from limber.mechanics.linear.supernodal import SupernodalFactor
-from limber.mechanics.materials import Material
-from limber.sparse import NotPositiveDefiniteError
+from limber.mechanics.materials.materials import Material
 
 if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel

@@ -1,7 +1,7 @@
 """Factorisation of a symmetric matrix whose pattern stays and whose values change.
 
 Limber's own supernodal factor, made for slender branches; for the dense kernels of bulky meshes
-a general library's (:mod:`limber.sparse`).
+a general library's (:mod:`limber.core.numerics.sparse`).
 """
 
 from typing import TYPE_CHECKING
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
+from limber.core.numerics.sparse import CholmodFactor, SuperLuFactor, general_factor
 from limber.mechanics.linear.fronts import make_fronts, postordered
 from limber.mechanics.linear.supernodal import SupernodalFactor
-from limber.sparse import CholmodFactor, SuperLuFactor, general_factor
 
 if TYPE_CHECKING:
     from limber.mechanics.linear.pattern import Pattern

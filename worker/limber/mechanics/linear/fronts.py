@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 
 PAD = 8
 """Rows are padded to multiples of this: no loop over rows has a remainder."""

@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.mechanics.linear.fronts import PAD, Fronts
-from limber.sparse import NotPositiveDefiniteError
 
 _COUNT = np.uint64
 """Indices of the inner loops: numba looks whether a signed index counts from the end."""

@@ -4,17 +4,17 @@ import time
 
 import numpy as np
 
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.progress import Progress
 from limber.mechanics.grasp import pose_between
 from limber.mechanics.linear.equations import Tangent
-from limber.mechanics.materials import Material
+from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import InternalState
 from limber.mechanics.statics.problem import StaticProblem, Target, make_result, strain_warnings
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.snap import settle
 from limber.mechanics.status import Status
 from limber.mechanics.strain import principal_stretch
-from limber.progress import Progress
-from limber.sparse import NotPositiveDefiniteError
 
 _SOFT_DET_F = 0.75
 """Volume under which St. Venant-Kirchhoff is named as what gave way. Pressed without going aside

@@ -6,10 +6,10 @@ from typing import Required, TypedDict, Unpack
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.linear.equations import Equations
-from limber.mechanics.materials import Material
+from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import BranchModel, InternalState
 from limber.mechanics.statics.result import StaticResult, StaticSettings
 from limber.mechanics.status import Status

@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.errors import ConvergenceError, InputError
+from limber.core.errors import ConvergenceError, InputError
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.progress import SILENT, Progress
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.mechanics.strain import deformation_gradients, gradient_metric
-from limber.progress import SILENT, Progress
-from limber.sparse import NotPositiveDefiniteError
 
 # Bounds and thresholds: chosen, not measured; tests/mechanics/statics sags beyond 90 % with them.
 _MAX_ITERATIONS = 40

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from limber.errors import ConvergenceError
+from limber.core.errors import ConvergenceError
 from limber.mechanics.status import Status
 
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.mechanics.linear.equations import Equations
-from limber.mechanics.materials import Material
+from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import BranchModel
-from limber.sparse import NotPositiveDefiniteError
 
 if TYPE_CHECKING:
     from limber.mechanics.statics.path import Path

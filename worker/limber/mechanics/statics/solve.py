@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.path import Path
 from limber.mechanics.statics.problem import StaticProblem, Target
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
-from limber.mechanics.statics.way_back import doubt_of
+from limber.mechanics.statics.return_path import doubt_of
 from limber.mechanics.status import Status
-from limber.progress import SILENT, Progress
 
 
 def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = None,

@@ -14,12 +14,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import Delaunay
 
+from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart
-from limber.planning.field.crew import Crew
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.guess import foretold_by, half_way
 from limber.planning.field.solved import Solved, taken
-from limber.progress import SILENT, Progress
+from limber.planning.field.solver_pool import Crew
 
 _JUMP = 0.01  # of the branch's length, by which neighbours' slopes foretell differently
 _ONE = 0.003  # of it: nearer shapes are one

@@ -1,8 +1,9 @@
 """Coordinates in which a field over grasp positions is smooth, and its shell flat.
 
 A branch bends easily across and hardly yields along. The grasp moves by itself on a shell
-(:mod:`limber.planning.field.valley`); a few millimetres off it the energy changes as much as
-across all of the reach: beyond the shell the branch is drawn taut, inside it bows out, and what is
+(:mod:`limber.planning.field.low_energy_surface`); a few millimetres off it the energy changes as
+much as across all of the reach: beyond the shell the branch is drawn taut, inside it bows out, and
+what is
 left of the bow grows with the root of the way. Radial functions know one length scale only, and a
 convex hull of samples on a curved shell cuts its facets off. Hence
 
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from limber.compiled import compiled
-from limber.errors import InputError, WorkError
+from limber.core.errors import InputError, WorkError
+from limber.core.files.reading import read_arrays, require_shapes
+from limber.core.numerics.compiled import compiled
+from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
 from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.field.trust import TrustRegion, trusted_at
-from limber.progress import SILENT, Progress
-from limber.reading import read_arrays, require_shapes
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import (
@@ -24,11 +25,10 @@ from limber.mechanics import (
     follow_poses,
     solve_static,
 )
-from limber.mechanics.loaded import LoadedBranch
-from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.loads.loaded_branch import LoadedBranch
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.status import Status
 from limber.mechanics.strain import peak_load
-from limber.sparse import NotPositiveDefiniteError
 
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
 _SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False, keeps_factor=True)

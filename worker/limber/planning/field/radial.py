@@ -18,8 +18,8 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from limber.compiled import compiled
-from limber.errors import WorkError
+from limber.core.errors import WorkError
+from limber.core.numerics.compiled import compiled
 
 KERNELS = {"cubic": 0, "quintic": 1, "multiquadric": 2, "gaussian": 3}
 """Kernel name to its number in the compiled loops."""

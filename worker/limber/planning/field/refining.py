@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.jobs import run_tasks
+from limber.core.processes import run_tasks
+from limber.core.progress import SILENT, Progress
 from limber.planning.field.between import neighbours
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import Sampled
 from limber.planning.field.solved import Solved, samples_of, taken
-from limber.progress import SILENT, Progress
 
 _ROUND = 0.15  # of the samples are added a round
 _FEWEST = 8

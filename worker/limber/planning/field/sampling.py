@@ -1,8 +1,9 @@
 """Energy of the branch at sampled grasp positions, by the full model.
 
 Some poses follow the shell on which the grasp moves by itself, and go a little beyond
-(:mod:`limber.planning.field.valley`). The positions of the others come from a Sobol sequence in the
-ball about the rest position that the deflection allows, inside that shell, cut by the paper's
+(:mod:`limber.planning.field.low_energy_surface`). The positions of the others come from a Sobol
+sequence in the ball about the rest position that the deflection allows, inside that shell, cut by
+the paper's
 hemisphere. They are solved along a nearest-neighbour tree: next is the position nearest to any that
 has been solved, and it starts from that solution. So every step is short, also where a tour would
 have to jump, and the branch stays in the equilibrium that bends out of rest.
@@ -14,17 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from limber.errors import ConvergenceError, WorkError
+from limber.core.errors import ConvergenceError, WorkError
+from limber.core.progress import SILENT, Progress
 from limber.planning.field.between import ask_between
 from limber.planning.field.chart import Chart
-from limber.planning.field.crew import Crew
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach
 from limber.planning.field.guess import guess_of
+from limber.planning.field.low_energy_surface import Valley, walk_valley
 from limber.planning.field.solved import Solved, samples_of, taken
-from limber.planning.field.valley import Valley, walk_valley
+from limber.planning.field.solver_pool import Crew
 from limber.planning.settings import EnergySettings
-from limber.progress import SILENT, Progress
 
 _LAYER = 0.06  # share of the shell's radius
 _SPREAD = 2 / 3  # of the samples lie evenly, the others between those that do not agree

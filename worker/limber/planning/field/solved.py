@@ -9,7 +9,7 @@ from limber.mechanics import StaticResult
 from limber.mechanics.status import Status
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.learnt import CorrectedResult
+from limber.planning.field.reduced_grasp import CorrectedResult
 
 
 @dataclass(frozen=True)

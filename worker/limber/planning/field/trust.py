@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from limber.compiled import compiled
-from limber.errors import WorkError
+from limber.core.errors import WorkError
+from limber.core.numerics.compiled import compiled
 from limber.planning.field.chart import Chart, mapped
 
 _EDGE = 1e-9  # [m] a sample on the hull belongs to it in spite of rounding

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from limber.errors import NoPathError
+from limber.core.errors import NoPathError
+from limber.core.progress import SILENT, Progress
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem
-from limber.progress import SILENT, Progress
 
 _RANGE = (1e-2, 1e3)  # of the weight of a metre, times that which was given
 _STEPS = 8  # of the search for the weight

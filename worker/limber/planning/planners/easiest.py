@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
-from limber.planning.goals import Goal
+from limber.planning.goals.goal import Goal
 
 _ALONG, _ACROSS = 64, 48  # points of the grid along the shell, each way, and off it
 _FINE = 0.001  # [m] between points of the way

@@ -2,21 +2,21 @@
 
 Each grid of the certificate shows the cheapest way on it; refined, it is a path. The first paths
 that are tried are the straight line and what other planners found; where none of them keeps the
-limits, a way by cells that do, if there is one (:mod:`limber.planning.bound.separation`), else the
-way that goes least over them.
+limits, a way by cells that do, if there is one (:mod:`limber.planning.certificate.feasibility`),
+else the way that goes least over them.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from limber.planning.bound.certificate import ENOUGH, Certificate, certify
-from limber.planning.bound.separation import Verdict, judge
+from limber.core.progress import SILENT, Progress
+from limber.planning.certificate.feasibility import Verdict, judge
+from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem, no_way, not_found
-from limber.progress import SILENT, Progress
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from limber.errors import MissingDependencyError
+from limber.core.errors import MissingDependencyError
+from limber.core.progress import Progress
 from limber.planning.cost import edge_cost
 from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
-from limber.progress import Progress
 
 _REWIRE_FACTOR = 0.05
 _REPORT_EVERY = 100  # iterations

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from limber.compiled import compiled
+from limber.core.numerics.compiled import compiled
+from limber.core.progress import Progress
 from limber.planning.cost import edge_cost
 from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
-from limber.progress import Progress
 
 _CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
 

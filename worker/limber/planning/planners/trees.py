@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from limber.errors import NoPathError
+from limber.core.errors import NoPathError
+from limber.core.progress import SILENT, Progress
 from limber.planning.cost import path_cost
 from limber.planning.planners.ompl_engine import search_with_ompl
 from limber.planning.planners.rrt_star import search_tree
 from limber.planning.planners.smoothing import polish, shortcut, slide_end
 from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
-from limber.progress import SILENT, Progress
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ import json
 import sys
 from pathlib import Path
 
-from limber.errors import LimberError
-from limber.robot.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
+from limber.core.errors import LimberError
+from limber.robot.driver.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.held_branch import BranchSetting, HeldBranch
+from limber.robot.virtual.gripped_branch import BranchSetting, HeldBranch
 from limber.robot.virtual.launch import serve
 
 

@@ -12,18 +12,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from limber.errors import InputError
-from limber.robot.arms import Arm, arm_named
-from limber.robot.frames import crossed, frame_of, weight_wrench
-from limber.robot.virtual.kernels import tool_state
-from limber.robot.virtual.motion import STOP_DECELERATION, Braking, Motion, Unreachable
+from limber.core.errors import InputError
+from limber.core.numerics.rigid_kernels import crossed, frame_of, weight_wrench
+from limber.robot.ur.arms import Arm, arm_named
+from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
+from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
 from limber.robot.virtual.program import ControlProgram
-from limber.robot.virtual.sensor import (
-    CB3_ESTIMATE,
-    E_SERIES,
-    FT300,
-    ForceSensor,
-)
+from limber.robot.virtual.step_kernels import tool_state
 
 _TRACKER_SIGMA_M = 1e-3
 HOME = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
@@ -436,7 +431,7 @@ class Controller:
 
 def _steady() -> dict[str, Any]:
     """Outputs that this controller does not model: plausible constants."""
-    from limber.robot.rtde import OUTPUT_TYPES
+    from limber.robot.ur.rtde import OUTPUT_TYPES
 
     fill = {"VECTOR6D": (0.0,) * 6, "VECTOR3D": (0.0,) * 3, "VECTOR6INT32": (253,) * 6,
             "DOUBLE": 0.0, "BOOL": False}

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from limber.errors import InputError, WorkError
+from limber.core.errors import InputError, WorkError
 from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
 from limber.robot.virtual.server import CAMERA_PORT
 

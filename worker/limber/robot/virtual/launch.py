@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import LimberError, WorkError
-from limber.jobs.ending import end_by_closing
-from limber.robot.real_time import spare_what_is_loaded
+from limber.core.errors import LimberError, WorkError
+from limber.core.processes.ending import end_by_closing
+from limber.robot.driver.real_time import spare_what_is_loaded
+from limber.robot.virtual.arm_motions import Servo, SpeedMotion, Waypoint, line_move
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.motion import Servo, SpeedMotion, Waypoint, line_move
 from limber.robot.virtual.server import Server, new_loop
 
 _START_SECONDS = 240.0  # its first start on a machine compiles what moves the branch

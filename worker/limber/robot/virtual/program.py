@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.robot.kinematics import forward, matrices, pose_vectors
-from limber.robot.virtual.motion import (
+from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+from limber.robot.virtual.arm_motions import (
     Braking,
     Motion,
     Servo,

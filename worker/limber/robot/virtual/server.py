@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from limber.errors import InputError, WorkError
+from limber.core.errors import InputError, WorkError
 from limber.geometry.cloud.camera import Camera
-from limber.robot import rtde
+from limber.robot.ur import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import GREETING, answer
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import (
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.contraction.pieces import Joined, join_pieces, specks
-from limber.geometry.skeleton.mending.ties import untied
+from limber.geometry.skeleton.repair.ties import untied
 
 _Z = np.array([0.0, 0.0, 1.0])
 

@@ -19,10 +19,15 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
-from limber.errors import WorkError
+from limber.core.errors import WorkError
+from limber.core.numerics.sparse import (
+    CholmodFactor,
+    NotPositiveDefiniteError,
+    SuperLuFactor,
+    general_factor,
+)
+from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.contraction.recentring import recentred
-from limber.progress import SILENT, Progress
-from limber.sparse import CholmodFactor, NotPositiveDefiniteError, SuperLuFactor, general_factor
 
 NEIGHBOURS = 12
 """Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""

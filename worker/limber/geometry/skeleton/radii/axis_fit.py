@@ -15,6 +15,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, match_cylinders
 from limber.geometry.skeleton.radii.fit_kernels import normal_blocks
 from limber.geometry.skeleton.radii.noisy_rings import (
@@ -34,7 +35,6 @@ from limber.geometry.skeleton.radii.sides_seen import (
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
-from limber.progress import SILENT, Progress
 
 # Of the median radius: the grid that each round starts from. A fifth of the step that ends a fit,
 # and far coarser than what libraries round differently.

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.geometry.cloud.sight import View
+from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 

@@ -1,0 +1,207 @@
+"""The command line's contract: exit codes, the last JSON line, progress lines, options."""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+import click
+import pytest
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.cli import main
+from limber.core.errors import Cancelled, ConvergenceError, InputError, SafetyStop
+from limber.stages.command_line import settings_options
+from limber.stages.registry import stage_description, stage_summaries
+
+
+class Settings(BaseModel):
+    """Settings of a stage that exists for the tests."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size: float = Field(0.5, gt=0, allow_inf_nan=False, description="Size [m].")
+    deep: bool = Field(False, description="Go deep.")
+    goal: tuple[float, float, float] | None = Field(None, description="Goal [m].")
+    fractions: tuple[float, ...] = Field((0.2, 0.4), description="Fractions.")
+
+
+def invoke(function, arguments, capfd):
+    """Run a command made from ``function``; return exit code and standard output's lines."""
+    command = main.stage_command("probe")(function)
+    with pytest.raises(SystemExit) as stop:
+        command.main(arguments, standalone_mode=False)
+    return stop.value.code, capfd.readouterr().out.splitlines()
+
+
+def test_result_is_the_last_json_line(capfd):
+    """--json ends with one object that has the contract's keys and the result's."""
+    def function(run, **_options):
+        """Probe."""
+        run.progress(0.5, "half", count=2)
+        run.progress.warn("careful")
+        return {"tet_count": 12}
+    code, lines = invoke(function, ["--json", "--progress", "json"], capfd)
+    assert code == 0
+    first, last = json.loads(lines[0]), json.loads(lines[-1])
+    assert (first["progress"], first["message"], first["count"]) == (0.5, "half", 2)
+    assert last["command"] == "probe"
+    assert last["status"] == "done"
+    assert last["error"] is None
+    assert last["warnings"] == ["careful"]
+    assert last["tet_count"] == 12
+    assert last["seconds"] >= 0
+
+
+@pytest.mark.parametrize(("failure", "code", "status"), [
+    (InputError("a", "b", "c"), 2, "failed"), (ConvergenceError("a"), 3, "failed"),
+    (SafetyStop("a"), 4, "failed"), (Cancelled(), 130, "cancelled"),
+    (KeyboardInterrupt(), 130, "cancelled"), (ZeroDivisionError("bug"), 3, "failed"),
+    (MemoryError(), 3, "failed"),
+])
+def test_exit_codes(failure, code, status, capfd):
+    """Each kind of failure ends with its exit code, and --json still ends with one object."""
+    def function(run, **_options):
+        """Probe."""
+        raise failure
+    got, lines = invoke(function, ["--json"], capfd)
+    assert got == code
+    assert json.loads(lines[-1])["status"] == status
+    assert json.loads(lines[-1])["error"]
+
+
+@pytest.mark.parametrize(("arguments", "wanted"), [
+    ([], Settings()),
+    (["--size", "2", "--deep", "--goal", "1", "2", "3", "--fractions", "0.5,0.9"],
+     Settings(size=2, deep=True, goal=(1, 2, 3), fractions=(0.5, 0.9))),
+])
+def test_settings_become_options(arguments, wanted, capfd):
+    """Every field is an option with its type; the function gets one checked settings object."""
+    seen = []
+
+    @settings_options(Settings)
+    def function(run, settings, **_options):
+        """Probe."""
+        seen.append(settings)
+        return {}
+    code, _ = invoke(function, arguments, capfd)
+    assert code == 0
+    assert seen == [wanted]
+
+
+@pytest.mark.parametrize("arguments", [["--size=-1"], ["--size=nan"], ["--fractions", "0.1,x"]])
+def test_refused_setting_is_named(arguments, capfd):
+    """A value out of range is a usage error (2); the last JSON line names option and value."""
+    @settings_options(Settings)
+    def function(run, settings, **_options):
+        """Probe."""
+        return {}
+    code, lines = invoke(function, [*arguments, "--json"], capfd)
+    assert code == 2
+    assert arguments[0].split("=")[0] in json.loads(lines[-1])["error"]
+
+
+def test_every_listed_command_exists():
+    """`limber --help` lists only commands whose module loads and has help."""
+    for name in main.command_summaries():
+        command = main.main.get_command(click.Context(main.main), name)
+        assert command is not None
+        assert command.help
+
+
+@pytest.mark.parametrize("arguments", [
+    ["nosuch"], ["record"], ["reconstruct"], ["reconstruct", "--nosuch"]])
+def test_wrong_usage_is_exit_code_2(arguments):
+    """Unknown commands and options, and missing arguments, end with 2."""
+    assert main.call(arguments) == 2
+
+
+REQUIRED = [(name, model, field) for name in stage_summaries()
+            for model in (stage_description(name).inputs, stage_description(name).settings,
+                          stage_description(name).options)
+            for field, about in model.model_fields.items()
+            if about.is_required() and not (about.json_schema_extra or {}).get("argument")]
+
+
+@pytest.mark.parametrize(("name", "model", "field"), REQUIRED)
+def test_a_forgotten_option_is_named_and_a_value_proposed(name, model, field, capfd):
+    """Of every stage: one line, without Python's words; what it proposes is taken."""
+    arguments = [f"some/{key}.xyz" for key, about in model.model_fields.items()
+                 if (about.json_schema_extra or {}).get("argument")]
+    assert main.call([name, *arguments]) == 2
+    said = capfd.readouterr().err.strip()
+    flag = "--" + field.replace("_", "-")
+    assert said.startswith("error: Missing option") and "\n" not in said
+    assert flag in said and "Path(" not in said and "Field required" not in said
+    proposed = shlex.split(said.partition("for example: ")[2])
+    short = (model.model_fields[field].json_schema_extra or {}).get("short", flag)
+    assert not proposed[proposed.index(short) + 1].isupper()
+    main.call([name, *arguments, *proposed])
+    assert "Missing" not in capfd.readouterr().err
+
+
+def test_a_forgotten_output_is_named_after_the_input(capfd):
+    """`limber reconstruct ten.xyz` proposes -o ten.branch."""
+    assert main.call(["reconstruct", "scans/ten.xyz"]) == 2
+    assert capfd.readouterr().err == (
+        "error: Missing option -o (--output). The branch folder to make; with a folder of scans, "
+        "where to make them. Add, for example: -o ten.branch\n")
+
+
+HEAVY = {"numpy", "pydantic", "scipy", "numba", "rich", "trimesh", "matplotlib"}
+
+
+@pytest.mark.parametrize(("arguments", "heavy"), [
+    ([], HEAVY), (["simulate"], {"scipy", "numba", "trimesh", "matplotlib"}),
+    (["estimate"], {"scipy", "numba", "trimesh", "matplotlib"})])
+def test_help_is_quick_and_imports_nothing_heavy(arguments, heavy):
+    """`limber --help` loads none of the packages that take long; a stage's no numerical one."""
+    program = ("import sys; from limber import cli\n"
+               f"assert cli.call({[*arguments, '--help']}) == 0\n"
+               f"assert not {heavy} & set(sys.modules), {heavy} & set(sys.modules)")
+    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_ends_with_130(kind):
+    """Ctrl-C and SIGTERM end a running command with 130 and the cancelled status."""
+    program = ("import time\nfrom limber import cli\n"
+               "def function(run, **_):\n"
+               "    'Probe.'\n"
+               "    print('ready', flush=True); time.sleep(30)\n"
+               "cli._terminate_like_interrupt()\n"
+               "cli.stage_command('probe')(function).main(['--json'], standalone_mode=False)")
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True,
+                               stderr=subprocess.DEVNULL)
+    assert process.stdout.readline().strip() == "ready"
+    time.sleep(0.1)
+    process.send_signal(kind)
+    out, _ = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert json.loads(out.splitlines()[-1])["status"] == "cancelled"
+
+
+def test_help_names_default_and_range_as_typed():
+    """A switch's default is the switch, a vector's has spaces, a list's commas; bounds are told."""
+    class Ranged(BaseModel):
+        """Settings with every kind of default."""
+
+        samples: int = Field(150, ge=30, le=5000, description="Samples.")
+        upright: bool = Field(True, description="Turn it.")
+        damping: tuple[float, float] = Field((0.5, 0.002), description="Damping [1/s, s].")
+        fractions: tuple[float, ...] = Field((0.2, 0.8), description="Places.")
+
+    @click.command()
+    @settings_options(Ranged)
+    def probe(settings):
+        """Probe."""
+
+    told = " ".join(probe.get_help(click.Context(probe)).split())
+    for text in ("[default: 150; at least 30; at most 5000]", "[default: --upright]",
+                 "[default: 0.5 0.002]", "[default: 0.2,0.8]"):
+        assert text in told

@@ -1,0 +1,118 @@
+"""`limber demo`: what it hands to the stages, and its end when one of them fails."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from limber.cli import main
+from limber.cli.commands import demo
+from limber.core.errors import NoPathError
+from limber.stages.command_line import options_of, without_foreign_options
+
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+
+
+@pytest.fixture
+def stages(monkeypatch):
+    """Stages that do nothing: their arguments by name; `fail` names one that finds no way."""
+    seen: dict = {"fail": [], "pull": {"young_true_pa": [1e9]}}
+    results = {"estimate": {"young_pa": [1e9], "young_interval_pa": [[9e8, 1.1e9]]},
+               "virtual-pull": seen["pull"],
+               "plan": {"baseline": {}, "plan": {}, "energy_saved_percent": 1.0,
+                        "length_added_percent": 2.0}}
+
+    def run(arguments, _progress):
+        seen[arguments[0]] = arguments
+        if arguments[0] in seen["fail"]:
+            raise NoPathError("There is no path (--max-strain 0.01).", "Walls.",
+                              "Raise --max-force or --max-strain. Or move the goal (--goal).")
+        return results.get(arguments[0], {})
+    monkeypatch.setattr(demo, "run_stage", run)
+    return seen
+
+
+def test_what_is_known_of_a_scan_reaches_the_stages(stages, tmp_path) -> None:
+    """Up, root, crop and goal, negative numbers too."""
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    assert main.call(["demo", str(scan), "-o", str(tmp_path / "out"), "--up", "0", "-1", "0",
+                     "--root", "1", "2", "3", "--crop", "-1", "0", "-2", "4", "5", "6",
+                     "--goal", "0.1", "0.2", "0.3"]) == 0
+    told = " ".join(stages["reconstruct"])
+    for part in ("--up 0.0 -1.0 0.0", "--root 1.0 2.0 3.0", "--crop-low -1.0 0.0 -2.0",
+                 "--crop-high 4.0 5.0 6.0"):
+        assert part in told
+    assert " ".join(stages["plan"]).endswith("--goal 0.1 0.2 0.3")
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_simulated_pull_of_ones_own_scan_is_no_truth(stages, tmp_path, own, capsys) -> None:
+    """Its modulus is assumed, at the top and in the tables; that of a generated branch is true."""
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    stages["pull"]["young_assumed"] = own
+    assert main.call(["demo", *([str(scan)] if own else []), "-o", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr()
+    words = told.out + told.err
+    assert ("nothing is measured of this branch's stiffness" in words) == own
+    assert ("assumed E [MPa]" in words) == own and ("true E [MPa]" in words) != own
+    assert ("hold the true modulus" in words) != own
+
+
+@pytest.mark.parametrize("failing", ["plan", "estimate"])
+def test_a_failure_after_the_mesh_ends_in_a_report(stages, tmp_path, failing, capsys) -> None:
+    """Scene and report are made; the exit code is the failure's."""
+    stages["fail"] = [failing]
+    assert main.call(["demo", "-o", str(tmp_path / "out")]) == NoPathError.exit_code
+    assert "report" in stages and "scene" in stages
+    told = capsys.readouterr().err
+    assert "There is no path." in told and "report.html" in told
+
+
+def test_a_scan_that_cannot_be_meshed_ends_at_once(stages, tmp_path) -> None:
+    """Without a branch there is nothing to report."""
+    stages["fail"] = ["reconstruct"]
+    assert main.call(["demo", "-o", str(tmp_path / "out")]) == NoPathError.exit_code
+    assert "report" not in stages
+
+
+def test_options_of_reconstruct_reach_it(stages, tmp_path) -> None:
+    """What its refusals propose, the demo takes."""
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    assert main.call(["demo", str(scan), "-o", str(tmp_path / "out"), "--plants", "largest",
+                     "--unexplained", "1", "--skeleton", "own.swc", "--unit", "mm"]) == 0
+    told = " ".join(stages["reconstruct"])
+    for part in ("--plants largest", "--unexplained 1.0", "--skeleton own.swc", "--unit mm"):
+        assert part in told
+    assert "--young" not in told
+
+
+def test_refusals_of_a_scan_name_only_options_that_the_demo_has() -> None:
+    """All that scan and skeleton code names in its messages."""
+    folder = Path(demo.__file__).parents[2] / "geometry"
+    files = [*folder.glob("skeleton/**/*.py"), *folder.glob("cloud/*.py"), *folder.glob("io/*.py"),
+             folder / "reconstruction.py", folder / "pruned_twigs.py"]
+    named = {option for path in files
+             for option in OPTION.findall(path.read_text(encoding="utf-8"))}
+    assert {"--plants", "--crop-low", "--skeleton", "--unexplained"} <= named
+    assert named <= options_of(demo.command)
+
+
+@pytest.mark.parametrize("failing", ["reconstruct", "plan"])
+def test_what_a_stage_alone_can_take_is_not_proposed(stages, tmp_path, failing, capsys) -> None:
+    """Of a stage's advice the demo keeps what its own user can follow."""
+    stages["fail"] = [failing]
+    assert main.call(["demo", "-o", str(tmp_path / "out")]) == NoPathError.exit_code
+    told = capsys.readouterr().err
+    assert "There is no path. Walls. Or move the goal (--goal)." in told
+    assert f"`limber {failing}` has more options" in told
+    assert {*OPTION.findall(told)} <= options_of(demo.command)
+
+
+def test_sentences_and_brackets_with_other_options_are_left_out() -> None:
+    """Numbers with a point and dashes within words end and name nothing."""
+    text = "At 0.5 m (--voxel 0.1) well-known. Give --b-c 1.5, or --a. Or --b."
+    assert without_foreign_options(text, {"--b", "--a"}) == "At 0.5 m well-known. Or --b."
+    assert without_foreign_options(text, {"--b", "--a", "--b-c", "--voxel"}) == text

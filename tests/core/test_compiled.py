@@ -1,0 +1,192 @@
+"""Compiled kernels are kept, and what is kept never stands in the way."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from limber.cli.main import Run, call
+from limber.core.errors import DamagedCacheWarning
+from limber.core.files import caches
+from limber.core.numerics import compiled
+from limber.core.processes.pool import Pool
+from limber.core.progress import damage_told_to
+
+KERNEL = """
+from limber.core.numerics.compiled import compiled
+from {place} import Pair
+
+@compiled
+def total(pair):
+    return pair.a + pair.b
+
+print(total(Pair(1.0, 2.0)), len(total._cache_hits))
+"""
+PAIR = """
+from typing import NamedTuple
+
+class Pair(NamedTuple):
+    a: float
+    b: float
+"""
+
+
+@pytest.mark.slow
+def test_a_moved_type_is_compiled_anew(tmp_path):
+    """A kernel kept with an argument's type that has since moved to another module still runs,
+    and is then kept again.
+    """
+    kernel = tmp_path / "kernel.py"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def run(place):
+        (tmp_path / f"{place}.py").write_text(PAIR)
+        if not kernel.exists() or place not in kernel.read_text():
+            kernel.write_text(KERNEL.format(place=place))
+        done = subprocess.run([sys.executable, str(kernel)], check=False, env=environment,
+                              capture_output=True, text=True)
+        (tmp_path / f"{place}.py").unlink()
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()
+    assert run("before") == ["3.0", "0"]
+    assert run("after") == ["3.0", "0"]
+    assert run("after") == ["3.0", "1"]
+
+
+@pytest.mark.slow
+def test_that_it_compiles_is_told_once(tmp_path):
+    """Before the first kernel is compiled; not where it is kept."""
+    (tmp_path / "kernel.py").write_text("""
+from limber.core.numerics.compiled import compiled, when_compiling
+
+@compiled
+def twice(value):
+    return value + value
+
+when_compiling(lambda: print("compiling"))
+print(twice(1.0), twice(2))
+""")
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    told = [subprocess.run([sys.executable, str(tmp_path / "kernel.py")], check=True, text=True,
+                           env=environment, capture_output=True).stdout.splitlines()
+            for _ in range(2)]
+    assert told == [["compiling", "2.0 4"], ["2.0 4"]]
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """A function that runs a kernel kept in a folder, as a new process would; and that folder."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache" / "numba"))
+    path = tmp_path / "kernel.py"
+    path.write_text("from limber.core.numerics.compiled import compiled\n\n\n@compiled\n"
+                    "def twice(value):\n    return value + value\n")
+
+    def run():
+        """Returns the result, whether it was compiled, and what was warned of."""
+        monkeypatch.setattr(compiled, "_damage_told", [])
+        spec = importlib.util.spec_from_file_location("kernel", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            results = module.twice(1.5), module.twice(2)
+        assert all(issubclass(one.category, DamagedCacheWarning) for one in told)
+        return (results, 2 - len(module.twice._cache_hits), [str(one.message) for one in told])
+    assert run() == ((3.0, 4), 2, [])
+    assert run() == ((3.0, 4), 0, [])
+    return run, tmp_path / "cache"
+
+
+def _half(path):
+    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+
+
+def _flipped(path):
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle:middle + 200] = bytes(200)
+    path.write_bytes(content)
+
+
+DAMAGES = {"empty": lambda path: path.write_bytes(b""), "cut": _half,
+           "of other bytes": lambda path: path.write_bytes(os.urandom(500)),
+           "with other bytes inside": _flipped}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_a_damaged_file_is_renewed_and_told_once(kept, suffix, damage):
+    """An index or code: the kernel runs, one warning names a file, and the next run is as ever."""
+    run, folder = kept
+    files = sorted(folder.rglob(f"*{suffix}"))
+    assert files
+    for file in files:
+        DAMAGES[damage](file)
+    results, compiled_count, told = run()
+    assert results == (3.0, 4) and compiled_count == 2
+    assert len(told) == 1 and str(files[0].parent) in told[0] and "compiled anew" in told[0]
+    assert run() == ((3.0, 4), 0, [])
+
+
+def test_a_missing_data_file_is_made_again(kept):
+    """The index still names it: that is no damage."""
+    run, folder = kept
+    for file in folder.rglob("*.nbc"):
+        file.unlink()
+    assert run() == ((3.0, 4), 2, [])
+    assert run() == ((3.0, 4), 0, [])
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_what_cannot_be_read_is_compiled_for_the_run(kept, suffix):
+    """A folder in the place of the file: neither read nor replaced."""
+    run, folder = kept
+    for file in folder.rglob(f"*{suffix}"):
+        file.unlink()
+        file.mkdir()
+    results, compiled_count, told = run()
+    assert results == (3.0, 4) and compiled_count == 2
+    assert len(told) == 1 and "cannot be read" in told[0]
+
+
+def test_cache_clear_removes_empty_files_and_folders(kept, monkeypatch, capsys):
+    """An empty file frees nothing and goes all the same."""
+    run, folder = kept
+    for file in folder.rglob("*.nbi"):
+        file.write_bytes(b"")
+    next(folder.rglob("*.nbc")).unlink()
+    (next(folder.rglob("*.nbi")).parent / "kernel.nbi").mkdir()
+    monkeypatch.setattr(caches, "cache_folder", lambda: folder)
+    assert call(["cache", "--clear", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["caches"] == {
+        "numba": {"file_count": 0, "byte_count": 0}}
+    assert list(folder.rglob("*")) == [folder / "numba"]
+    assert run()[2] == []
+
+
+def test_a_command_says_it_once_as_its_own_warning():
+    """One line, and among the warnings of its result, however many processes warn."""
+    said = []
+    run = Run(None, said.append)
+    with damage_told_to(run.progress.warn):
+        for number in range(3):
+            warnings.warn(f"file {number} was damaged", DamagedCacheWarning, stacklevel=1)
+    assert run.warnings == ["file 0 was damaged"] and said == ["warning: file 0 was damaged"]
+
+
+def _damaged(number):
+    warnings.warn(f"file {number} was damaged", DamagedCacheWarning, stacklevel=1)
+    return number
+
+
+@pytest.mark.slow
+def test_processes_of_a_pool_warn_through_the_command():
+    """Two that find damage: one warning."""
+    told = []
+    with damage_told_to(told.append), Pool(2) as pool:
+        assert sorted(pool.map(_damaged, [(0,), (1,)])) == [0, 1]
+    assert len(told) == 1 and "was damaged" in told[0]

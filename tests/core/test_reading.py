@@ -1,0 +1,134 @@
+"""The door for files of others: what is not finite, too deep, too large or no number stays out."""
+
+import io
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+
+from limber.core.errors import InputError
+from limber.core.files.reading import (
+    read_arrays,
+    read_columns,
+    read_json,
+    read_json_as,
+    read_toml,
+    require_shapes,
+)
+
+
+@pytest.mark.parametrize("text", [
+    "NaN", "[Infinity]", "[1e400]", "{", "[" * 100_000, '{"a": ' + "9" * 400 + "}", "\xff"])
+def test_json_that_is_refused(tmp_path, text):
+    """Numbers that are not finite, endless nesting, endless digits, no text: one clear error."""
+    path = tmp_path / "a.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"a\.json"):
+        read_json(path, "numbers")
+
+
+def test_json_of_a_kind_says_where(tmp_path):
+    """The place that is wrong is named; what fits comes as it is."""
+    path = tmp_path / "a.json"
+    path.write_text("[1, 2.5]")
+    assert read_json_as(path, list[float], "numbers") == [1.0, 2.5]
+    path.write_text('[1, "x"]')
+    with pytest.raises(InputError, match="1: Input should be a valid number"):
+        read_json_as(path, list[float], "numbers")
+
+
+@pytest.mark.parametrize("text", ["a = 1e400", "a = ", "a = [" * 3000])
+def test_toml_that_is_refused(tmp_path, text):
+    """Likewise; TOML's own inf and nan too."""
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"a\.toml"):
+        read_toml(path, "settings")
+    path.write_text("a = nan")
+    with pytest.raises(InputError):
+        read_toml(path, "settings")
+
+
+def test_arrays_come_as_they_were_saved(tmp_path):
+    """Both orders, no dimensions, none at all, and text."""
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.asfortranarray(np.arange(6).reshape(2, 3)),
+              "c": np.array(2.5), "d": np.empty((0, 3)), "e": np.array(["x", "yz"])}
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    np.save(tmp_path / "a.npy", arrays["b"])
+    found = read_arrays(tmp_path / "a.npz", "arrays")
+    assert set(found) == set(arrays)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(found[name], values)
+        assert found[name].dtype == values.dtype
+    np.testing.assert_array_equal(read_arrays(tmp_path / "a.npy", "an array")["arr_0"], arrays["b"])
+
+
+def _npy_header(shape: str) -> bytes:
+    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+@pytest.mark.parametrize("shape", ["(1000000000000,)", "(-3,)", "(99999, 99999, 99999)"])
+def test_an_array_that_announces_more_than_there_is(tmp_path, shape):
+    """Refused by its header: no memory is asked for."""
+    (tmp_path / "a.npy").write_bytes(_npy_header(shape) + bytes(24))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("a.npy", _npy_header(shape) + bytes(24))
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(InputError, match="announced"):
+            read_arrays(tmp_path / name, "arrays")
+
+
+def test_a_header_that_is_no_header(tmp_path):
+    """One that Python's own parser of words gives up on."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': ((3,"
+    path = tmp_path / "a.npy"
+    path.write_bytes(np.lib.format.magic(1, 0) + struct.pack("<H", len(header)) + header)
+    with pytest.raises(InputError, match=r"a\.npy"):
+        read_arrays(path, "numbers")
+
+
+@pytest.mark.slow
+def test_an_archive_that_would_flood_the_memory(tmp_path):
+    """A megabyte that expands to a gigabyte is refused before it does."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("a.npy", "w", force_zip64=True) as member:
+            for _ in range(300):
+                member.write(bytes(1 << 20))
+    with pytest.raises(InputError, match="expand"):
+        read_arrays(tmp_path / "a.npz", "arrays")
+
+
+def test_objects_are_never_loaded(tmp_path):
+    """Pickled content is told, not run."""
+    np.savez(tmp_path / "a.npz", a=np.array([{}], object))
+    with pytest.raises(InputError, match="objects"):
+        read_arrays(tmp_path / "a.npz", "arrays")
+
+
+def test_shapes_that_do_not_fit(tmp_path):
+    """Missing, of other length, text, not finite: each is named."""
+    good = {"a": np.zeros((4, 3)), "b": np.zeros(4)}
+    shapes = {"a": ("n", 3), "b": ("n",)}
+    require_shapes(tmp_path, good, shapes, "arrays")
+    for bad in ({"a": good["a"]}, {**good, "b": np.zeros(5)}, {**good, "b": np.array(["x"] * 4)},
+                {**good, "b": np.array([0, 0, np.inf, 0])}):
+        with pytest.raises(InputError, match="b"):
+            require_shapes(tmp_path, bad, shapes, "arrays")
+
+
+def test_columns_of_numbers(tmp_path):
+    """A column with a gap or a word is none; one that is needed is missed by name."""
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,word\n1,2,a\n3,nan,b\n")
+    assert list(read_columns(path, ["x"], "a table")) == ["x"]
+    with pytest.raises(InputError, match="column y"):
+        read_columns(path, ["x", "y"], "a table")
+
+
+def test_bytes_that_are_no_archive():
+    """What is no zip at all reads as damaged, whatever numpy would say."""
+    with pytest.raises(InputError):
+        read_arrays(__file__, "arrays")
+    assert zipfile.is_zipfile(io.BytesIO(b"")) is False

@@ -1,0 +1,262 @@
+"""The report on folders that are not finished, and its refusals; a finished one: test_pipeline."""
+
+import json
+
+import numpy as np
+import pytest
+
+from limber.core.errors import BranchFolderError, InputError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.io.skeletons import write_cylinders
+from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
+from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.results.report import swing_section
+from limber.results.report.estimate_figures import young_along_branch
+from limber.results.report.page import draw_page
+from limber.results.report.tables import (
+    cause_rows,
+    comparison_rows,
+    deviation_rows,
+    held_out_rows,
+    held_sentence,
+    modulus_rows,
+)
+from limber.results.scene.graphs import young_graph
+from limber.stages.results.report import write_report
+from limber.store import Branch
+
+
+@pytest.fixture
+def meshed(tmp_path) -> Branch:
+    """A branch folder with a mesh and nothing else."""
+    branch = Branch.create(tmp_path / "beam & co.branch")
+    with branch.stage("mesh") as stage:
+        straight_beam(0.3, 0.006, 0.004).write(stage.path("mesh.vtu"))
+        stage.result.update(tet_count=1)
+    return branch
+
+
+def test_unfinished_folder_says_what_is_missing(meshed: Branch):
+    """Each part that has not been done names the command that does it; the name is escaped."""
+    result = write_report(meshed.folder)
+    html = (meshed.folder / "report.html").read_text(encoding="utf-8")
+    assert result["sections"] == ["Summary", "Mesh", "How it was made"]
+    assert "Young&#39;s modulus along the branch" in html
+    for command in ("limber reconstruct", "limber estimate", "limber energy", "limber plan"):
+        assert command in html
+    assert "<title>beam &amp; co" in html
+
+
+def test_a_page_of_an_unchanged_folder_is_left_as_it_is(meshed: Branch):
+    """Drawn again when something has been added, or when it is asked for."""
+    first = write_report(meshed.folder)
+    entry = Branch.open(meshed.folder).manifest.stages["report"]
+    assert write_report(meshed.folder) == first
+    assert Branch.open(meshed.folder).manifest.stages["report"] == entry
+    page = meshed.folder / "report.html"
+    drawn = page.stat().st_ino
+    write_report(meshed.folder, force=True)
+    assert page.stat().st_ino != drawn  # clocks are too coarse: it is drawn within milliseconds
+    with meshed.stage("note") as stage:
+        stage.result["said"] = "something"
+    entry = Branch.open(meshed.folder).manifest.stages["report"]
+    write_report(meshed.folder)
+    assert Branch.open(meshed.folder).manifest.stages["report"] != entry
+
+
+def test_an_execution_shows_felt_beside_predicted(meshed: Branch):
+    """A log of the robot becomes a table and a picture; one without a prediction says so."""
+    from limber.robot.driver.link import COLUMNS
+
+    rows = np.full((400, len(COLUMNS)), np.nan)
+    rows[:, :25] = 0.0
+    rows[:, 0] = np.arange(400) * 0.002
+    rows[100:, 25:28] = rows[100:, 13:16] = np.linspace(0, 3, 300)[:, None]
+    rows[100:, 31:37] = 0.01
+
+    def executed(name: str, table: np.ndarray) -> None:
+        with meshed.stage(f"execute:{name}") as stage:
+            lines = [",".join("" if np.isnan(x) else f"{x:g}" for x in row) for row in table]
+            stage.path(f"executions/{name}/samples.csv").write_text(
+                "\n".join([",".join(COLUMNS), *lines]) + "\n", encoding="utf-8")
+            stage.result.update(reached=name == "led", stop_reason="slipped", peak_force_n=5.2,
+                                force_within_share=0.99, path_error_m=None)
+    executed("led", rows)
+    executed("lost", rows[:100])
+    html, page = draw_page(meshed)
+    led, lost = (section for section in page if section.title.startswith("By the robot"))
+    assert len(led.pictures) == 1 and ["peak force, felt [N]", "5.20"] in led.tables[0][1]
+    assert not lost.pictures and "no predicted force" in lost.text[0]
+    assert "a stop: slipped" in html
+
+
+def test_picture_must_be_a_png(meshed: Branch, tmp_path):
+    """Another file, or none, is refused with its name; no report is left behind."""
+    (tmp_path / "x.png").write_bytes(b"JFIF")
+    for picture in (tmp_path / "x.png", tmp_path / "none.png"):
+        with pytest.raises(InputError, match=picture.name):
+            write_report(meshed.folder, picture=picture)
+    assert not (meshed.folder / "report.html").exists()
+
+
+def test_damaged_mesh_is_named(meshed: Branch):
+    """A damaged file is reported by name, not drawn."""
+    with open(meshed.folder / "mesh.vtu", "a", encoding="utf-8") as stream:
+        stream.write(" ")
+    with pytest.raises(BranchFolderError, match=r"mesh\.vtu"):
+        write_report(meshed.folder)
+
+
+def test_tables_without_truth_or_numbers():
+    """A real pull has no truth columns; an undetermined interval and an absent measure say so."""
+    estimate = {"young_pa": [2e6, 3e6], "young_interval_pa": [[1e6, 4e6], [None, None]]}
+    rows = modulus_rows(estimate, None)
+    assert rows == [["control point", "E [MPa]", "95 % interval [MPa]"],
+                    ["1", "2", "1 to 4"], ["2", "3", "undetermined"]]
+    plan = {"baseline": {"length_m": 0.5, "peak_force_n": None}, "plan": {"length_m": 0.55}}
+    assert comparison_rows(plan)[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
+
+
+def test_a_known_truth_tells_how_far_the_intervals_held():
+    estimate = {"young_pa": [2e6, 3e6, 1e6],
+                "young_interval_pa": [[1e6, 4e6], [2.5e6, 3.5e6], [None, None]]}
+    pull = {"young_true_pa": [3e6, 4e6, 1e6]}
+    rows = modulus_rows(estimate, pull)
+    assert [row[-1] for row in rows] == ["in the interval", "yes", "NO", "NO"]
+    assert held_sentence(estimate, pull).startswith("1 of 3 ")
+    assert "true E [MPa]" in rows[0] and held_sentence(estimate, pull).endswith("true modulus.")
+
+
+def test_an_assumed_modulus_is_never_called_true():
+    """A simulated pull of a scan that nobody pulled: its modulus is assumed, in every word."""
+    estimate = {"young_pa": [2e6], "young_interval_pa": [[1e6, 4e6]]}
+    pull = {"young_true_pa": [3e6], "young_assumed": True}
+    told = " ".join(modulus_rows(estimate, pull)[0]) + held_sentence(estimate, pull)
+    assert "assumed E [MPa]" in told and "this branch was not pulled" in told
+    assert "true" not in told and "error" not in told
+    curve = {"fractions": [0.2, 0.8], "young_pa": [2e6, 1e6],
+             "young_interval_pa": [[1e6, 3e6], [5e5, 2e6]]}
+    for assumed in (False, True):
+        truth = {"fractions": [0.2, 0.8], "young_pa": [2e6, 1e6], "assumed": assumed}
+        word = "assumed" if assumed else "true"
+        drawn = young_graph(curve | {"truth": truth})
+        assert word in [line["label"] for line in drawn["lines"]]
+        axes = young_along_branch(curve | {"truth": truth}).axes[0]
+        assert word in axes.get_legend_handles_labels()[1]
+
+
+def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():
+    """Parts in percent, what was not examined said so; a score that was not measured is a dash."""
+    estimate = {"fractions": [0.25, 0.5], "young_deviation": {
+        "sensor": [0.01, 0.02], "geometry": None, "mesh": [0.005, 0.005], "total": [0.011, 0.021]}}
+    assert deviation_rows(estimate)[1:] == [
+        ["1", "0.25", "1.0 %", "not examined", "0.5 %", "1.1 %"],
+        ["2", "0.50", "2.0 %", "not examined", "0.5 %", "2.1 %"]]
+    assert deviation_rows({"fractions": [0.5]}) == []
+    scores = {"a": {"rms_m": 0.0012, "rms_force_n": 0.034, "relative_distance": 0.021,
+                    "relative_force": 0.04, "in_fit": True},
+              "b": {"rms_m": 0.003, "rms_force_n": None, "relative_distance": 0.1,
+                    "relative_force": None, "in_fit": False}}
+    assert held_out_rows({"held_out": scores})[1:] == [
+        ["a", "1.20", "2.1 %", "0.034", "4.0 %", "the other pulls"],
+        ["b", "3.00", "10.0 %", "-", "-", "this estimate"]]
+    assert held_out_rows({"held_out": {}}) == []
+
+
+def test_what_holds_an_estimate_back_is_read_first(meshed: Branch):
+    """Causes with what would shrink each open the page; without an estimate nothing does."""
+    estimate = {"causes": [
+        {"cause": "gripper frame", "share": 0.6, "deviation": 0.12, "advice": "calibrate it"},
+        {"cause": "force gain", "share": 0.3, "deviation": 0.08, "advice": "hang a known weight"}]}
+    assert cause_rows(estimate)[1:] == [
+        ["gripper frame", "60 %", "up to 12.0 %", "calibrate it"],
+        ["force gain", "30 %", "up to 8.0 %", "hang a known weight"]]
+    assert cause_rows({"causes": []}) == [] == cause_rows({})
+    full = estimate | {
+        "young_pa": [1e9], "young_interval_pa": [[8e8, 1.2e9]], "fractions": [0.5],
+        "young_deviation": {"sensor": [0.14], "geometry": None, "mesh": None, "total": [0.14]},
+        "method": "gauss-newton", "forward_count": 1, "loss_m2": 1e-6, "converged": True,
+        "warnings": [], "history": [], "pulls": [], "groups": [0], "parameters": ["E1"],
+        "covariance": [[0.02]], "deviations_before_fit": [0.2], "poisson": 0.35,
+        "control_points_m": [[0.0, 0.0, 0.2]]}
+    with meshed.stage("estimate") as stage:
+        stage.path("estimate.json").write_text(json.dumps(full), encoding="utf-8")
+    result = write_report(meshed.folder)
+    assert result["sections"][:2] == ["What holds the estimate back", "Summary"]
+    html = (meshed.folder / "report.html").read_text(encoding="utf-8")
+    assert html.index("calibrate it") < html.index("Summary</h2>") and "14.0 %" in html
+
+
+@pytest.mark.slow
+def test_named_targets_stand_in_figure_and_table(tmp_path):
+    """The place of a flower is a row of the scan's table."""
+    import shutil
+    from pathlib import Path
+
+    from limber.stages.shape.target import TargetSettings, set_target
+
+    example = Path(__file__).parents[3] / "blend_files" / "bending_branch"
+    folder = shutil.copytree(example, tmp_path / "example.branch")
+    branch = Branch.open(folder)
+    tip = np.loadtxt(branch.path("skeleton.swc"))[-1, 2:5]
+    set_target(folder, "flower", TargetSettings(at=tuple(tip), mass=0.02))
+    write_report(folder)
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Named targets" in html and ">flower<" in html and f"{tip[2]:.3f}" in html
+
+
+@pytest.mark.slow
+def test_cylinder_model_stands_beside_calipers(tmp_path):
+    """Orders, diameters, how radii are known, doubt; a caliper's value, and one off the branch."""
+    tree = Skeleton.from_edges(
+        np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.1, 0, 0.3]], float),
+        np.array([-1, 0, 1, 1]), np.array([0.012, 0.01, 0.008, 0.004]),
+        radius_sigma=np.array([0, 2e-4, 2e-4, 1e-3]), radius_state=np.array([0, 0, 0, UNRESOLVED]),
+        probability=np.array([1, 1, 1, 0.4]))
+    branch = Branch.create(tmp_path / "a.branch")
+    with branch.stage("reconstruct") as stage:
+        tree.write_swc(stage.path("skeleton.swc"))
+        write_cylinders(tree, stage.path("skeleton.csv"))
+        Cloud(tree.nodes).write_ply(stage.path("cloud.ply"))
+        stage.result["length_shares"] = {"measured": 0.74, "unresolved": 0.26}
+    path = tmp_path / "calipers.csv"
+    path.write_text("along_m,diameter_mm\n0.2,21.0\n")
+    result = write_report(branch.folder, caliper_path=path)
+    assert "Cylinder model" in result["sections"]
+    (row,) = result["calipers"]
+    assert row["difference"] == pytest.approx(20 / 21 - 1)
+    assert row["sigmas"] == pytest.approx(-0.001 / 4e-4)
+    html = (branch.folder / "report.html").read_text(encoding="utf-8")
+    for text in ("74.0 %", "26.0 %", "probability 0.40", "sigma 25% of it", "-4.8 %", "-2.5",
+                 "By branching order", "taper [mm of radius a m]"):
+        assert text in html, text
+    for content, told in (("along_m,diameter_mm\n0.5,21\n", "0.5 m; the main path is 0.4 m"),
+                          ("along_m,diameter_mm\n0.1,-3\n", "line 2: -3 mm"), ("", "no values")):
+        path.write_text(content)
+        with pytest.raises(InputError, match=told):
+            write_report(branch.folder, caliper_path=path)
+
+
+def test_a_swing_has_a_section(meshed):
+    """What it told, with intervals, and the track it was laid over."""
+    times = np.linspace(0.0, 1.0, 30)
+    track = 0.02 * np.cos(20 * times)[:, None, None] * [[[0, 0, 0.1], [0, 0.5, 1.0]]]
+    swing = {"pull": "let-go", "young_pa": 2.5e6, "young_interval_pa": [2.4e6, 2.7e6],
+             "damping_ratio": 0.05, "damping_ratio_interval": [0.04, 0.06], "release_s": 0.4,
+             "release_deviation_s": 0.01, "frequency_hz": 3.2, "relative_residual": 0.012,
+             "warnings": ["a word"], "times_s": times.tolist(), "seen_m": (track + 1e-4).tolist(),
+             "simulated_m": track.tolist()}
+    rows = swing_section.swing_rows(swing_section.SwingFile(**swing))
+    assert rows[1] == ["Young's modulus, mean [MPa]", "2.5", "2.4 to 2.7"]
+    assert rows[3][2] == "0.3804 to 0.4196"
+    with meshed.stage("swing") as stage:
+        stage.path("swing.json").write_text(json.dumps(swing), encoding="utf-8")
+    page, sections = draw_page(meshed)
+    found = next(section for section in sections if section.title == "Swing let-go")
+    assert len(found.pictures) == 1 and found.text == ["a word"] and "2.4 to 2.7" in page
+
+
+def test_a_deviation_that_is_not_known_is_told_so():
+    rows = deviation_rows({"fractions": [0.2, 0.8], "young_deviation": {
+        "sensor": [0.1, None], "geometry": None, "mesh": None, "total": [0.1, 0.2]}})
+    assert rows[2][2:] == ["not known", "not examined", "not examined", "20.0 %"]

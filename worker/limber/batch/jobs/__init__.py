@@ -1,0 +1,1 @@
+"""The job file and the command lines that come from it."""

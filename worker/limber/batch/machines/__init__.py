@@ -1,0 +1,1 @@
+"""Machines beyond this process: clusters and staging of files."""

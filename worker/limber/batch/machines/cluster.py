@@ -1,0 +1,238 @@
+"""Machines beyond this process, by Dask: a cluster started here, asked of a queue, or found.
+
+Command lines go out, outcomes come back; branch folders stand where all machines see them. What
+is sent is encrypted and both ends are known to each other (TLS); only a scheduler that somebody
+else has started on this computer may do without.
+"""
+
+import ipaddress
+import shutil
+from concurrent.futures import Future
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from limber.batch.jobs.command_lines import line_of_task
+from limber.batch.jobs.job_file import JobFile, StageTask
+from limber.batch.machines.dask_worker import run_line, stop_lines, unfit
+from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.optional import require_extra
+from limber.core.present import present
+from limber.core.processes import worker_count
+from limber.core.processes.budget import CORES, core_budget
+from limber.core.progress import Progress
+from limber.version import VERSION
+
+_QUEUES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "sge": "SGECluster",
+          "oar": "OARCluster", "moab": "MoabCluster", "htcondor": "HTCondorCluster"}
+"""Queues and what dask-jobqueue calls their clusters."""
+_LOOPBACK = "127.0.0.1"
+_NO_DAEMON = {"distributed.worker.daemon": False}
+"""A worker's processes are its own: those of Dask are not allowed any otherwise."""
+_UNSERVED: dict[str, list[str]] = {
+    "distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+"""Dask's pages are not asked for."""
+_UNWATCHED = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s",
+              "distributed.admin.system-monitor.interval": "2s"}
+"""Nor how Dask's own processes spend their time, which takes some of the stages'."""
+_WAIT_SECONDS = 0.5
+_MEMORY_MB = 4000.0
+"""What a job asks of a queue where neither the job file nor Dask's settings say."""
+
+
+class ClusterLostError(WorkError):
+    """The scheduler does not answer any more; what was done is kept."""
+
+
+class Cluster:
+    """Runs tasks on a Dask cluster; use it in a ``with``.
+
+    Args:
+        jobs: The job file; its limits hold for each stage.
+        kind: One of :data:`~limber.batch.jobs.job_file.CLUSTERS`, or None with an ``address``.
+        address: Of a scheduler that runs already: ``tls://HOST:PORT``, or ``tcp://`` on loopback.
+        workers: How many workers to start, or jobs to ask of a queue.
+        progress: Told while no worker has come yet; cancelling it ends the wait.
+
+    Raises:
+        InputError: the address would not be safe, or a queue was not told how many jobs.
+        MissingDependencyError: Dask is not installed.
+        WorkError: the cluster could not be started, or a worker of it cannot run the tasks.
+        Cancelled: it was, before a worker came.
+    """
+
+    def __init__(self, jobs: JobFile, kind: str | None = None, *, address: str | None = None,
+                 workers: int | None = None, progress: Progress):
+        packages = ("distributed", "cryptography", *(["dask_jobqueue"] if kind in _QUEUES else []))
+        require_extra("cluster", packages, "A batch on a cluster")
+        self._limits, self._place = jobs.limits, str(Path.cwd())
+        self._wanted = workers
+        self._is_cancelled = False
+        with ExitStack() as stack:
+            self._client = stack.enter_context(self._connected(stack, jobs, kind, address))
+            self._wait(kind or present(address, "kind of cluster"), progress)
+            self._closing = stack.pop_all()
+
+    @property
+    def count(self) -> int:
+        """How many tasks to have under way."""
+        return self._wanted or max(sum(self._client.nthreads().values()), 1)
+
+    def submit(self, task: StageTask, folder: Path) -> Future:
+        """Have a task run; its future holds what :func:`~limber.batch.stage_task.run_task` returns.
+
+        A worker that is lost costs this stage: another runs it again.
+        """
+        from distributed.utils import TimeoutError as NoAnswer
+
+        future: Future = Future()
+        future.set_running_or_notify_cancel()
+        try:
+            remote = self._client.submit(run_line, line_of_task(task), self._place, str(folder),
+                                         self._limits, VERSION, pure=False)
+        except (OSError, NoAnswer) as error:
+            raise _lost(error) from error
+        remote.add_done_callback(partial(self._pass_on, future))
+        return future
+
+    def cancel(self) -> None:
+        """Stop all tasks and what they have started."""
+        self._is_cancelled = True
+        self._client.cancel(list(self._client.futures.values()), force=True)
+        self._client.run(stop_lines, on_error="ignore")
+
+    def __enter__(self) -> "Cluster":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._closing.close()
+
+    def _pass_on(self, future: Future, remote: Any) -> None:
+        from distributed import KilledWorker
+
+        if remote.cancelled():
+            future.set_exception(Cancelled() if self._is_cancelled else _lost(None))
+            return
+        error = remote.exception()
+        if isinstance(error, KilledWorker):
+            error = WorkError(
+                "Every worker that ran it was lost.", "The stage, or what else ran on those "
+                "machines, took more memory or time than they had, or they went down.",
+                "See the queue's logs; ask for more memory or time in Dask's settings.")
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(remote.result())
+
+    def _connected(self, stack: ExitStack, jobs: JobFile, kind: str | None,
+                   address: str | None) -> Any:
+        """Return a client of the cluster, which is closed with ``stack``."""
+        import dask
+        from distributed import Client
+
+        if address is not None:
+            _check_address(address)
+            try:
+                return Client(address, timeout="20s", set_as_default=False)
+            except (OSError, ValueError, TypeError) as error:
+                raise WorkError(f"No Dask scheduler answers at {address} ({error}).", "",
+                                "Start `dask scheduler` and `dask worker --no-nanny`, with the "
+                                "same certificates in Dask's settings here and there.") from error
+        # As long as the cluster is there: it may start a lost worker anew.
+        stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _UNWATCHED))
+        cluster = stack.enter_context(
+            self._local(jobs) if kind == "local"
+            else self._queue(present(kind, "kind of cluster"), jobs))
+        return Client(cluster, security=cluster.security, set_as_default=False)
+
+    def _local(self, jobs: JobFile) -> Any:
+        from distributed import LocalCluster
+        from distributed.security import Security
+
+        self._wanted = worker_count(len(jobs.branches), wanted=self._wanted or jobs.workers)
+        cores = max(core_budget() // self._wanted, 1)
+        return LocalCluster(
+            n_workers=self._wanted, threads_per_worker=1, processes=True, memory_limit=0,
+            host=_LOOPBACK, protocol="tls://", security=Security.temporary(),
+            dashboard_address=f"{_LOOPBACK}:0", worker_dashboard_address=f"{_LOOPBACK}:0",
+            scheduler_kwargs={"dashboard": False}, env={CORES: str(cores)}, silence_logs="CRITICAL")
+
+    def _queue(self, kind: str, jobs: JobFile) -> Any:
+        import dask
+        import dask_jobqueue
+
+        self._wanted = self._wanted or jobs.workers
+        if self._wanted is None:
+            raise InputError(f"How many jobs to ask of {kind} is not said.",
+                             "Each waits in the queue and costs what its allocation costs.",
+                             "Give --workers N, or `workers = N` in the job file.")
+        made = getattr(dask_jobqueue, _QUEUES[kind])
+        submitter = made.job_cls.submit_command
+        if shutil.which(submitter) is None:
+            raise InputError(f"There is no {submitter} on this computer.",
+                             f"Jobs are asked of {kind} with it.",
+                             "Run the batch on a login node of the cluster, or with --emit.")
+        own = dask.config.get(f"jobqueue.{kind}", {})
+        cores = int(own.get("cores") or 1)
+        prologue = [*(own.get("job-script-prologue") or ()),
+                    "export DASK_DISTRIBUTED__WORKER__DAEMON=False", f"export {CORES}={cores}"]
+        memory = own.get("memory") or f"{cores * (jobs.limits.memory_mb or _MEMORY_MB):.0f}MB"
+        try:
+            # One worker a job, with a thread for each stage that it may run at a time.
+            cluster = made(
+                cores=cores, processes=1, memory=memory, security=True, protocol="tls://",
+                shared_temp_directory=str(jobs.out.resolve()), job_script_prologue=prologue,
+                worker_extra_args=[*(own.get("worker-extra-args") or ()),
+                                   "--dashboard-address", f"{_LOOPBACK}:0"],
+                scheduler_options={"dashboard_address": f"{_LOOPBACK}:0", "dashboard": False})
+        except (OSError, RuntimeError, ValueError) as error:
+            raise WorkError(f"The cluster of {kind} could not be started: {error}", "",
+                            f"Its settings are Dask's own (jobqueue.{kind}).") from error
+        # An allocation that has expired is asked for anew.
+        cluster.adapt(minimum_jobs=self._wanted, maximum_jobs=self._wanted)
+        self._wanted *= cores
+        return cluster
+
+    def _wait(self, name: str, progress: Progress) -> None:
+        """Wait until a worker is there, and hold those that are to what they must be."""
+        while not self._client.nthreads():
+            progress(0.0, f"waiting for the first worker of {name}")
+            try:
+                self._client.wait_for_workers(1, timeout=_WAIT_SECONDS)
+            except TimeoutError:
+                continue
+        for worker, reason in self._client.run(_unfit_here, VERSION).items():
+            if reason:
+                raise WorkError(f"The worker {worker} cannot run this batch: {reason}.", "", "")
+
+
+def _unfit_here(version: str) -> str:
+    return unfit(version)
+
+
+def _lost(error: Exception | None) -> ClusterLostError:
+    told = f" ({error})" if error is not None else ""
+    return ClusterLostError(f"The Dask scheduler does not answer any more{told}.",
+                            "What was done is kept; what ran is before its stage or after it.",
+                            "Run the batch again: it goes on from there.")
+
+
+def _check_address(address: str) -> None:
+    """Only what is encrypted leaves this computer: whoever reaches a worker can run programs."""
+    protocol, _, place = address.partition("://")
+    host = place.rpartition(":")[0].strip("[]")
+    if protocol not in ("tls", "tcp") or not host:
+        raise InputError(f"{address!r} is no address of a Dask scheduler.", "",
+                         "Write tls://HOST:PORT, as `dask scheduler` says it.")
+    if protocol == "tls" or host == "localhost":
+        return
+    try:
+        is_here = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        is_here = False
+    if not is_here:
+        raise InputError(f"{address} is not encrypted.",
+                         "Whoever can write to a Dask worker can run programs on it.",
+                         "Give scheduler, workers and this computer certificates "
+                         "(distributed.comm.tls in Dask's settings), and write tls://.")

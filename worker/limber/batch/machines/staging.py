@@ -1,0 +1,208 @@
+"""Branches whose inputs, or themselves, are elsewhere: brought here before, put there after.
+
+The branch folder here is worked on as any other. At its address its files stand beside each other
+as here, the manifest last: whoever reads it there finds the branch before a batch or after it, or
+a checksum that tells of a transfer that was cut off and that the next run ends.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from threading import Event
+
+from limber.batch.addresses import (
+    copy_here,
+    fetch,
+    put,
+    read_bytes,
+    remove,
+    take_away,
+)
+from limber.batch.jobs.job_file import BranchJob, JobFile
+from limber.batch.records import path_of_page, path_of_table
+from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
+from limber.core.files.atomic import file_digest, write_atomically
+from limber.core.files.reading import read_json
+from limber.core.files.temporary_names import owned_name, sweep_beside
+from limber.store.branch import settled_manifest
+from limber.store.manifest import MANIFEST, Manifest, checked_name, read_manifest
+
+AT_ONCE = 2
+"""Transfers side by side."""
+
+
+class Staging:
+    """Moves what branches need and what they give, in threads; use it in a ``with``."""
+
+    def __init__(self, jobs: JobFile):
+        self._jobs = jobs
+        self._closing = Event()
+        self._threads = ThreadPoolExecutor(AT_ONCE, "staging")
+
+    def fetch(self, branch: BranchJob) -> Future:
+        """Bring in a branch's inputs, and the branch itself as it stands at its address."""
+        return self._threads.submit(bring_in, branch, self._stop)
+
+    def put(self, branch: BranchJob) -> Future:
+        """Put a branch's files to its address."""
+        return self._threads.submit(put_out, self._jobs, branch)
+
+    def __enter__(self) -> "Staging":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._closing.set()
+        self._threads.shutdown(cancel_futures=True)
+
+    def _stop(self) -> None:
+        if self._closing.is_set():
+            raise Cancelled
+
+
+def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
+    """Fetch what a branch reads, and the branch where it is not here or was changed elsewhere.
+
+    Raises:
+        WorkError: a file cannot be had. BranchFolderError: the branch was changed here and there.
+    """
+    for address, path in branch.fetched:
+        fetch(address, path, stop)
+    if not branch.home:
+        return
+    theirs = read_bytes(f"{branch.home}/{MANIFEST}")
+    if theirs is None or _is_ours(branch, theirs):
+        return
+    if (branch.folder / MANIFEST).is_file():
+        # Nothing is here that was not put there before it was changed there.
+        old = branch.folder.with_name(owned_name(branch.folder.name))
+        branch.folder.rename(old)
+        remove(old)
+    _download(branch, theirs, stop)
+
+
+def put_out(jobs: JobFile, branch: BranchJob) -> None:
+    """Put what is new of a branch to its address, and what its stages wrote beside it.
+
+    Raises:
+        WorkError: it cannot be written there. BranchFolderError: it was changed there meanwhile.
+    """
+    if (branch.folder / MANIFEST).is_file():
+        _put_branch(branch)
+    if jobs.home:
+        for path in _beside(jobs, branch):
+            put(path, f"{jobs.home}/{path.relative_to(jobs.out.resolve()).as_posix()}")
+
+
+def put_summary(jobs: JobFile) -> None:
+    """Put the table and the page beside the branches, where those are elsewhere."""
+    for path in (path_of_table(jobs), path_of_page(jobs)):
+        if jobs.home and path.is_file():
+            put(path, f"{jobs.home}/{path.name}")
+
+
+def _is_ours(branch: BranchJob, theirs: bytes) -> bool:
+    """Whether the branch here is the one at its address, or newer.
+
+    Raises:
+        BranchFolderError: each has what the other has not.
+    """
+    path = branch.folder / MANIFEST
+    if not path.is_file():
+        return False
+    # What a killed program left comes first: it is this branch.
+    settled_manifest(branch.folder)
+    there, known = hashlib.sha256(theirs).hexdigest(), _known(branch)
+    here = file_digest(path)
+    if here == there:
+        _note(branch, here)
+        return True
+    if here != known != there:
+        raise BranchFolderError(
+            f"{branch.home} is another branch than {branch.folder}.",
+            "Both were changed since the one was copied to the other, or they never were one.",
+            f"Move {branch.folder} away to go on with the other, or the other to go on with it.")
+    return there == known
+
+
+def _download(branch: BranchJob, manifest: bytes, stop: Callable[[], None]) -> None:
+    sweep_beside(branch.folder)
+    made = branch.folder.with_name(owned_name(branch.folder.name))
+    made.mkdir(parents=True)
+    try:
+        write_atomically(made / MANIFEST, manifest)
+        for name, entry in read_manifest(made).files.items():
+            target = made / checked_name(name)
+            copy_here(f"{branch.home}/{name}", target, stop)
+            if file_digest(target) != entry.sha256:
+                raise WorkError(f"{branch.home}/{name} is not what its manifest says.",
+                                "It is damaged, or was being written.",
+                                "Let the program that writes it end, or restore it.")
+        made.rename(branch.folder)
+    finally:
+        remove(made)
+    _note(branch, hashlib.sha256(manifest).hexdigest())
+
+
+def _put_branch(branch: BranchJob) -> None:
+    theirs = read_bytes(f"{branch.home}/{MANIFEST}")
+    if theirs is not None and not _is_ours(branch, theirs):
+        raise BranchFolderError(f"{branch.home} was changed by another program meanwhile.",
+                                f"The results are in {branch.folder}.",
+                                "Run one batch at a time on it.")
+    mine = settled_manifest(branch.folder)
+    there = _files(theirs)
+    for name, entry in mine.files.items():
+        if there.pop(name, None) != entry.sha256:
+            put(branch.folder / checked_name(name), f"{branch.home}/{name}")
+    digest = file_digest(branch.folder / MANIFEST)
+    if theirs is None or hashlib.sha256(theirs).hexdigest() != digest:
+        put(branch.folder / MANIFEST, f"{branch.home}/{MANIFEST}")
+    _note(branch, digest)
+    for name in there:
+        take_away(f"{branch.home}/{name}")
+
+
+def _files(manifest: bytes | None) -> dict[str, str]:
+    """Names and checksums of a manifest elsewhere; none of one that is damaged."""
+    if manifest is None:
+        return {}
+    try:
+        files = Manifest.model_validate_json(manifest).files
+        return {checked_name(name): entry.sha256 for name, entry in files.items()}
+    except ValueError:
+        return {}
+
+
+def _beside(jobs: JobFile, branch: BranchJob) -> Iterator[Path]:
+    """Files that stages wrote into the results' folder, not into the branch's."""
+    out, own = jobs.out.resolve(), branch.folder.resolve()
+    fetched = {path.resolve() for _, path in branch.fetched}
+    for task in branch.tasks:
+        for value in vars(task.inputs).values():
+            path = value.resolve() if isinstance(value, Path) else None
+            if path is None or path in fetched or not path.is_relative_to(out) or (
+                    path.is_relative_to(own)):
+                continue
+            yield from sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else (
+                [path] if path.is_file() else [])
+
+
+def _mark(branch: BranchJob) -> Path:
+    return branch.folder.with_name(f".{branch.folder.name}.home.json")
+
+
+def _known(branch: BranchJob) -> str:
+    """The manifest's checksum when the branch here and that at its address were last the same."""
+    try:
+        told = read_json(_mark(branch), "a note of what was fetched")
+    except InputError:
+        # There is none, or it is damaged: then nothing is known.
+        return ""
+    is_of_it = isinstance(told, dict) and told.get("address") == branch.home
+    return str(told.get("manifest", "")) if is_of_it else ""
+
+
+def _note(branch: BranchJob, digest: str) -> None:
+    write_atomically(_mark(branch), json.dumps({"address": branch.home, "manifest": digest}))

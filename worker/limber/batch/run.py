@@ -1,0 +1,281 @@
+"""Runs a job file: branches side by side, the stages of each one after the other."""
+
+import time
+from collections import deque
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from limber.batch.jobs.job_file import BranchJob, JobFile, StageTask
+from limber.batch.log import BatchLog
+from limber.batch.machines.cluster import Cluster, ClusterLostError
+from limber.batch.machines.staging import AT_ONCE, Staging
+from limber.batch.records import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
+from limber.batch.stage_task import is_shown, run_task
+from limber.core.errors import Cancelled, LimberError, WorkError
+from limber.core.processes import Pool, worker_count
+from limber.core.progress import SILENT, Progress
+from limber.version import VERSION
+
+_TICK_SECONDS = 0.2
+_FETCH = -1
+"""Before a branch's first task: what it needs is brought from its addresses."""
+_MEMORY_MB_EACH = 1000.0
+"""What a stage may need; the pool starts no more processes than memory has room for."""
+
+
+def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
+             workers: int | None = None, cluster: str | None = None,
+             scheduler: str | None = None, progress: Progress = SILENT) -> None:
+    """Run what is not up to date; a failure ends its own branch alone.
+
+    What has failed before, with the same settings, is run again only with ``retry_failed``. Each
+    stage looks for itself whether the branch has its result already.
+
+    Args:
+        jobs: The checked job file.
+        records: Take in how each task ends, as it happens.
+        retry_failed: Try again what has failed.
+        workers: At most so many branches side by side; by default the file's, or the core budget.
+            On a queue's cluster: how many jobs to ask for.
+        cluster: Where, as one of :data:`limber.batch.jobs.job_file.CLUSTERS`; by default the
+            file's, or this process's own pool.
+        scheduler: Address of a Dask scheduler to use instead.
+        progress: Cancelling it stops all; what was done stays.
+
+    Raises:
+        Cancelled: it was cancelled.
+        WorkError: the cluster could not be had, or was lost.
+    """
+    jobs.out.mkdir(parents=True, exist_ok=True)
+    kind = None if scheduler else cluster or jobs.cluster
+    with records.writing(), (
+            Cluster(jobs, kind, address=scheduler, workers=workers, progress=progress)
+            if kind or scheduler else _ThisProcess(jobs, workers)) as machines, (
+            Staging(jobs)) as staging, BatchLog(jobs) as log:
+        log.tell(f"{jobs.path.name}: {len(jobs.branches)} branches, Limber {VERSION}")
+        _Course(jobs, records, machines, staging, log, progress, retry_failed=retry_failed).run()
+
+
+class Machines(Protocol):
+    """Where tasks are run: so many at a time, stopped all at once."""
+
+    @property
+    def count(self) -> int: ...
+
+    def submit(self, task: StageTask, folder: Path) -> Future: ...
+
+    def cancel(self) -> None: ...
+
+
+class _ThisProcess:
+    """The pool of this process."""
+
+    def __init__(self, jobs: JobFile, workers: int | None):
+        self.count = worker_count(len(jobs.branches), wanted=workers or jobs.workers,
+                                  memory_mb_each=_MEMORY_MB_EACH)
+        self._limits = jobs.limits
+        self._pool = Pool(self.count, name="a stage of the batch")
+
+    def submit(self, task: StageTask, folder: Path) -> Future:
+        return self._pool.submit(run_task, task, folder, limits=self._limits)
+
+    def cancel(self) -> None:
+        self._pool.cancel(wait_for_end=True)
+
+    def __enter__(self) -> "_ThisProcess":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._pool.close()
+
+
+class _Course:
+    """The way of all branches through their tasks; each may be fetched before and put after."""
+
+    def __init__(self, jobs: JobFile, records: Records, machines: Machines, staging: Staging,
+                 log: BatchLog, progress: Progress, *, retry_failed: bool):
+        self.jobs, self.records, self.machines, self.progress = jobs, records, machines, progress
+        self.staging, self.log, self.retry_failed = staging, log, retry_failed
+        self.waiting = deque(jobs.branches)
+        self.running: dict[Future, tuple[BranchJob, int, float]] = {}
+        self.earlier: dict[Future, Record] = {}
+        self.ended = 0
+        self.place = _identity(jobs.out)
+        # While some are moved others are computed.
+        self.ahead = AT_ONCE if any(branch.is_moved for branch in jobs.branches) else 0
+
+    def run(self) -> None:
+        total = max(len(self.jobs.branches), 1)
+        started = time.monotonic()
+        try:
+            while self.waiting or self.running:
+                # A branch is brought to its end before another is begun: results come early.
+                while self.waiting and len(self.running) < self.machines.count + self.ahead:
+                    self.begin(self.waiting.popleft())
+                done, _ = wait(self.running, _TICK_SECONDS, FIRST_COMPLETED)
+                for future in done:
+                    self.take(future)
+                self.report(total, time.monotonic() - started)
+        except BaseException as error:
+            self.machines.cancel()
+            self.log.tell(f"stopped: {error!r}")
+            raise
+        self.log.tell(f"{self.ended} branches ended in {time.monotonic() - started:.0f} s")
+
+    def report(self, total: int, seconds: float) -> None:
+        numbers: dict[str, Any] = {"branches_done": self.ended}
+        if self.ended and seconds > 1:
+            numbers["remaining_s"] = round(seconds * (total - self.ended) / self.ended)
+        at = ", ".join(f"{branch.name} {_step(branch, number)}"
+                       for branch, number, _ in list(self.running.values())[:3])
+        self.progress(self.ended / total, at, **numbers)
+
+    def begin(self, branch: BranchJob) -> None:
+        """Have a branch fetched, or its first task run."""
+        if not branch.is_moved or self.is_given_up(branch, 0):
+            self.submit(branch, 0)
+        else:
+            self.running[self.staging.fetch(branch)] = branch, _FETCH, time.monotonic()
+
+    def is_given_up(self, branch: BranchJob, number: int) -> bool:
+        """Whether a task has failed before and is not to be tried again."""
+        failed = self.records.of(branch, branch.tasks[number]).status == FAILED
+        return failed and not self.retry_failed
+
+    def submit(self, branch: BranchJob, number: int) -> None:
+        """Have the branch's task of this number run, or end the branch."""
+        if number == len(branch.tasks):
+            self.end(branch)
+            return
+        if self.is_given_up(branch, number):
+            self.ended += 1
+            return
+        self.require_place()
+        task = branch.tasks[number]
+        record = self.records.of(branch, task)
+        if record.has_succeeded and is_shown(task, branch.folder, record.content):
+            self.records.end(branch, task, replace(record, status=KEPT))
+            self.submit(branch, number + 1)
+            return
+        self.records.begin(branch, task)
+        future = self.machines.submit(task, branch.folder)
+        self.earlier[future] = record
+        self.running[future] = branch, number, time.monotonic()
+
+    def require_place(self) -> None:
+        """Stop where the folder of results was lost: a new one would hide what is in it."""
+        try:
+            is_there = _identity(self.jobs.out) == self.place
+        except OSError:
+            is_there = False
+        if not is_there:
+            raise WorkError(f"{self.jobs.out} is not there any more.",
+                            "Results and records go there; it was moved, or its disk or network "
+                            "folder was lost.",
+                            "Bring it back and run this again: what was stored is kept.")
+
+    def end(self, branch: BranchJob) -> None:
+        """Have what came of a branch put where it belongs, or count it as ended."""
+        if branch.home or self.jobs.home:
+            self.running[self.staging.put(branch)] = (
+                branch, len(branch.tasks), time.monotonic())
+        else:
+            self.ended += 1
+
+    def take(self, future: Future) -> None:
+        branch, number, since = self.running.pop(future)
+        if number in (_FETCH, len(branch.tasks)):
+            self.moved(future, branch, number, time.monotonic() - since)
+            return
+        task = branch.tasks[number]
+        record, earlier = (self.outcome(future, branch, time.monotonic() - since),
+                           self.earlier.pop(future))
+        is_kept = record.status == KEPT and earlier.has_succeeded
+        # What was told of it, and what it took, is of its making, not of finding it made.
+        self.records.end(branch, task, replace(earlier, status=KEPT, numbers=record.numbers)
+                         if is_kept else record)
+        self.log.tell(branch.name, task.label, f"{record.status} after {record.seconds or 0:.1f} s",
+                      f"with {record.memory_mb:.0f} MB" if record.memory_mb else "")
+        for warning in record.warnings:
+            self.warn(f"{branch.name} {task.label}: {warning}")
+        if record.has_succeeded:
+            self.submit(branch, number + 1)
+        else:
+            self.warn(f"{branch.name} {task.label} failed: {record.error}")
+            self.end(branch)
+
+    def warn(self, message: str) -> None:
+        self.progress.warn(message)
+        self.log.tell(message)
+
+    def moved(self, future: Future, branch: BranchJob, number: int, seconds: float) -> None:
+        """Go on after a branch was fetched, or end with it; a failure is that of the next task,
+        or of the last."""
+        try:
+            future.result()
+        except LimberError as error:
+            if isinstance(error, Cancelled):
+                raise
+            task = branch.tasks[0 if number == _FETCH else -1]
+            told = f"{_step(branch, number)}: {error}"
+            self.warn(f"{branch.name} {told}")
+            if self.records.of(branch, task).status != FAILED:
+                self.records.end(branch, task, Record(FAILED, told, round(seconds, 3)))
+            self.ended += 1
+            return
+        if number == _FETCH:
+            self.submit(branch, 0)
+        else:
+            self.ended += 1
+
+    def outcome(self, future: Future, branch: BranchJob, seconds: float) -> Record:
+        try:
+            told = future.result()
+        except (Cancelled, ClusterLostError):
+            raise
+        except LimberError as error:
+            # It crashed, or went over its limits: the pool says so.
+            return Record(FAILED, str(error), round(seconds, 3))
+        except Exception as error:
+            # A bug of ours in a stage: it costs this branch, not the night's work.
+            notes = " ".join(getattr(error, "__notes__", ()))
+            return Record(FAILED, f"internal error: {error!r}; please report it (`limber "
+                          f"bug-report {branch.folder}`). {notes}", round(seconds, 3))
+        status = FAILED if told["error"] else KEPT if told["is_kept"] else DONE
+        return Record(status, told["error"], told["seconds"], told["memory_mb"],
+                      tuple(told["warnings"]), numbers_of(told["result"]), told.get("content", ""))
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    about = folder.stat()
+    return about.st_dev, about.st_ino
+
+
+def _step(branch: BranchJob, number: int) -> str:
+    if number == _FETCH:
+        return "fetching"
+    return branch.tasks[number].label if number < len(branch.tasks) else "putting"
+
+
+def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,
+            ) -> list[tuple[BranchJob, StageTask, str]]:
+    """Return what a run would do: each branch's tasks, in order, and what comes of them."""
+    found = []
+    for branch in jobs.branches:
+        stopped = ""
+        for task in branch.tasks:
+            record = records.of(branch, task)
+            if stopped:
+                told = stopped
+            elif record.status == FAILED and not retry_failed:
+                told, stopped = "not again: it failed (--retry-failed)", "not reached"
+            elif record.status == RUNNING:
+                told = "running"
+            elif record.has_succeeded:
+                told = "done before; runs again if its input has changed"
+            else:
+                told = "to run" if record.status != FAILED else "to try again"
+            found.append((branch, task, told))
+    return found

@@ -1,0 +1,121 @@
+"""Where things stand in the loop's cell: the robot, its gripper at the branch, touched marks."""
+
+from pathlib import Path
+
+import numpy as np
+import scipy
+
+from limber.core.errors import NoPathError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.execution import across
+from limber.robot.motion.joint_path import JointPath, follow
+from limber.robot.motion.trajectory import densely
+from limber.robot.ur.arms import Arm
+from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
+
+_AROUND_M = 0.06  # that the gripper is to reach about the grasp
+_RIM_M = 0.12  # radius of the pot's rim, which has marks to touch
+_MARKS = 6
+_SINGULARITY = 0.08
+
+
+def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: float) -> float:
+    """Return the modulus [Pa] with which ``force`` [N] across a branch moves it by ``travel`` [m].
+
+    By the theory of slender beams, of the straight branch: the force's virtual work on itself.
+
+    Args:
+        fraction: Of the main path, where the force acts.
+    """
+    path = skeleton.main_path()
+    along, radius = skeleton.arc_length[path], skeleton.radius[path]
+    place = fraction * along[-1]
+    at = np.linspace(0.0, place, 400)
+    arms, radii = place - at, np.interp(at, along, radius)
+    return float(force / travel * scipy.integrate.trapezoid(arms**2 / (np.pi / 4 * radii**4), at))
+
+
+def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return where an upright arm reaches a branch best: its base's pose [6], branch frame.
+
+    Args:
+        tool: Frame of the grasp in the flange's, shape [4, 4].
+        point: Of the grasp [m], shape [3].
+        axis: Of the branch there, shape [3].
+
+    Raises:
+        NoPathError: from nowhere around.
+    """
+    best: tuple[float, np.ndarray] | None = None
+    for turn in np.arange(6) * np.pi / 3:
+        aside = np.array([np.cos(turn), np.sin(turn), 0.0])
+        for distance in (0.6, 0.8):
+            for below in (0.15, 0.3):
+                pose = np.r_[point + distance * arm.reach * aside - [0, 0, below], 0, 0, turn]
+                held = _held(arm, pose, tool, point, axis)
+                if held is not None and (best is None or held[0].singularity > best[0]):
+                    best = held[0].singularity, pose
+    if best is None:
+        raise NoPathError(f"A {arm.name} reaches the branch from nowhere around it.",
+                          "It is too large, or grows where the arm cannot turn.",
+                          "Take a larger arm.")
+    return best[1]
+
+
+def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return joints [rad, 6] and the gripper's rotation [rad, 3] with it on the branch.
+
+    Raises:
+        NoPathError: it does not reach about there.
+    """
+    found = _held(cell.arm, np.array(cell.base.pose), matrices(np.array(cell.tool.grasp_pose)),
+                  point, axis)
+    if found is None:
+        raise NoPathError("The arm does not reach about the grasp.", "", "Move its base.")
+    return found[0].joints[0], found[1]
+
+
+def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis: np.ndarray,
+          ) -> tuple[JointPath, np.ndarray] | None:
+    """The way of reaching a bit farther about a grasp that stays farthest from singularities."""
+    best: tuple[JointPath, np.ndarray] | None = None
+    for rotation in across(axis):
+        grasp = matrices(np.r_[point, rotation])
+        around = [grasp]
+        for way in _AROUND_M * np.vstack([np.eye(3), -np.eye(3)]):
+            away = grasp.copy()
+            away[:3, 3] += way
+            around += [away, grasp]
+        back = grasp.copy()
+        back[:3, 3] -= 0.08 * grasp[:3, 2]
+        frames = inverted(matrices(base)) @ np.array([*around, back])
+        steps = matrices(densely(pose_vectors(frames), spacing=0.015)) @ inverted(tool)
+        paths, _refusals = follow(arm, steps, singularity_margin=_SINGULARITY)
+        if paths and (best is None or paths[0].singularity > best[0].singularity):
+            best = paths[0], rotation
+    return best
+
+
+def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: np.ndarray,
+                  sigma: float, rng: np.random.Generator) -> None:
+    """Write points as `limber robot calibrate` takes them: on the branch, and as it touched them.
+
+    Args:
+        base: The robot's true base in the scan's frame [m, rad], shape [6].
+        moved: Added to the scan's coordinates to get the branch's [m], shape [3].
+        axis_points: Points of the branch that are touched, the scan's frame [m], shape [n, 3].
+        sigma: Standard deviation of what touching errs by, each axis [m].
+    """
+    turn = np.arange(_MARKS) * 2 * np.pi / _MARKS
+    rim = _RIM_M * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    points = np.vstack([rim, axis_points])
+    touched = np.tile(np.zeros(6), (len(points), 1))
+    touched[:, :3] = points @ matrices(base)[:3, :3] + inverted(matrices(base))[:3, 3]
+    touched[:, :3] += sigma * rng.standard_normal((len(points), 3))
+    lines = ["name,x_m,y_m,z_m,robot_x_m,robot_y_m,robot_z_m,robot_rx_rad,robot_ry_rad,"
+             "robot_rz_rad"]
+    for number, (point, pose) in enumerate(zip(points + moved, touched, strict=True)):
+        name = f"rim-{number + 1}" if number < _MARKS else f"branch-{number + 1 - _MARKS}"
+        lines.append(",".join([name, *(f"{value:.7g}" for value in (*point, *pose))]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,436 @@
+"""Scan, reconstruct, record, estimate, plan, execute: each a process, over loopback.
+
+A branch is generated and stands, on a mesh of its own and with moduli that only it knows, beside a
+virtual robot. Everything after that uses what a user has: the camera's pictures, touched points,
+the robot's ports and Limber's own commands. At the end both sides are compared.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.cli.closed_loop.bystander import Watch
+from limber.cli.closed_loop.cell_layout import (
+    base_beside,
+    bending_modulus,
+    gripper_at,
+    write_touched,
+)
+from limber.cli.closed_loop.task_sizes import Wish, wish_for
+from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
+from limber.core.json_values import plain
+from limber.core.processes.stage_process import run_stage
+from limber.core.progress import SILENT, Progress
+from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.simulated_pull import TrueBranch, true_branch
+from limber.geometry.generated import read_truth
+from limber.geometry.io.skeletons import read_swc
+from limber.planning.problem import UNPROVEN
+from limber.robot.cell.cell import Cell, read_cell, write_cell
+from limber.robot.ur.arms import arm_named
+from limber.robot.ur.kinematics import matrices
+from limber.robot.virtual.gripped_branch import BranchSetting
+from limber.robot.virtual.launch import VirtualRobot
+from limber.robot.virtual.server import MARKER_PORT
+from limber.store import Branch
+from limber.store.loading import load_skeleton
+
+GRASP_FRACTION = 0.85
+FLOWER, PLAN = "flower", "to-light"
+GOAL_TOLERANCE_M = 0.01
+"""So near its goal the flower is in it."""
+PLANNED_TOLERANCE_M = 0.006
+"""So near it is planned: a path ends where the region begins, and the model is off by something."""
+
+_LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
+_PEAK_N, _TRAVEL_M = 6.0, 0.04
+OPEN_FACTOR = 4.0
+"""Between the ends of a modulus' interval: where it is more, `limber suggest-pull` is asked whether
+another pull is worth it for the plan."""
+_MOST_PULLS = 3
+_MORE_SAMPLES = 450  # about twice the usual
+_FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
+_GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
+_TOUCH_SIGMA_M = 3e-4
+_POISSON_SIGMA, _DENSITY_SIGMA, _WAVE_SIGMA = 0.05, 0.1, 0.12  # from what a fit is told
+_SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8
+_PULL_SPEED_M_S = 0.02
+_PLAN_SPEED_M_S = 0.03
+_OVERLOAD_N = 30.0  # beyond the hard limit
+_DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16, "target": 0.17,
+         "record": 0.27, "estimate": 0.5, "energy": 0.6, "plan": 0.66, "suggest": 0.68,
+         "dry run": 0.75,
+         "execute": 0.88, "overload": 1.0}
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What pulls have told so far, and what was planned with it."""
+
+    estimated: dict[str, Any]
+    goal: np.ndarray
+    wish: Wish
+    plan: dict[str, Any]
+    pull_count: int = 1
+    reason: str = ""
+
+    @property
+    def open_factor(self) -> float:
+        """The widest interval of a modulus: its end over its beginning."""
+        low, high = np.array(self.estimated["young_interval_pa"], float).T
+        return float((high / low).max())
+
+
+@dataclass
+class ClosedLoop:
+    """One turn of the loop on a branch of its own.
+
+    Args:
+        folder: Where everything goes.
+        seed: Of the branch, the sensors' noise and the touching.
+        address: Loopback address of the virtual robot.
+        model: Its arm.
+        say: Gets a line for each part.
+
+    Attributes:
+        seconds: What each part took.
+    """
+
+    folder: Path
+    seed: int = 1
+    address: str = "127.0.0.1"
+    model: str = "ur5e"
+    say: Callable[[str], None] = lambda line: None
+    progress: Progress = SILENT
+    seconds: dict[str, float] = field(default_factory=dict)
+    _done: float = 0.0
+
+    @property
+    def branch(self) -> Path:
+        """The branch folder that the loop makes."""
+        return self.folder / "loop.branch"
+
+    @property
+    def cell_file(self) -> Path:
+        return self.folder / "cell.toml"
+
+    def run(self) -> dict[str, Any]:
+        """Go once around.
+
+        Returns:
+            What :meth:`_compared` tells.
+
+        Raises:
+            LimberError: a part failed; the robot is gone then, what was made stays.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.branch.exists():
+            raise InputError(f"{self.branch} is there already.", "A loop begins with a new branch.",
+                             "Choose another folder with -o.")
+        truth = self._grown()
+        cell = self._cell(truth)
+        setting = self._setting(truth, cell)
+        file = self.folder / "truth.json"
+        file.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}),
+                        encoding="utf-8")
+        with VirtualRobot(self.model, self.address,
+                          ["--branch", str(file), "--seed", str(self.seed)]) as robot:
+            try:
+                moved = self._reconstructed(truth, cell)
+                told = self._told(robot)
+                executed, watch = self._executed(robot)
+                stopped = self._overloaded(robot, executed)
+            except SafetyStop:
+                # A real controller is never held up: what this one lost may be what stopped it.
+                if robot.process.poll() is None:
+                    held_up = 1000 * robot.state["lost_seconds"]
+                    self.progress.warn("stopped; until then the virtual robot itself was held up "
+                                       f"for {held_up:.0f} ms in all.")
+                raise
+        return self._compared(truth, moved, told, executed, watch, stopped)
+
+    # Parts
+
+    def _grown(self) -> TrueBranch:
+        scan = self.folder / "grown"
+        shape = ["--length", _LENGTH_M, "--fork-count", 0, "--seed", self.seed]
+        self._part("generate", "a branch grows", "generate", scan, *shape)
+        skeleton = read_swc(scan / "truth_skeleton.swc")
+        young = bending_modulus(skeleton, GRASP_FRACTION, _PEAK_N, _TRAVEL_M)
+        known = read_truth(scan / "truth.json")
+        shares = np.array(known["young_pa"]) / np.exp(np.mean(np.log(known["young_pa"])))
+        return true_branch(skeleton, VirtualPullSettings(young=tuple(young * shares)),
+                           fractions=tuple(known["fractions"]))
+
+    def _setting(self, truth: TrueBranch, cell: Cell) -> BranchSetting:
+        """Return the branch as it is: unlike what a fit is told, by as much as it allows for."""
+        rng, told = np.random.default_rng([self.seed, 8]), VirtualPullSettings()
+        poisson = float(np.clip(rng.normal(told.poisson, _POISSON_SIGMA), 0.2, 0.47))
+        return BranchSetting.of_truth(
+            truth, cell, self.folder / "truth.vtu", poisson=poisson,
+            density=told.density * (1 + _DENSITY_SIGMA * float(rng.standard_normal())),
+            wave=_WAVE_SIGMA * float(rng.standard_normal()))
+
+    def _cell(self, truth: TrueBranch) -> Cell:
+        """Put the robot beside the branch; returns its true cell in the scan's frame."""
+        point, axis = _grasp_of(truth.skeleton)
+        arm = arm_named(self.model)
+        base = base_beside(arm, matrices(np.array(_GRASP_POSE)), point, axis)
+        return Cell(
+            robot={"model": self.model, "address": self.address},
+            base={"pose": tuple(map(float, base))},
+            tool={"grasp_pose": _GRASP_POSE, "gripper": "digital_output", "mass_kg": 0.0,
+                  "grip_seconds": 4.0},
+            limits={"soft_force_n": 20.0, "hard_force_n": 30.0, "hard_torque_nm": 6.0})
+
+    def _reconstructed(self, truth: TrueBranch, cell: Cell) -> np.ndarray:
+        """Scan, reconstruct, calibrate, name the flower; returns what takes the scan's frame to
+        the branch's [m], shape [3]."""
+        nodes = truth.mesh.nodes
+        middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
+        scan = self.folder / "scan.ply"
+        self._part("scan", "scanned by the virtual camera", "robot", "scan", "--address",
+                   self.address, "-o", scan, "--middle", *middle, "--distance", _SCAN_DISTANCE_M,
+                   "--views", _SCAN_VIEWS)
+        self._part("reconstruct", "scan to tetrahedra", "reconstruct", scan, "-o", self.branch,
+                   "--root", *truth.skeleton.nodes[0], "--grasp-fraction", GRASP_FRACTION)
+        alignment = Branch.open(self.branch).manifest.alignment
+        moved = alignment.apply(np.zeros((1, 3)))[0]
+        assert np.allclose(np.array(alignment.rotation), np.eye(3)), "the scan is upright"
+        # Somebody has measured roughly where the base stands; touching tells it.
+        base = np.array(cell.base.pose) + np.r_[moved, 0, 0, 0]
+        write_cell(self.cell_file, cell.model_copy(update={
+            "base": cell.base.model_copy(update={"pose": tuple(map(float, base))})}))
+        rng = np.random.default_rng([self.seed, 7])
+        on_axis = np.array([truth.skeleton.point_at(part) for part in (0.3, 0.6, 0.85)])
+        write_touched(self.folder / "touched.csv", np.array(cell.base.pose), moved, on_axis,
+                      _TOUCH_SIGMA_M, rng)
+        self._part("calibrate", "base calibrated by touching", "robot", "calibrate",
+                   self.cell_file, self.branch, "--points", self.folder / "touched.csv")
+        tip = truth.skeleton.nodes[truth.skeleton.main_path()[-1]] + moved
+        self._part("target", "the flower at its tip is named", "target", self.branch, FLOWER,
+                   "--at", *tip)
+        return moved
+
+    def _told(self, robot: VirtualRobot) -> "_Told":
+        """Pull, estimate and plan, and pull again as long as that is worth it for the plan."""
+        branch = Branch.open(self.branch)
+        point, axis = _grasp_of(load_skeleton(branch))
+        self._pulled(robot, 1, point, axis, "--direction", *_sideways(point)[0], "--distance",
+                     _TRAVEL_M)
+        told = self._planned()
+        for number in range(2, _MOST_PULLS + 1):
+            if told.open_factor <= OPEN_FACTOR:
+                return replace(told, reason=f"no interval is open beyond {OPEN_FACTOR:g}")
+            reached = [part for part in _FRACTIONS if self._reaches(part)]
+            if not reached:
+                return replace(told, reason="the arm reaches no place for another pull")
+            found = self._part("suggest", "whether another pull is worth it", "suggest-pull",
+                               self.branch, "--plan", PLAN, "--fractions",
+                               ",".join(map(str, reached)), "--max-force",
+                               read_cell(self.cell_file).limits.soft_force_n)
+            if not found["plan"]["worth"]:
+                return replace(told, reason=found["plan"]["why"])
+            self._pulled(robot, number, *_grasp_of(load_skeleton(branch),
+                                                   found["best"]["grasp_fraction"]), "--suggested")
+            told = replace(self._planned(told.goal), pull_count=number)
+        return replace(told, reason=f"{_MOST_PULLS} pulls were made")
+
+    def _reaches(self, fraction: float) -> bool:
+        """Whether the arm reaches about a place of the main path."""
+        place = _grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
+        try:
+            gripper_at(read_cell(self.cell_file), *place)
+        except NoPathError:
+            return False
+        return True
+
+    def _pulled(self, robot: VirtualRobot, number: int, point: np.ndarray, axis: np.ndarray,
+                *way: object) -> None:
+        """Record a pull with the gripper about ``point`` [3]."""
+        joints, _rotation = gripper_at(read_cell(self.cell_file), point, axis)
+        robot.ask("stand", joints=list(map(float, joints)))
+        name = f"pull-{number}"
+        self._part("record", "a pull along the branch's arc", "record", self.branch, "--cell",
+                   self.cell_file, "--name", name, "--confirm", name, "--markers", MARKER_PORT,
+                   *way, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
+
+    def _planned(self, goal: np.ndarray | None = None) -> "_Told":
+        """Estimate, sample the energy field and plan the flower's way to a place [3], or to one
+        that suits the branch."""
+        estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
+                               self.branch)
+        branch = Branch.open(self.branch)
+        place, _axis = _grasp_of(load_skeleton(branch))
+        # A place that somebody wishes the flower at: where a pull to the other side takes it.
+        wish = wish_for(branch, _sideways(place)[1], _TRAVEL_M)
+        write_cell(self.cell_file, wish.limited(read_cell(self.cell_file)))
+        goal = wish.place if goal is None else goal
+        self._sampled(wish)
+        try:
+            plan = self._ways(wish, goal)
+        except WorkError as error:
+            if UNPROVEN not in str(error):
+                raise
+            # What it advises then, once: where a branch may stand in two shapes, few poses tell
+            # its force coarsely.
+            self.progress.warn(f"plan: {error} Planned again with {_MORE_SAMPLES} poses.")
+            self._sampled(wish, "--samples", _MORE_SAMPLES)
+            plan = self._ways(wish, goal)
+        return _Told(estimated, goal, wish, plan)
+
+    def _sampled(self, wish: Wish, *more: object) -> None:
+        self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed",
+                   self.seed, "--deflection", wish.sampled_deflection, *more)
+
+    def _ways(self, wish: Wish, goal: np.ndarray) -> dict[str, Any]:
+        return self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
+                          PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
+                          "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", wish.max_force,
+                          "--speed", _PLAN_SPEED_M_S, "--seed", self.seed)
+
+    def _executed(self, robot: VirtualRobot) -> tuple[dict[str, Any], Watch]:
+        dry = self._part("dry run", "the path checked for the arm", "execute", self.branch,
+                         "--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S)
+        robot.ask("stand", joints=dry["start_joints_rad"])
+        with Watch(robot) as watch:
+            result = self._part("execute", "the path followed, armed", "execute", self.branch,
+                                *self._armed(dry))
+        return dry | result, watch
+
+    def _overloaded(self, robot: VirtualRobot, executed: dict[str, Any]) -> tuple[str, Watch]:
+        """Follow the path again and overload the sensor on the way; returns what stopped it."""
+        robot.ask("stand", joints=executed["start_joints_rad"])
+        limit = read_cell(self.cell_file).limits.hard_force_n
+        overload = np.array([0.0, 0.0, limit + _OVERLOAD_N, 0.0, 0.0, 0.0])
+        stopped: SafetyStop | None = None
+        with Watch(robot, overload=overload) as watch:
+            try:
+                self._part("overload", "the path again, with an overload", "execute", self.branch,
+                           *self._armed(executed))
+            except SafetyStop as stop:
+                stopped = stop
+        if stopped is None:
+            raise WorkError("The overload stopped nothing.", f"{overload[2]:.0f} N were added to "
+                            "the sensor while the branch was led.", "See the robot's log.")
+        told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
+        if told["stop_reason"] is None:
+            # Something else stopped it before it moved; what is told is of the way before.
+            raise stopped
+        return told["stop_reason"], watch
+
+    def _armed(self, dry: dict[str, Any]) -> list[object]:
+        return ["--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S, "--arm",
+                "--confirm", PLAN, "--after-stop", "hold", "--gripper-rotation",
+                *dry["gripper_rotation"]]
+
+    # Both sides
+
+    def _compared(self, truth: TrueBranch, moved: np.ndarray, told: "_Told",
+                  executed: dict[str, Any], watch: Watch, stopped: tuple[str, Watch],
+                  ) -> dict[str, Any]:
+        """Return recovered against true E, force along the path, the flower, the overload."""
+        estimated, goal = told.estimated, told.goal
+        seen = watch.at_the_end()
+        flower = None if seen is None else seen[-1] + moved
+        off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
+        interval = np.array(estimated["young_interval_pa"], float)
+        reason, second = stopped
+        overload = second.overloaded
+        return plain({
+            "seed": self.seed, "branch": self.branch, "young_true_pa": truth.young,
+            "young_pa": estimated["young_pa"], "young_interval_pa": interval,
+            "covered": (interval[:, 0] <= truth.young) & (truth.young <= interval[:, 1]),
+            "force_within_share": executed["force_within_share"],
+            "force_error_of_peak": executed["force_error_of_peak"],
+            "predicted_peak_force_n": executed["predicted_peak_force_n"],
+            "predicted_force_sigma_n": executed["predicted_force_sigma_n"],
+            "peak_force_n": executed["peak_force_n"], "path_error_m": executed["path_error_m"],
+            "limit_broken": bool(executed["peak_force_n"]
+                                 > read_cell(self.cell_file).limits.soft_force_n),
+            "pull_count": told.pull_count, "open_factor": told.open_factor,
+            "no_further_pull": told.reason, "holding_force_n": told.wish.holding_force,
+            "max_force_n": told.wish.max_force,
+            "flower_goal_m": goal, "flower_planned_m": told.plan.get("target_end_m"),
+            "flower_m": flower, "flower_off_m": None if flower is None else off,
+            "flower_in_goal": off <= GOAL_TOLERANCE_M,
+            "overload_reason": reason,
+            "overload_way_m": overload.way if overload else None,
+            "overload_standstill_s": overload.standstill if overload else None,
+            "extrapolation_error_n": max(watch.extrapolation_error, second.extrapolation_error),
+            "part_seconds": self.seconds})
+
+    def _part(self, name: str, title: str, *arguments: object) -> dict[str, Any]:
+        """Run a command as a process; show its progress and its time."""
+        with self._timed(name, title) as progress:
+            result = run_stage([str(a) for a in arguments], progress)
+        for warning in result.get("warnings", []):
+            self.progress.warn(f"{name}: {warning}")
+        return result
+
+    @contextmanager
+    def _timed(self, name: str, title: str) -> Iterator[Progress]:
+        began = time.perf_counter()
+        ends = max(self._done, _DONE[name])
+        progress = self.progress.part(self._done, ends)
+        progress(0.0, title)
+        try:
+            yield progress
+        finally:
+            self._done = ends
+            took = round(time.perf_counter() - began, 1)
+            self.seconds[name] = round(self.seconds.get(name, 0.0) + took, 1)
+            self.say(f"  {title:<42} {took:6.1f} s")
+
+
+def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """Return titles and tables of what a loop found, for a terminal."""
+    from limber.results.report.tables import modulus_rows
+
+    force = [["force along the path", ""],
+             ["predicted peak", f"{result['predicted_peak_force_n']:.2f} N"],
+             ["measured peak", f"{result['peak_force_n']:.2f} N"],
+             ["within 5 % of the peak or its interval",
+              f"{100 * result['force_within_share']:.1f} % of the path"],
+             ["difference, 95 % of the path below",
+              f"{100 * result['force_error_of_peak']:.1f} % of the peak"],
+             ["the virtual branch's own force off by at most",
+              f"{result['extrapolation_error_n']:.2f} N"]]
+    places = [["", "x [mm]", "y [mm]", "z [mm]"]]
+    for title, key in (("flower's goal", "flower_goal_m"), ("as planned", "flower_planned_m"),
+                       ("where it came to", "flower_m")):
+        if result[key] is not None:
+            places.append([title, *(f"{1000 * value:.1f}" for value in result[key])])
+    way, still = result["overload_way_m"], result["overload_standstill_s"]
+    pulls = [["pulls", str(result["pull_count"])],
+             ["widest interval, its end over its beginning", f"{result['open_factor']:.1f}"],
+             ["no further pull", result["no_further_pull"]],
+             ["holds the flower in its goal", f"{result['holding_force_n']:.2f} N"],
+             ["allowed on the way", f"{result['max_force_n']:.2f} N"]]
+    stop = [["a provoked overload", ""], ["stopped by", result["overload_reason"]],
+            ["way after it", "-" if way is None else f"{1000 * way:.1f} mm"],
+            ["until standstill", "-" if still is None else f"{1000 * still:.0f} ms"]]
+    return [("Young's modulus", modulus_rows(result, result)), ("Whether that is enough", pulls),
+            ("Predicted against measured", force), ("The flower", places), ("Safety", stop)]
+
+
+def _grasp_of(skeleton: Any, fraction: float = GRASP_FRACTION,
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """A place on the main path [m] and the branch's axis there, shape [3] each."""
+    point = skeleton.point_at(fraction)
+    axis = point - skeleton.point_at(fraction - 0.05)
+    return point, axis / np.linalg.norm(axis)
+
+
+def _sideways(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions across the line from the root, the origin, to ``point`` [3]."""
+    axis = point / np.linalg.norm(point)
+    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)

@@ -1,0 +1,101 @@
+"""Many branches at once: the stages that a job file names, resumed where it was left."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.batch.jobs.job_file import CLUSTERS
+from limber.cli.main import Run, stage_command
+
+
+@stage_command("batch")
+@click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
+@click.option("--dry-run", is_flag=True, help="Only check the file and say what would run.")
+@click.option("--retry-failed", is_flag=True, help="Run again also what has failed before.")
+@click.option("--emit", type=click.Choice(["slurm", "snakemake"]), help=(
+    "Run nothing; write a Slurm array job, a task a branch, or a Snakefile, for a cluster."))
+@click.option("--cluster", type=click.Choice(CLUSTERS), help=(
+    "Run on a Dask cluster: started here (local, loopback only), or asked of a queue with the "
+    "settings of dask-jobqueue (jobqueue.slurm and so on in Dask's configuration)."))
+@click.option("--scheduler", metavar="tls://HOST:PORT", help=(
+    "Run on the Dask cluster of this scheduler; tcp:// only on loopback."))
+@click.option("--workers", type=click.IntRange(min=1), help=(
+    "At most so many branches side by side; by default as the file says, or one a core. "
+    "Of a queue: so many jobs."))
+def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: str | None,
+            cluster: str | None, scheduler: str | None, workers: int | None) -> dict[str, Any]:
+    """Run stages on many branches, side by side.
+
+    \b
+    out = "results"                     # where all goes; default: the file's name
+    workers = 2
+    time_limit = "1 h"                  # of each stage; memory_limit = "4 GB"
+    cluster = "slurm"                   # or local, pbs, ...; default: the cores of this computer
+    [[job]]
+    scans = ["scans/*.ply"]             # a branch each; or folders = ["old/*.branch"]
+    [[job.stage]]
+    run = "reconstruct"                 # settings as in `limber reconstruct --help-all`, with _
+    contraction_points = 6000
+    [[job.stage]]
+    run = "import-pull"
+    source = "pulls/{scan}/*.csv"       # one run for each file that is found
+    name = "{file}"
+    [[job.stage]]
+    run = "estimate"
+    [job.sweep]                         # a branch for each combination
+    "reconstruct.mesh_spacing" = [2.0, 3.0]
+
+    Scans, folders, inputs and out may be addresses that fsspec knows (s3://bucket/scans/*.ply):
+    fetched before a branch is begun, its results put there after it; work = "/scratch" says where
+    they are worked on.
+
+    A number may have its unit: grasp_radius = "8 mm". The whole file is checked before anything
+    runs. Run it again after a stop, or after inputs have changed: what is up to date is kept.
+    The results stand in OUT/JOBS.csv, one row a branch, and OUT/JOBS.html.
+    """
+    from limber.batch.jobs.job_file import read_jobs
+    from limber.batch.machines.staging import put_summary
+    from limber.batch.records import Records, path_of_page, path_of_table
+    from limber.batch.run import plan_of, run_jobs
+    from limber.batch.summary import counts, failures, write_page, write_table
+    from limber.core.errors import InputError, WorkError
+
+    if cluster is not None and scheduler is not None:
+        raise InputError("Both --cluster and --scheduler are given.",
+                         "The one starts a cluster, the other uses one.", "Leave one out.")
+    jobs = read_jobs(job_file)
+    if emit is not None:
+        from limber.batch.jobs.scheduler_scripts import write_script
+
+        return {"branch_count": len(jobs.branches), "script": write_script(jobs, emit)}
+    records = Records(jobs)
+    if dry_run:
+        planned = plan_of(jobs, records, retry_failed=retry_failed)
+        run.show("What would run", [["branch", "stage", ""], *(
+            [branch.name, task.label, told] for branch, task, told in planned)])
+        return {"branch_count": len(jobs.branches), "task_count": len(planned),
+                "planned": [[branch.name, task.label, told] for branch, task, told in planned]}
+    try:
+        run_jobs(jobs, records, retry_failed=retry_failed, workers=workers,
+                 cluster=cluster, scheduler=scheduler, progress=run.progress)
+    except BaseException:
+        # What it came to is told as far as it can be: the error is what counts.
+        try:
+            if jobs.out.is_dir():
+                write_table(jobs, records)
+                write_page(jobs, records)
+        except OSError as error:
+            run.progress.warn(f"The summary could not be written ({error}).")
+        raise
+    write_table(jobs, records)
+    write_page(jobs, records)
+    put_summary(jobs)
+    failed = failures(jobs, records)
+    if failed:
+        first = ": ".join(failed[0])
+        raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed; {first}",
+                        "The others are done.",
+                        f"See {path_of_page(jobs)}; mend it and run this with --retry-failed.")
+    return {"branch_count": len(jobs.branches), **counts(jobs, records),
+            "table": path_of_table(jobs), "page": path_of_page(jobs)}

@@ -1,0 +1,84 @@
+"""Gather what a report of a bug needs in one file."""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+
+
+@stage_command("bug-report")
+@click.argument("source", type=click.Path(path_type=Path), metavar="FOLDER_OR_FILE")
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("limber-bug.zip"),
+              show_default=True, help="File to write.")
+@click.option("--data", is_flag=True, help=(
+    "Also the files: scan, mesh, recordings. Without it nothing of what was measured "
+    "leaves your computer but numbers of results and settings."))
+@click.option("--note", default="", help="What you did, and what happened instead.")
+def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict[str, Any]:
+    """Pack what is installed, and what is known of a branch folder or of a scan, into a ZIP.
+
+    Of a folder its manifest and what is wrong with its files; a scan that no branch came of is
+    named itself. Look into the ZIP before you send it: the manifest names your files.
+    """
+    from limber.cli.commands.doctor import report
+    from limber.core.errors import InputError
+    from limber.core.files.safe_names import is_link
+    from limber.core.json_values import plain
+    from limber.store.manifest import MANIFEST
+
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"There is no {source}.", "A branch folder or a scan was expected.",
+                         "Name what the bug is about.")
+    told: dict[str, Any] = {"note": note, "doctor": plain(report()), "damages": [], "opens": True}
+    if source.is_dir():
+        told |= _of_folder(source)
+        # A link may lead to a file that is none of the branch's.
+        files = sorted(Path(place, name) for place, _, names in os.walk(source) for name in names
+                       if Path(place, name).is_file() and not is_link(Path(place, name)))
+        names = {path: path.relative_to(source).as_posix() for path in files}
+    else:
+        files, names = [source], {source: source.name}
+    told["files"] = {names[path]: {"bytes": path.stat().st_size, "sha256": _digest(path)}
+                     for path in files}
+    count = 0
+    try:
+        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("report.json", json.dumps(plain(told), indent=1, default=str))
+            for path, name in names.items():
+                if name == MANIFEST or (data and path.resolve() != Path(output).resolve()):
+                    run.progress(count / len(files), name)
+                    archive.write(path, f"branch/{name}" if source.is_dir() else name)
+                    count += 1
+    except OSError as error:
+        raise InputError(f"{output} cannot be written ({error.strerror}).",
+                         "The report goes there.", "Choose another place with -o.") from error
+    return {"output": output, "file_count": count, "byte_count": Path(output).stat().st_size,
+            "opens": told["opens"], "damaged_count": len(told["damages"])}
+
+
+def _of_folder(folder: Path) -> dict[str, Any]:
+    from limber.core.errors import BranchFolderError
+    from limber.store import Branch
+
+    try:
+        branch = Branch.read(folder, unfinished=True)
+        return {"damages": [vars(damage) for damage in branch.damages()],
+                "is_unfinished": branch.is_unfinished}
+    except BranchFolderError as error:
+        # A folder that cannot be opened is the more worth a report.
+        return {"opens": False, "error": str(error)}
+
+
+def _digest(path: Path) -> str:
+    from limber.core.files.atomic import file_digest
+
+    try:
+        return file_digest(path)
+    except OSError as error:
+        return f"not readable: {error.strerror}"

@@ -1,0 +1,43 @@
+"""What is kept to be quicker the next time, and how much room it takes."""
+
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+
+
+@stage_command("cache")
+@click.option("--limit", metavar="SIZE", help=(
+    "Remove what was used longest ago until all together take so much at most: 500 MB, 2 GB."))
+@click.option("--clear", is_flag=True, help="Remove all of it; it is made anew when it is needed.")
+def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
+    """Show what is kept beside branch folders (meshes, reduced models, compiled code), or trim it.
+
+    Nothing of it is a result: branch folders do not need it.
+    """
+    from limber.core.errors import InputError
+    from limber.core.files.caches import cache_folder, known_caches, trim
+    from limber.core.files.caches import clear as clear_folder
+    from limber.core.units import in_unit
+
+    most = None
+    if limit is not None:
+        try:
+            most = 1e6 * float(in_unit(limit, "MB"))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"--limit {limit!r} is no size.", "", "Write 500 MB or 2 GB.",
+                             ) from error
+        if not 0 <= most < float("inf"):
+            raise InputError(f"--limit {limit!r} is no size.", "", "Write 500 MB or 2 GB.")
+    if clear:
+        freed = clear_folder(cache_folder())
+    else:
+        freed = 0 if most is None else trim(cache_folder(), most)
+    caches = known_caches()
+    run.show(f"Kept in {cache_folder()}", [["what", "files", "MB"], *(
+        [one.name, str(one.file_count), f"{one.byte_count / 1e6:.1f}"] for one in caches)])
+    return {"folder": cache_folder(), "byte_count": sum(one.byte_count for one in caches),
+            "freed_bytes": freed,
+            "caches": {one.name: {"file_count": one.file_count, "byte_count": one.byte_count}
+                       for one in caches}}

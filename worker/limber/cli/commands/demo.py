@@ -1,0 +1,235 @@
+"""The whole pipeline on one branch: every stage as a process, and a closing table."""
+
+import functools
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.optional import require_extra
+from limber.core.processes.stage_process import run_stage
+from limber.geometry.settings import ReconstructSettings
+from limber.stages.command_line import (
+    GroupedOption,
+    command_line,
+    options_of,
+    settings_options,
+    without_foreign_options,
+)
+
+# Assumed Young's modulus [Pa] at the control points for the simulated pull on a scan that comes
+# without a recording: green wood that softens towards the tip.
+DEMO_YOUNG = (2.0e9, 1.6e9, 1.2e9, 0.8e9)
+
+# Share of the whole time by which each stage ends, for the bar; measured once, need not be exact.
+_ENDS = {"generate": 0.01, "reconstruct": 0.15, "virtual-pull": 0.3, "estimate": 0.5,
+         "simulate": 0.55, "energy": 0.8, "plan": 0.92, "scene": 0.97, "report": 1.0}
+
+
+@dataclass
+class _Demo:
+    """A demo in progress: its folder and what its stages returned, by command."""
+
+    folder: Path
+    run: Run
+    own: frozenset[str]
+    """The demo's options."""
+    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    done: float = 0.0
+
+    def stage(self, title: str, *arguments: object) -> None:
+        """Run one stage as a process; show its progress and its time; keep its result."""
+        name = str(arguments[0])
+        started = time.perf_counter()
+        progress = self.run.progress.part(self.done, _ENDS[name])
+        progress(0.0, title)
+        try:
+            result = run_stage([str(a) for a in arguments], progress)
+        except LimberError as error:
+            raise self._in_own_words(name, error) from error
+        self.done = _ENDS[name]
+        self.seconds[name] = round(time.perf_counter() - started, 1)
+        self.results[name] = result
+        self.run.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
+        for warning in result.get("warnings", []):
+            if told := without_foreign_options(warning, self.own):
+                self.run.progress.warn(f"{name}: {told}")
+
+    def _in_own_words(self, name: str, error: LimberError) -> LimberError:
+        """Return a stage's error without advice to use options that only the stage has."""
+        seen, why, fix = (without_foreign_options(part, self.own)
+                          for part in (error.seen, error.why, error.fix))
+        if (seen, why, fix) == (error.seen, error.why, error.fix):
+            return error
+        return type(error)(seen or f"{name} failed.", why, " ".join(filter(None, [
+            fix, f"`limber {name}` has more options than the demo; run it by itself on the "
+                 f"results in {self.folder}."])))
+
+
+_option = functools.partial(click.option, cls=GroupedOption, group="demo")
+
+
+@stage_command("demo")
+@click.argument("cloud", required=False, type=click.Path(path_type=Path))
+@_option("-o", "--output", type=click.Path(path_type=Path),
+         help="Folder of the results.  [default: out/NAME]")
+@_option("--crop", type=float, nargs=6, metavar="X Y Z X Y Z",
+         help="Lower and upper corner of the part to keep, in the cloud's coordinates.")
+@_option("--skeleton", type=click.Path(path_type=Path),
+         help="Your own skeleton in the cloud's coordinates, as of `limber reconstruct`.")
+@_option("--edits", type=click.Path(path_type=Path),
+         help="Edits of the skeleton, as of `limber skeleton`.")
+@_option("--goal", type=float, nargs=3, metavar="X Y Z",
+         help="Where the grasp shall be, in the branch's frame [m]; else a far pose.")
+@_option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
+         show_default=True, metavar="A,B,C,D",
+         help="Assumed Young's modulus [Pa] at the control points of your CLOUD's pull.")
+@_option("--seed", type=int, default=1, show_default=True,
+         help="Of the generated branch, the sensor noise and the planner.")
+@_option("--force", is_flag=True, help="Reconstruct again even if nothing has changed.")
+@_option("--robot", is_flag=True, help="The whole loop instead, with a virtual robot that "
+         "scans, pulls and moves a generated branch, over loopback.")
+@settings_options(ReconstructSettings, "scan", without=("young",))
+def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed: int, robot: bool,
+            **wishes: Any) -> dict[str, Any]:
+    """The whole pipeline on one branch: a generated one with known truth, or your CLOUD with a
+    simulated pull, whose modulus is assumed."""
+    if robot:
+        return _closed_loop(run, cloud, output or Path("out") / "robot", seed)
+    if cloud is not None and not cloud.is_file():
+        raise InputError(f"There is no file {cloud}.", "The demo wants the scan of one branch.",
+                         "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
+    # Before minutes of work, not after them.
+    require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
+    name = cloud.stem if cloud else "generated"
+    demo = _Demo(output or Path("out") / name, run,
+                 options_of(click.get_current_context().command))
+    _make_folder(demo.folder)
+    started = time.perf_counter()
+    run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
+    if cloud is not None:
+        run.say("The pull is simulated with an assumed Young's modulus (--young): nothing is "
+                "measured of this branch's stiffness.")
+    branch, failure = _run_stages(demo, cloud, name, young=young, seed=seed, wishes=wishes)
+    _show_tables(demo)
+    summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}
+    run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\n"
+            f"picture {summary['picture']}\n{summary['demo_seconds']:.0f} s in all")
+    if failure is not None:
+        raise failure
+    return summary
+
+
+def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[str, Any]:
+    if cloud is not None:
+        raise InputError(f"--robot is given with the scan {cloud}.",
+                         "The virtual robot scans a branch that it holds: a generated one.",
+                         "Leave one of them out.")
+    require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
+    require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
+    from limber.cli.closed_loop.loop import ClosedLoop, comparison
+
+    started = time.perf_counter()
+    run.say(f"Limber demo with a virtual robot, results in {folder}")
+    result = ClosedLoop(folder, seed, say=run.say, progress=run.progress).run()
+    for title, rows in comparison(result):
+        run.show(title, rows)
+    scene, picture = folder / "scene.blend", folder / "scene.png"
+    try:
+        run_stage(["scene", result["branch"], "-o", str(scene), "--render", str(picture)])
+    except Cancelled:
+        raise
+    except LimberError as error:
+        run.progress.warn(f"There is no picture of it: {error}")
+    with_picture = ["--picture", str(picture)] if picture.exists() else []
+    report = run_stage(["report", result["branch"], *with_picture])["report"]
+    seconds = round(time.perf_counter() - started, 1)
+    run.say(f"\nreport  {report}\nscene   {scene}\npicture {picture}\n{seconds:.0f} s in all")
+    return result | {"report": report, "demo_seconds": seconds}
+
+
+def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, young: str, seed: int,
+                wishes: Mapping[str, Any]) -> tuple[Path, LimberError | None]:
+    """Run all stages; what fails between mesh and scene ends in a report all the same.
+
+    Returns:
+        The branch folder, and what failed.
+    """
+    branch = demo.folder / f"{name}.branch"
+    truth: list[str] = []
+    if cloud is None:
+        source = demo.folder / "scan"
+        demo.stage("a generated branch, scanned", "generate", source, "--seed", seed)
+        cloud = source / "cloud.ply"
+    else:
+        truth = ["--young", young]
+    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *_scan_options(wishes))
+    goal = ["--goal", *wishes["goal"]] if wishes.get("goal") else []
+    failure = None
+    try:
+        demo.stage("a simulated pull, with sensor noise", "virtual-pull", branch,
+                   "--name", "pull-1", "--seed", seed, *truth)
+        demo.stage("Young's modulus from the pull", "estimate", branch)
+        demo.stage("a pull with the estimated modulus", "simulate", branch)
+        demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
+        demo.stage("the gentlest path and the shortest", "plan", branch, "--name", "to-goal",
+                   "--seed", seed, *goal)
+    except Cancelled:
+        raise
+    except LimberError as error:
+        failure = error
+        demo.run.progress.warn(f"{error} Scene and report show what there is.")
+    picture = demo.folder / "scene.png"
+    demo.stage("a Blender scene and its picture", "scene", branch,
+               "-o", demo.folder / "scene.blend", "--render", picture)
+    demo.stage("the report", "report", branch, "--picture", picture)
+    return branch, failure
+
+
+def _scan_options(wishes: Mapping[str, Any]) -> list[object]:
+    """What is known of the scan, as options of `limber reconstruct`."""
+    scan = wishes["scan"]
+    if wishes["crop"]:
+        scan = scan.model_copy(update={"crop_low": wishes["crop"][:3],
+                                       "crop_high": wishes["crop"][3:]})
+    options: list[object] = list(command_line(scan))
+    for name in ("skeleton", "edits"):
+        if wishes[name]:
+            options += [f"--{name}", wishes[name]]
+    return [*options, "--force"] if wishes["force"] else options
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made ({error.strerror}).", "Results go there.",
+                         "Choose another folder with -o.") from error
+
+
+def _show_tables(demo: _Demo) -> None:
+    from limber.results.report.tables import comparison_rows, held_sentence, modulus_rows
+
+    if "estimate" in demo.results:
+        estimate, pull = demo.results["estimate"], demo.results["virtual-pull"]
+        demo.run.show("Young's modulus", modulus_rows(estimate, pull))
+        demo.run.say(held_sentence(estimate, pull))
+    if "plan" in demo.results:
+        demo.run.show("Paths", comparison_rows(demo.results["plan"]))
+
+
+def _summary(demo: _Demo, branch: Path) -> dict[str, Any]:
+    return {
+        "branch": branch, "report": branch / "report.html",
+        "scene": demo.folder / "scene.blend", "picture": demo.folder / "scene.png",
+        "stage_seconds": demo.seconds,
+        "young_pa": demo.results.get("estimate", {}).get("young_pa"),
+        "energy_saved_percent": demo.results.get("plan", {}).get("energy_saved_percent"),
+        "length_added_percent": demo.results.get("plan", {}).get("length_added_percent"),
+    }

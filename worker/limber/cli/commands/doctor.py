@@ -1,0 +1,85 @@
+"""What is installed, what is missing and what then does not work."""
+
+import importlib
+import importlib.util
+import os
+import platform
+import shutil
+from importlib import metadata
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+
+# Module, distribution, what does not work without it. None: nothing works without it.
+PARTS = [
+    ("numpy", "numpy", None),
+    ("scipy", "scipy", None),
+    ("numba", "numba", None),
+    ("cvxopt", "cvxopt", "fast factorisation; SuperLU takes over, about 4 times slower"),
+    ("robust_laplacian", "robust_laplacian", "the robust Laplacian; our own takes over"),
+    ("pytetwild", "pytetwild", "fTetWild meshes; the sweep mesher takes over"),
+    ("manifold3d", "manifold3d", "smooth unions at forks"),
+    ("ompl", "ompl", "OMPL's RRT*; our own planner takes over (no wheel for Windows)"),
+    ("rtde_control", "ur-rtde", "motion of a UR robot (pip install 'limber[robot]')"),
+    ("laspy", "laspy", "LAS and LAZ scans"),
+    ("pypcd4", "pypcd4", "PCD scans"),
+    ("ezc3d", "ezc3d", "C3D motion capture"),
+    ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
+    ("fsspec", "fsspec", "addresses in job files, s3:// and such (pip install 'limber[remote]')"),
+    ("h5py", "h5py", "MAT files of version 7.3 (pip install 'limber[matlab]')"),
+    ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags (pip install 'limber[bags]')"),
+    ("mcap", "mcap", "`limber export-pull` (pip install 'limber[bags]')"),
+    ("matplotlib", "matplotlib", "`limber report` (pip install 'limber[report]')"),
+    ("jinja2", "jinja2", "`limber report` (pip install 'limber[report]')"),
+    ("pxr", "usd-core", "`limber export` to USD (pip install 'limber[usd]')"),
+    ("bpy", "bpy", "`limber scene` without a real Blender (pip install 'limber[blender]')"),
+    ("ultralytics", "ultralytics", "masks by a YOLO model of your own (optional)"),
+]
+
+
+@stage_command("doctor")
+@click.option("--warm", is_flag=True, help="Compile the solver's kernels now, not at first use.")
+def command(run: Run, warm: bool) -> dict[str, Any]:
+    """What is installed, what is missing and what then does not work."""
+    result = report()
+    if warm:
+        from limber.geometry.warm_up import warm_up as warm_geometry
+        from limber.mechanics.warm_up import warm_up as warm_mechanics
+        from limber.planning.warm_up import warm_up as warm_planning
+        from limber.reduced.strain_polynomial import compile_kernels
+
+        warm_geometry(run.progress.part(0.0, 0.1))
+        warm_mechanics(run.progress.part(0.1, 0.5))
+        compile_kernels()
+        warm_planning(run.progress.part(0.5, 1.0))
+    return result
+
+
+def report() -> dict[str, Any]:
+    """Return what is installed and what is missing."""
+    parts = {}
+    missing = []
+    for module, distribution, cost in PARTS:
+        present = importlib.util.find_spec(module) is not None
+        parts[module] = _version(distribution) if present else (
+            f"missing: {cost or 'nothing works without it'}")
+        if not present:
+            missing.append(module)
+    return {
+        "python": platform.python_version(), "system": platform.platform(),
+        "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
+    }
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "present"
+
+
+def _blender() -> str:
+    path = os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
+    return path or "none found (LIMBER_BLENDER or the PATH); scripts/provision_blender brings one"

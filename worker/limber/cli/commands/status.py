@@ -1,0 +1,28 @@
+"""How far a batch is: what is done, failed, running and waiting."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+
+
+@stage_command("status")
+@click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
+def command(run: Run, job_file: Path) -> dict[str, Any]:
+    """Say how far the batch of a job file is, also while it runs; each failure with its reason."""
+    from limber.batch.jobs.job_file import read_jobs
+    from limber.batch.records import RUNNING, Records
+    from limber.batch.summary import counts, failures
+
+    jobs = read_jobs(job_file)
+    records = Records(jobs)
+    failed = failures(jobs, records)
+    if failed:
+        run.show("Failed", [["branch", "stage", "why"], *map(list, failed)])
+    return {"branch_count": len(jobs.branches), **counts(jobs, records),
+            "running_now": [f"{branch.name} {task.label}" for branch in jobs.branches
+                            for task in branch.tasks
+                            if records.of(branch, task).status == RUNNING],
+            "failures": [list(one) for one in failed]}

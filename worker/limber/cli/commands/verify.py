@@ -1,0 +1,37 @@
+"""Whether a branch folder's files are as they were written."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+from limber.store import Branch, damage_error, unlisted
+
+
+@stage_command("verify")
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+@click.option("--finish", is_flag=True, help=(
+    "First put in place what an interrupted command left (.commit). Else nothing is changed."))
+def command(run: Run, branch_folder: Path, finish: bool) -> dict[str, Any]:
+    """Compare every file of a branch folder with its checksum; exit code 2 if one is damaged.
+
+    Files that no stage wrote, and recordings that were cut off, are named too; they are no
+    damage. Nothing in the folder is changed, unless --finish is given.
+    """
+    branch = (Branch.open(branch_folder) if finish
+              else Branch.read(branch_folder, unfinished=True))
+    if branch.is_unfinished:
+        run.progress.warn(
+            "An interrupted command left results that are not in place yet; they are compared as "
+            "they will be. --finish, or the next command that writes to the folder, puts them in "
+            "place.")
+    run.progress(0.0, "comparing with checksums")
+    damages = branch.damages()
+    if damages:
+        raise damage_error(branch.folder, damages, shown_count=len(damages))
+    return {"uuid": branch.uuid, "file_count": len(branch.manifest.files),
+            "byte_count": sum(entry.bytes for entry in branch.manifest.files.values()),
+            "unlisted": unlisted(branch.folder, branch.manifest),
+            "is_unfinished": branch.is_unfinished,
+            "unfinished_streams": branch.streams()}

@@ -1,0 +1,252 @@
+"""The command ``limber``: finds the commands, and gives each the same way of running.
+
+A stage's command is made from its description (:mod:`limber.stages.registry`); any other command
+is a module in ``limber/cli/commands`` with an object ``command``, its docstring the help. Those
+made here take ``--json`` and ``--progress``, end with the exit codes of ``limber.core.errors``
+and, with ``--json``, print one JSON object as their last line.
+"""
+
+import ast
+import functools
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from limber.cli.terminal import result_lines, table_lines
+from limber.core.errors import LimberError, SafetyStop
+from limber.core.machine_errors import machine_error
+from limber.core.processes.heartbeat import Heartbeat
+from limber.core.progress import BarSink, JsonSink, Progress, Sink, damage_told_to
+from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
+from limber.version import VERSION
+
+if TYPE_CHECKING:
+    from limber.stages.registry import StageDescription
+
+
+def command_summaries() -> dict[str, str]:
+    """Return what each command does in one line, by name; imports none of them.
+
+    `limber --help` must not wait for the numerical packages.
+    """
+    found = {}
+    for path in sorted((Path(__file__).parent / "commands").glob("*.py")):
+        if path.stem != "__init__":
+            told = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            found[path.stem.replace("_", "-")] = told.split("\n\n")[0].replace("\n", " ")
+    return stage_summaries() | found
+
+
+class _Commands(click.Group):
+    """Loads each command's module only when that command is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(command_summaries())
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name in stage_summaries():
+            return command_of(stage_description(name), stage_module(name).__doc__)
+        if name not in command_summaries():
+            return None
+        return importlib.import_module(f"limber.cli.commands.{name.replace('-', '_')}").command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        stages = stage_summaries()
+        others = {name: told for name, told in command_summaries().items() if name not in stages}
+        for title, commands in (("Stages", stages), ("Other commands", others)):
+            with formatter.section(title):
+                formatter.write_dl(list(commands.items()))
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(VERSION, prog_name="limber")
+def main() -> None:
+    """From the scan of a plant branch to a simulation that behaves like it, and to gentle motion.
+
+    Exit codes: 0 done, 2 wrong usage or input, 3 the work failed, 4 stopped for safety,
+    130 cancelled.
+    """
+
+
+class Run:
+    """What a command's function gets besides its options.
+
+    ``progress`` to report and warn to, ``say`` to print a line on standard error, ``show`` a
+    table there. ``warnings`` are kept for the JSON result.
+    """
+
+    def __init__(self, sink: Sink | None, say: Callable[[str], None]):
+        self.progress = Progress(sink, self._warned)
+        self.say = say
+        self.warnings: list[str] = []
+
+    def _warned(self, message: str) -> None:
+        self.warnings.append(message)
+        self.say(f"warning: {message}")
+
+    def show(self, title: str, rows: list[list[str]]) -> None:
+        """Print a table, its first row the header."""
+        self.say("\n".join([f"\n{title}", *(f"  {line}" for line in table_lines(rows))]))
+
+
+def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
+    """Make a click command of ``function(run, **options) -> result dict``.
+
+    The docstring's first line is the help text. The result is printed for a person to read,
+    or, with ``--json``, as the last line together with ``command``, ``status``, ``seconds``,
+    ``warnings`` and ``error``.
+    """
+    def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
+        @functools.wraps(function)
+        def body(as_json: bool, progress_style: str, **options: Any) -> None:
+            sys.exit(_execute(name, function, as_json, progress_style, options))
+        decorated = click.option(
+            "--progress", "progress_style", type=click.Choice(["auto", "bar", "json", "none"]),
+            default="auto", show_default=True,
+            help="bar on a terminal; json: one JSON object a line on standard output.")(body)
+        decorated = click.option(
+            "--json", "as_json", is_flag=True,
+            help="Print the result as one JSON object, the last line.")(decorated)
+        return click.command(name, cls=_grouped_command())(decorated)
+    return wrap
+
+
+def command_of(stage: "StageDescription", help_text: str) -> click.Command:
+    """Make the command of a stage: its inputs, settings and options become options."""
+    from limber.stages.command_line import settings_options
+
+    @stage_command(stage.name)
+    @click.option("--schema", is_flag=True, is_eager=True, expose_value=False,
+                  callback=functools.partial(_show_schema, stage.name),
+                  help="Print what the stage takes as a JSON schema, and exit.")
+    @settings_options(stage.inputs, "inputs")
+    @settings_options(stage.settings, "settings")
+    @settings_options(stage.options, "options")
+    def command(run: Run, inputs: Any, settings: Any, options: Any) -> dict[str, Any]:
+        result = stage.run(inputs, settings, options, run.progress)
+        for title, rows in stage.tables(_plain(result)) if stage.tables else ():
+            run.show(title, rows)
+        return result
+    command.help = help_text
+    return command
+
+
+def _grouped_command() -> type[click.Command]:
+    from limber.stages.command_line import GroupedCommand
+
+    return GroupedCommand
+
+
+def _show_schema(name: str, ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        click.echo(json.dumps(stage_schema(name), indent=1))
+        ctx.exit()
+
+
+def _plain(value: Any) -> Any:
+    # Loads numpy and pydantic: not for `limber --help`.
+    from limber.core.json_values import plain
+
+    return plain(value)
+
+
+def run(arguments: list[str] | None = None) -> None:
+    """Entry point of the command ``limber``; does not return."""
+    sys.exit(call(arguments))
+
+
+def call(arguments: list[str] | None = None) -> int:
+    """Run one command line and return its exit code; what Blender's command entry calls."""
+    _terminate_like_interrupt()
+    if "LIMBER_PARENT_PIPE" in os.environ:
+        from limber.core.processes.ending import end_with_parent_pipe
+
+        end_with_parent_pipe()
+    try:
+        main.main(args=arguments, prog_name="limber", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        return 130
+    except LimberError as error:
+        click.echo(f"error: {error}", err=True)
+        return error.exit_code
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    return 0
+
+
+def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
+             progress_style: str, options: dict[str, Any]) -> int:
+    started = time.perf_counter()
+    if progress_style == "auto":
+        progress_style = "bar" if sys.stderr.isatty() else "none"
+    outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
+    result: dict[str, Any] = {}
+    lines = JsonSink() if progress_style == "json" else None
+    state = Run(lines, functools.partial(click.echo, err=True))
+    code = 0
+    try:
+        if progress_style == "bar":
+            with BarSink(name) as bar:
+                state = Run(bar, bar.say)
+                with damage_told_to(state.progress.warn):
+                    result = function(state, **options)
+        elif lines is not None:
+            with Heartbeat(lines.say), damage_told_to(state.progress.warn):
+                result = function(state, **options)
+        else:
+            with damage_told_to(state.progress.warn):
+                result = function(state, **options)
+    except LimberError as error:
+        code = error.exit_code
+        if isinstance(error, SafetyStop):
+            result = error.result
+        outcome |= {"status": error.status, "error": str(error), "fix": error.fix}
+    except KeyboardInterrupt:
+        code = 130
+        outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}
+    except Exception as error:
+        told = machine_error(error)
+        code = told.exit_code if told else 3
+        if told is None:
+            # A bug of ours: the trace goes to standard error, the contract of the last line holds.
+            traceback.print_exc()
+            told = f"internal error: {error!r}; please report it"
+        outcome |= {"status": "failed", "error": str(told)}
+    outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
+    _print_outcome(outcome, result or {}, as_json)
+    return code
+
+
+def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(_plain(outcome | result), allow_nan=False), flush=True)
+    if outcome["error"]:
+        click.echo(f"error: {outcome['error']}", err=True)
+    elif not as_json:
+        # Warnings were said when they came up.
+        for line in result_lines({k: v for k, v in _plain(result).items() if k != "warnings"}):
+            click.echo(line)
+        click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s")
+
+
+def _terminate_like_interrupt() -> None:
+    """Let SIGTERM end a command as Ctrl-C does: with its clean-up and exit code 130."""
+    def interrupt(_signal: int, _frame: Any) -> None:
+        raise KeyboardInterrupt
+    try:
+        signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:
+        # Not the main thread (Blender may call us from one): the default handler stays.
+        return

@@ -1,0 +1,66 @@
+"""Files: written whole or not at all, told apart by their bytes, missed with a clear word."""
+
+import hashlib
+import os
+from pathlib import Path
+
+from limber.core.errors import InputError
+from limber.core.files.temporary_names import owned_name
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file so that a reader sees the old or the new content, never a part.
+
+    The content is on the disk, and so is its name, when this returns.
+    """
+    path = Path(path)
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    temporary = path.with_name(owned_name(path.name))
+    try:
+        with open(temporary, "xb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    flush_folder(path.parent)
+
+
+def flush_folder(folder: Path) -> None:
+    """Bring the names in ``folder`` to the disk; Windows does that by itself."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def flush_tree(folder: Path) -> None:
+    """Bring all files below ``folder``, and their names, to the disk."""
+    for place, _folders, files in os.walk(folder):
+        for name in files:
+            # Windows flushes only what is open for writing.
+            with open(Path(place, name), "rb+" if os.name == "nt" else "rb") as stream:
+                os.fsync(stream.fileno())
+        flush_folder(Path(place))
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """Return the sha256 of a file's bytes, in hexadecimal."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def require_file(path: Path, what: str) -> Path:
+    """Return ``path`` if it is a file.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"There is no file {path}.", f"{what} was expected.", "Check the path.")
+    return Path(path)

@@ -1,0 +1,252 @@
+"""The door through which files of others, and of branch folders, come in: JSON, TOML and arrays.
+
+Whoever wrote them, they may be cut short, mangled or made to harm. So: numbers are finite, what a
+header announces is compared with the file's size before memory is taken, nothing is unpickled, and
+whatever is wrong is an :class:`~limber.core.errors.InputError` that names the file.
+"""
+
+import contextlib
+import csv
+import json
+import math
+import os
+import tokenize
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, NoReturn, TypeVar
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from limber.core.errors import InputError
+
+Content = TypeVar("Content")
+
+LARGEST_EXPANSION = 100.0
+"""Array bytes for a byte of a compressed file, from which on ``HARMLESS_BYTES`` is the limit:
+real measurements compress ten times at best."""
+HARMLESS_BYTES = 256e6
+
+
+def read_text(path: str | os.PathLike, what: str) -> str:
+    """Return a file's text (UTF-8, with or without a mark); ``what`` it should be, for errors.
+
+    Raises:
+        InputError: it cannot be read, or is no text.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, what, error) from error
+
+
+def read_json(path: str | os.PathLike, what: str) -> Any:
+    """Return the content of a JSON file; all its numbers are finite.
+
+    Raises:
+        InputError: it is none, or a number in it is not finite.
+    """
+    text = read_text(path, what)
+    try:
+        return json.loads(text, parse_constant=_refused, parse_float=_finite, parse_int=_integer)
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(path, what, error) from error
+
+
+def read_json_as(path: str | os.PathLike, kind: type[Content], what: str) -> Content:
+    """Return the content of a JSON file as ``kind``, any type that pydantic checks.
+
+    Raises:
+        InputError: it is none, or not of that kind; says where.
+    """
+    return checked_as(path, kind, read_json(path, what), what)
+
+
+def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what: str) -> Content:
+    """Return what was read from ``path`` as ``kind``.
+
+    Raises:
+        InputError: it is not of that kind; says where.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: {place + ': ' if place else ''}{first['msg']}.",
+                         f"{what[0].upper()}{what[1:]} was expected.",
+                         "It is damaged, or was written by another program; make it anew.",
+                         ) from error
+
+
+def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dict[str, Any]:
+    """Return the content of a TOML file; all its numbers are finite.
+
+    Args:
+        finite: False where the caller refuses what is not finite itself, by its name and line.
+
+    Raises:
+        InputError: it is none (the line is named), or a number in it is not finite.
+    """
+    text = read_text(path, what)
+    try:
+        return tomllib.loads(text, parse_float=_finite if finite else float)
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(path, what, error) from error
+
+
+def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
+    """Return the arrays of an NPZ file, or the one of an NPY file as ``arr_0``.
+
+    Raises:
+        InputError: it is damaged, holds objects, or announces more than it can hold.
+    """
+    try:
+        with open(path, "rb") as stream:
+            if stream.read(6) == np.lib.format.MAGIC_PREFIX:
+                stream.seek(0)
+                return {"arr_0": _array(stream, os.path.getsize(path))}
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            size = os.path.getsize(path)
+            _require_modest(sum(member.file_size for member in members), size)
+            arrays = {}
+            for member in members:
+                with archive.open(member) as stream:
+                    name = member.filename.removesuffix(".npy")
+                    arrays[name] = _array(stream, member.file_size)
+        return arrays
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, RuntimeError,
+            NotImplementedError, RecursionError, tokenize.TokenError, zipfile.BadZipFile,
+            zlib.error) as error:
+        raise _unreadable(path, what, error) from error
+
+
+def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
+                 ) -> dict[str, np.ndarray]:
+    """Return the columns of a CSV file with a header that hold finite numbers throughout.
+
+    Raises:
+        InputError: it cannot be read, has no rows, or one of ``needed`` is not among them.
+    """
+    rows = [row for row in csv.reader(read_text(path, what).splitlines()) if row]
+    columns = {}
+    for name, *values in zip(*rows, strict=False):
+        with contextlib.suppress(ValueError):
+            numbers = np.array([float(value) for value in values])
+            if np.isfinite(numbers).all():
+                columns[name.strip()] = numbers
+    missing = [name for name in needed if not len(columns.get(name, ()))]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]} of finite numbers.",
+                         f"{what[0].upper()}{what[1:]} was expected.",
+                         "It is damaged, or was written by another program; make it anew.")
+    return columns
+
+
+def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], what: str) -> None:
+    """Refuse arrays with numbers that are not finite.
+
+    Raises:
+        InputError: there is one; names the array.
+    """
+    for name, values in arrays.items():
+        if values.dtype.kind in "fc" and not np.isfinite(values).all():
+            raise InputError(f"{path}: {name} has values that are not finite.",
+                             f"{what[0].upper()}{what[1:]} holds numbers.",
+                             "It is damaged; make it anew.")
+
+
+def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
+                   shapes: Mapping[str, tuple[int | str, ...]], what: str) -> None:
+    """Refuse arrays that are missing, no finite numbers, or of another shape.
+
+    Args:
+        shapes: Name to shape; a letter stands for the same length wherever it stands.
+
+    Raises:
+        InputError: names the first that does not fit.
+    """
+    lengths: dict[int | str, int] = {}
+    for name, shape in shapes.items():
+        array = arrays.get(name)
+        fits = array is not None and array.dtype.kind in "iufb" and (
+            array.ndim == len(shape)) and all(
+            length == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length))
+            for wanted, length in zip(shape, array.shape, strict=True))
+        if not fits:
+            found = "is missing" if array is None else (
+                f"has shape {list(array.shape)} of {array.dtype}")
+            raise InputError(f"{path}: {name} {found}.",
+                             f"{what[0].upper()}{what[1:]} was expected, with numbers of shape "
+                             f"[{', '.join(map(str, shape))}] there.",
+                             "It is damaged, or of another program; make it anew.")
+    require_finite(path, {name: arrays[name] for name in shapes}, what)
+
+
+def require_size(path: str | os.PathLike, announced: float, held: float, what: str) -> None:
+    """Refuse a file whose header announces more bytes than it holds, before memory is taken.
+
+    Args:
+        announced: Bytes that so many ``what`` take at least.
+        held: Bytes that are there.
+
+    Raises:
+        InputError: it does.
+    """
+    if announced > held:
+        raise InputError(f"{path} announces {what}: at least {announced:.3g} bytes, of which "
+                         f"{max(held, 0):.3g} are there.",
+                         "It is cut short, or its header is damaged.", "Export it again.")
+
+
+def _array(stream: IO[bytes], size: int) -> np.ndarray:
+    """Read one array whose header has been compared with the bytes that there are."""
+    version = np.lib.format.read_magic(stream)
+    reader = {(1, 0): np.lib.format.read_array_header_1_0,
+              (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if reader is None:
+        raise ValueError(f"array format {version} is not known")
+    shape, is_fortran, kind = reader(stream)
+    if kind.hasobject:
+        raise ValueError("it holds Python objects, which are never loaded")
+    count = math.prod(shape)
+    if count * kind.itemsize > size or any(length < 0 for length in shape):
+        raise ValueError(f"an array of shape {shape} is announced, and {size} bytes are there")
+    content = stream.read(count * kind.itemsize)
+    if len(content) != count * kind.itemsize:
+        raise ValueError("it is cut short")
+    array = np.frombuffer(content, kind, count)
+    return array.reshape(shape, order="F" if is_fortran else "C").copy()
+
+
+def _require_modest(expanded: float, size: float) -> None:
+    if expanded > max(LARGEST_EXPANSION * size, HARMLESS_BYTES):
+        raise ValueError(f"{size} bytes that would expand to {expanded:.3g}")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not a finite number")
+    return number
+
+
+def _integer(text: str) -> int:
+    if len(text) > 300:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
+
+
+def _refused(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not a finite number")
+
+
+def _unreadable(path: str | os.PathLike, what: str, error: Exception) -> InputError:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return InputError(f"{path} cannot be read ({reason or type(error).__name__}).",
+                      f"{what[0].upper()}{what[1:]} was expected.",
+                      "It is missing, damaged or of another kind.")

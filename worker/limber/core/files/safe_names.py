@@ -1,0 +1,85 @@
+"""Names that files contain and that become paths: they may not lead out of their folder.
+
+A branch folder or a recording may come from anybody. Each name in it that is used as a path goes
+through :func:`inside`, and a folder with links is refused before anything in it is written.
+"""
+
+import os
+import re
+import stat
+import unicodedata
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from limber.core.errors import InputError
+
+_PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_. +-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_. +-]*)*")
+"""Names that need no closer look: manifests list thousands of them."""
+
+
+def relative_name(name: str) -> str:
+    """Return ``name``, relative and with ``/``, in its shortest form.
+
+    The rule is the same on every system, so that a folder that is valid here is valid anywhere.
+
+    Raises:
+        InputError: it is absolute, leads upwards, names a drive, or no file can have it.
+    """
+    if _PLAIN.fullmatch(name):
+        return name
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or PureWindowsPath(name).anchor or "\\" in name:
+        why = "It is absolute, or has a backslash or a drive."
+    elif any(not part.strip(". ") for part in pure.parts) or not pure.parts:
+        # Windows drops dots and spaces at the end of a name.
+        why = "It leads upwards, or names no file."
+    elif any(PureWindowsPath(part).drive for part in pure.parts):
+        why = "A part of it names a drive."
+    elif any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
+        why = "It has control characters, or is not valid Unicode."
+    else:
+        return pure.as_posix()
+    raise InputError(f"{name[:200]!r} cannot be used as a file name in a folder.", why,
+                     "Use a relative name with / that stays inside the folder.")
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of ``name`` in ``folder``, whether it exists or not.
+
+    Raises:
+        InputError: the name leads out of the folder, or a link is on the way.
+    """
+    path = Path(folder)
+    for part in PurePosixPath(relative_name(name)).parts:
+        path = path / part
+        if is_link(path):
+            raise _link_error(path)
+    return path
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder with a link anywhere in it; ``folder`` itself may be one.
+
+    Raises:
+        InputError: there is a link; names it.
+    """
+    for place, folders, files in os.walk(folder):
+        for name in folders + files:
+            if is_link(path := Path(place, name)):
+                raise _link_error(path)
+
+
+def is_link(path: Path) -> bool:
+    """Whether ``path`` is a symbolic link, or a junction of Windows; False if there is nothing."""
+    try:
+        about = os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    junction = getattr(stat, "IO_REPARSE_TAG_MOUNT_POINT", None)
+    return stat.S_ISLNK(about.st_mode) or (
+        junction is not None and getattr(about, "st_reparse_tag", 0) == junction)
+
+
+def _link_error(path: Path) -> InputError:
+    return InputError(f"{path} is a link.",
+                      "It may lead out of its folder, where nothing may be read or written.",
+                      "Put a copy of what it leads to in its place, or remove it.")

@@ -1,0 +1,54 @@
+"""What the machine does to a program, in words: a full disk, a lost folder, no memory."""
+
+import errno
+import re
+from pathlib import Path
+
+from limber.core.errors import InputError, LimberError, WorkError
+
+
+def _codes(*names: str) -> frozenset[int]:
+    # Windows has not all of them.
+    return frozenset(getattr(errno, name) for name in names if hasattr(errno, name))
+
+
+_FULL = _codes("ENOSPC", "EDQUOT")
+_LOST = _codes("ESTALE", "EIO", "ENODEV", "ENXIO")
+_UNREACHABLE = _codes("ENOTCONN", "ESHUTDOWN", "EHOSTDOWN", "EHOSTUNREACH", "ENETDOWN",
+                      "ENETUNREACH", "ETIMEDOUT")
+"""Of a file; without a name they may be of a robot's connection."""
+_LOST_ON_WINDOWS = frozenset((53, 55, 59, 64, 67, 121, 1231))
+"""ERROR_BAD_NETPATH and its kin, which Python takes for a file that is not there."""
+_FULL_IN_WORDS = re.compile(r"no space left|not enough free space|requested and \d+ written", re.I)
+"""As numpy and HDF5 say it, without a number."""
+_FORBIDDEN = _codes("EROFS", "EACCES", "EPERM")
+
+
+def machine_error(error: BaseException, place: Path | None = None) -> LimberError | None:
+    """Return what the user can read of an error that is the machine's and not ours; else None.
+
+    Args:
+        error: As Python or the system raised it.
+        place: The file or folder that was at work, where the error names none.
+    """
+    if isinstance(error, MemoryError):
+        return WorkError("Out of memory.", "", "Use a coarser mesh or a thinner cloud.")
+    if not isinstance(error, OSError):
+        return None
+    name = error.filename2 or error.filename or place or "A file"
+    told = error.strerror or str(error) or type(error).__name__
+    if error.errno in _FULL or (error.errno is None and _FULL_IN_WORDS.search(told)):
+        return WorkError(f"{name} cannot be written ({told}).",
+                         "The disk is full, or your share of it.",
+                         "Make room (`limber cache --clear` frees some), and run this again: what "
+                         "was stored before is kept.")
+    if (error.errno in _LOST or (error.filename and error.errno in _UNREACHABLE)
+            or getattr(error, "winerror", None) in _LOST_ON_WINDOWS):
+        return WorkError(f"{name} does not answer ({told}).",
+                         "The disk or the network folder that it is on was lost.",
+                         "Bring it back, and run this again: what was stored before is kept.")
+    if error.errno in _FORBIDDEN:
+        return InputError(f"{name} cannot be used ({told}).",
+                          "It is read-only, or belongs to somebody else.",
+                          "Change its permissions, or work on a copy.")
+    return None

@@ -1,0 +1,1 @@
+"""Compiled kernels, sparse solvers and rigid transforms."""

@@ -1,0 +1,9 @@
+"""Processes: a pool for parts of a computation, stages as processes of their own, their end.
+
+It stands on nothing but errors and progress, so that every package may use it.
+"""
+
+from limber.core.processes.budget import core_budget, worker_count
+from limber.core.processes.pool import Limits, Pool, run_tasks
+
+__all__ = ["Limits", "Pool", "core_budget", "run_tasks", "worker_count"]

@@ -1,0 +1,84 @@
+"""How many processes may compute side by side: cores and memory, shared out to who is below.
+
+A process that starts others hands each a share of its own cores in the environment variable
+``LIMBER_CORES``; what runs there shares out no more than that, however deep. A user may set it
+to leave cores to other programs.
+"""
+
+import os
+from pathlib import Path
+
+from limber.core.errors import InputError
+
+CORES = "LIMBER_CORES"
+_SPARED_MEMORY = 0.15
+"""Share of the free memory that is left alone: estimates of a task's need are rough."""
+
+
+def core_budget() -> int:
+    """Return how many cores this process may use.
+
+    Raises:
+        InputError: ``LIMBER_CORES`` is not a positive whole number.
+    """
+    given = os.environ.get(CORES)
+    if given is None:
+        return _machine_cores()
+    try:
+        count = int(given)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise InputError(f"{CORES} is {given!r}.", "It is how many cores Limber may use.",
+                         "Set it to a whole number from 1, or unset it.")
+    return count
+
+
+def worker_count(task_count: int, *, wanted: int | None = None,
+                 memory_mb_each: float = 0.0) -> int:
+    """Return how many processes to start for ``task_count`` tasks, at least 1.
+
+    Args:
+        task_count: More processes than tasks would idle.
+        wanted: What the user asked for; the budget holds all the same.
+        memory_mb_each: What a task may need; as many run as the free memory has room for.
+    """
+    count = min(core_budget(), max(task_count, 1), wanted or task_count or 1)
+    if memory_mb_each > 0:
+        room = (1 - _SPARED_MEMORY) * free_memory_mb() / memory_mb_each
+        count = min(count, int(room))
+    return max(count, 1)
+
+
+def free_memory_mb() -> float:
+    """Return the memory [MB] that may still be used, also where a container has less."""
+    import psutil
+
+    free = psutil.virtual_memory().available
+    limit, used = (_number(Path("/sys/fs/cgroup", name))
+                   for name in ("memory.max", "memory.current"))
+    if limit is not None and used is not None:
+        free = min(free, max(limit - used, 0))
+    return free / 1e6
+
+
+def _machine_cores() -> int:
+    """Cores that the system lets this process use: affinity, and a container's quota."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
+        os.cpu_count() or 1)
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        if quota != "max":
+            cores = min(cores, max(int(int(quota) / int(period)), 1))
+    except (OSError, ValueError):
+        # No container, or of another kind.
+        return cores or 1
+    return cores or 1
+
+
+def _number(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        # Not there, or "max".
+        return None

@@ -1,0 +1,455 @@
+"""One pool of processes for all that is computed side by side.
+
+Python's own pool is broken as a whole by one process that is killed, and others let their
+processes share a pipe, which one killed in the middle of a message spoils for all. Here each
+process has a pipe of its own, over which tasks, progress, cancelling and results go: a process
+may be killed at any moment, for its time, its memory or a crash, and only its task fails.
+"""
+
+import atexit
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import wait as wait_for_any
+from threading import Event, Lock, Thread
+from typing import Any
+
+from limber.core.errors import Cancelled, DamagedCacheWarning, WorkError
+from limber.core.present import present
+from limber.core.processes.budget import core_budget, worker_count
+from limber.core.processes.ending import kill_tree
+from limber.core.processes.pool_process import (
+    Began,
+    CacheDamaged,
+    Failed,
+    Reported,
+    Returned,
+    Task,
+    serve,
+)
+from limber.core.progress import SILENT, Progress
+
+_TICK_SECONDS = 0.1
+_MEMORY_SECONDS = 0.5
+_GRACE_SECONDS = 3.0
+"""How long a cancelled task has to come to its next report before its process is killed."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a task may take; its process is killed when it goes over.
+
+    Attributes:
+        seconds: From its beginning, or None.
+        memory_mb: Of its process and all that it started, or None.
+    """
+
+    seconds: float | None = None
+    memory_mb: float | None = None
+
+
+UNLIMITED = Limits()
+
+
+class Pool:
+    """Processes that compute what they are given; close it, or use it in a ``with``.
+
+    Args:
+        workers: How many processes; by default the core budget. Each gets its share of it.
+        begin: Called in each process before its first task.
+        begin_arguments: For it.
+        name: What is computed, for messages.
+    """
+
+    def __init__(self, workers: int | None = None, *, begin: Callable[..., None] | None = None,
+                 begin_arguments: tuple = (), name: str = "the computation"):
+        self.worker_count = workers or core_budget()
+        self.name = name
+        self._begin = (begin, begin_arguments)
+        self._cores_each = max(core_budget() // self.worker_count, 1)
+        self._context = get_context("spawn")
+        self._guard = Lock()
+        self._waiting: deque[_Job] = deque()
+        self._workers: list[_Worker] = []
+        self._broken: BaseException | None = None
+        self._closing = Event()
+        self._bell, self._bell_button = self._context.Pipe(duplex=False)
+        self._manager = Thread(target=self._manage, name="pool", daemon=True)
+        self._manager.start()
+        atexit.register(self.close)
+
+    def submit(self, function: Callable, *arguments: Any, limits: Limits = UNLIMITED,
+               progress: Progress = SILENT) -> Future:
+        """Have ``function(*arguments)`` computed, both picklable; returns its future at once.
+
+        A function that takes ``progress`` gets one whose reports come to the ``progress`` given
+        here, from another thread.
+        """
+        job = _Job(Task(function, arguments), limits, progress)
+        with self._guard:
+            if self._closing.is_set():
+                raise WorkError(f"The pool of {self.name} is closed.")
+            self._waiting.append(job)
+        self._ring()
+        return job.future
+
+    def map(self, function: Callable, tasks: Sequence[tuple], *, limits: Limits = UNLIMITED,
+            progress: Progress = SILENT, message: str = "") -> list:
+        """Return ``[function(*task) for task in tasks]``, in this order, computed side by side.
+
+        Args:
+            function: May take ``progress``.
+            tasks: Its arguments, once for each call.
+            limits: Of each call.
+            progress: Gets the mean of the calls' fractions, ``message``, how many are done, and
+                ``remaining_s`` once that can be told. Cancelling it stops all.
+            message: What is being done.
+
+        Raises:
+            WorkError: a process crashed or went over its limits.
+            Exception: the first error of a call; the other calls are stopped.
+        """
+        course = _Course(len(tasks), progress, message)
+        futures = [self.submit(function, *task, limits=limits, progress=course.part(number))
+                   for number, task in enumerate(tasks)]
+        try:
+            while True:
+                done, waiting = wait(futures, _TICK_SECONDS, FIRST_EXCEPTION)
+                for future in futures:
+                    if future in done and (error := future.exception()) is not None:
+                        raise error
+                course.report(len(done))
+                if not waiting:
+                    return [future.result() for future in futures]
+        except BaseException:
+            self.cancel(wait_for_end=True)
+            raise
+
+    def cancel(self, *, wait_for_end: bool = False) -> None:
+        """Stop all tasks; those that do not stop at their next report are killed."""
+        with self._guard:
+            jobs = [*self._waiting, *(w.job for w in self._workers if w.job is not None)]
+            self._waiting.clear()
+        for job in jobs:
+            job.cancel()
+        self._ring()
+        if wait_for_end:
+            wait([job.future for job in jobs], _GRACE_SECONDS + 5)
+
+    def close(self) -> None:
+        """End the processes at once; what has not been computed is cancelled."""
+        atexit.unregister(self.close)
+        self._closing.set()
+        self._ring()
+        self._manager.join()
+
+    def __enter__(self) -> "Pool":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    @property
+    def process_ids(self) -> list[int]:
+        """Of the processes that run now."""
+        with self._guard:
+            return [worker.process_id for worker in self._workers]
+
+    def _ring(self) -> None:
+        try:
+            self._bell_button.send_bytes(b"!")
+        except OSError:
+            # Closed: nobody listens any more.
+            return
+
+    def _manage(self) -> None:
+        reason: BaseException = Cancelled()
+        try:
+            while not self._closing.is_set():
+                self._fill()
+                self._listen()
+                self._enforce()
+        except Exception as error:
+            # No process could be started, for one: nobody shall wait for ever.
+            reason = error
+        finally:
+            self._closing.set()
+            for worker in list(self._workers):
+                self._end(worker, reason)
+            with self._guard:
+                waiting, self._waiting = list(self._waiting), deque()
+            for job in waiting:
+                job.fail(reason)
+            self._bell.close()
+            self._bell_button.close()
+
+    def _fill(self) -> None:
+        """Give waiting tasks to idle processes; start processes that are needed."""
+        with self._guard:
+            if self._broken is not None:
+                waiting, self._waiting = list(self._waiting), deque()
+                for job in waiting:
+                    job.fail(self._broken)
+            needed = min(self.worker_count, len(self._waiting)
+                         + sum(w.job is not None for w in self._workers))
+            missing = needed - len(self._workers)
+        for _ in range(missing):
+            self._workers.append(_Worker(self._context, self._begin, self._cores_each))
+        for worker in self._workers:
+            with self._guard:
+                while worker.is_idle and self._waiting:
+                    job = self._waiting.popleft()
+                    if job.future.set_running_or_notify_cancel():
+                        worker.give(job)
+
+    def _listen(self) -> None:
+        by_handle: dict[Any, _Worker] = {}
+        for worker in self._workers:
+            by_handle |= {worker.pipe: worker, worker.process.sentinel: worker}
+        ready = wait_for_any([self._bell, *by_handle], _TICK_SECONDS)
+        if self._bell in ready:
+            self._bell.recv_bytes()
+        for worker in {id(w): w for h, w in by_handle.items() if h in ready}.values():
+            self._hear(worker)
+
+    def _hear(self, worker: "_Worker") -> None:
+        """Take in all that a process has said; it may have ended after it."""
+        try:
+            while worker.pipe.poll():
+                self._take(worker, worker.pipe.recv())
+            has_ended = not worker.process.is_alive()
+        except (EOFError, OSError):
+            worker.process.join(_GRACE_SECONDS)
+            has_ended = True
+        except Exception as error:
+            # What it sent cannot be unpickled here.
+            self._end(worker, WorkError(f"The result of {self.name} could not be read: {error!r}."))
+            return
+        if has_ended:
+            self._end(worker, WorkError(
+                f"A process of {self.name} ended with exit code {worker.process.exitcode}.",
+                "It crashed, or the system ended it because memory ran out.",
+                "Use a coarser mesh or fewer processes (LIMBER_CORES)."))
+
+    def _take(self, worker: "_Worker", said: Any) -> None:
+        if isinstance(said, Began):
+            worker.has_begun = True
+        elif isinstance(said, CacheDamaged):
+            warnings.warn(said.message, DamagedCacheWarning, stacklevel=2)
+        elif isinstance(said, Reported) and worker.job is not None:
+            worker.job.report(said)
+        elif isinstance(said, Returned) and worker.job is not None:
+            worker.take_job().future.set_result(said.value)
+        elif isinstance(said, Failed):
+            if worker.job is not None:
+                worker.take_job().fail(said.error)
+            else:
+                self._broken = said.error
+
+    def _enforce(self) -> None:
+        """Stop what was cancelled or has gone over its limits."""
+        now = time.monotonic()
+        for worker in list(self._workers):
+            job = worker.job
+            if job is None:
+                continue
+            if job.cancelled_at is not None:
+                worker.cancel_once()
+                if now - job.cancelled_at > _GRACE_SECONDS:
+                    self._end(worker, Cancelled())
+                continue
+            seconds = now - worker.since
+            if job.limits.seconds is not None and seconds > job.limits.seconds:
+                self._end(worker, WorkError(
+                    f"{self.name} was stopped after {seconds:.0f} s.",
+                    "It had not finished within its time limit.",
+                    "Allow it more time, or make the task smaller."))
+            elif job.limits.memory_mb is not None and now > worker.next_memory_check:
+                worker.next_memory_check = now + _MEMORY_SECONDS
+                used = memory_mb(worker.process_id)
+                if used > job.limits.memory_mb:
+                    self._end(worker, WorkError(
+                        f"{self.name} was stopped at {used:.0f} MB of memory.",
+                        f"Its limit is {job.limits.memory_mb:.0f} MB.",
+                        "Allow it more, or make the task smaller."))
+
+    def _end(self, worker: "_Worker", error: BaseException) -> None:
+        self._workers.remove(worker)
+        worker.kill()
+        if worker.job is not None:
+            worker.take_job().fail(error)
+        elif not worker.has_begun and not self._closing.is_set():
+            # The next one would end in the same way.
+            self._broken = self._broken or error
+
+
+@dataclass
+class _Job:
+    """A task, what it may take, and who waits for it."""
+
+    task: Task
+    limits: Limits
+    progress: Progress
+    future: Future = field(default_factory=Future)
+    cancelled_at: float | None = None
+
+    def report(self, said: Reported) -> None:
+        try:
+            if said.warning:
+                self.progress.warn(said.message)
+            else:
+                self.progress(said.fraction, said.message, **said.numbers)
+        except Cancelled:
+            self._end_soon()
+
+    def cancel(self) -> None:
+        if self.future.cancel():
+            # Nobody else will tell those who wait for it.
+            self.future.set_running_or_notify_cancel()
+        else:
+            self._end_soon()
+
+    def _end_soon(self) -> None:
+        if self.cancelled_at is None:
+            self.cancelled_at = time.monotonic()
+
+    def fail(self, error: BaseException) -> None:
+        if not self.future.done():
+            self.future.set_exception(error)
+
+
+class _Worker:
+    """One process, its pipe and its task."""
+
+    def __init__(self, context: Any, begin: tuple, cores: int):
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=serve, args=(theirs, begin, cores),
+                                       name="limber pool")
+        self.process.start()
+        self.process_id = self.process.pid
+        # From now on the pipe closes when either side ends.
+        theirs.close()
+        self.job: _Job | None = None
+        self.has_begun = False
+        self.since = 0.0
+        self.next_memory_check = 0.0
+        self._is_told = False
+
+    @property
+    def is_idle(self) -> bool:
+        return self.has_begun and self.job is None
+
+    def give(self, job: _Job) -> None:
+        self.job, self.since, self._is_told = job, time.monotonic(), False
+        try:
+            self.pipe.send(job.task)
+        except OSError:
+            # It has just died; that is seen, and told to the task, in the next round.
+            return
+        except Exception as error:
+            self.take_job().fail(error)
+
+    def take_job(self) -> _Job:
+        job, self.job = present(self.job, "task"), None
+        return job
+
+    def cancel_once(self) -> None:
+        if not self._is_told:
+            self._is_told = True
+            try:
+                self.pipe.send(None)
+            except OSError:
+                return
+
+    def kill(self) -> None:
+        kill_tree(self.process_id)
+        self.process.join()
+        self.pipe.close()
+        self.process.close()
+
+
+class _Course:
+    """How far many calls are together."""
+
+    def __init__(self, count: int, progress: Progress, message: str):
+        self._fractions = [0.0] * count
+        self._progress, self._message = progress, message
+        self._started = time.monotonic()
+
+    def part(self, number: int) -> Progress:
+        def hear(fraction: float, _message: str, _numbers: dict[str, Any]) -> None:
+            self._fractions[number] = fraction
+        return Progress(hear, self._progress.warn)
+
+    def report(self, done_count: int) -> None:
+        count = len(self._fractions)
+        fraction = sum(self._fractions) / count if count else 1.0
+        fraction = max(fraction, done_count / count if count else 1.0)
+        numbers = {"done": done_count}
+        seconds = time.monotonic() - self._started
+        if 0.02 < fraction < 1.0 and seconds > 1.0:
+            numbers["remaining_s"] = round(seconds * (1.0 / fraction - 1.0))
+        self._progress(fraction, self._message, **numbers)
+
+
+def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None = None,
+              memory_mb_each: float = 0.0, limits: Limits | None = None,
+              progress: Progress = SILENT, message: str = "") -> list:
+    """Return ``[function(*task) for task in tasks]``: side by side where cores and memory allow.
+
+    Where they do not, or there is one task, it is computed here, without a process: the results
+    are the same. See :meth:`Pool.map`.
+
+    Args:
+        function: May take ``progress``.
+        tasks: Its arguments, once for each call.
+        workers: At most so many processes; by default the core budget.
+        memory_mb_each: What a call may need.
+        limits: Of each call; with limits there is always a process.
+        progress: Of all together.
+        message: What is being done.
+    """
+    count = worker_count(len(tasks), wanted=workers, memory_mb_each=memory_mb_each)
+    if count > 1 or limits is not None:
+        with Pool(count, name=message or "the computation") as pool:
+            return pool.map(function, tasks, limits=limits or UNLIMITED, progress=progress,
+                            message=message)
+    course = _Course(len(tasks), progress, message)
+    results = []
+    for number, task in enumerate(tasks):
+        part = _Here(course, course.part(number), number)
+        results.append(Task(function, task).run(part.progress))
+        course.report(number + 1)
+    return results
+
+
+class _Here:
+    """Progress of a call in this process: passes on at once, so that cancelling reaches it."""
+
+    def __init__(self, course: _Course, part: Progress, done_count: int):
+        def hear(fraction: float, message: str, numbers: dict[str, Any]) -> None:
+            part(fraction, message, **numbers)
+            course.report(done_count)
+        self.progress = Progress(hear, part.warn)
+
+
+def memory_mb(process_id: int) -> float:
+    """Return the memory [MB] of a process and all that it has started."""
+    import psutil
+
+    try:
+        process = psutil.Process(process_id)
+        family = [process, *process.children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return 0.0
+    used = 0
+    for each in family:
+        try:
+            used += each.memory_info().rss
+        except psutil.NoSuchProcess:
+            continue
+    return used / 1e6

@@ -1,0 +1,172 @@
+"""What runs in a process of the pool: it takes tasks from its pipe until that closes."""
+
+import inspect
+import os
+import queue
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection
+from typing import Any
+
+from limber.core.errors import LimberError, WorkError
+from limber.core.processes.budget import CORES
+from limber.core.processes.ending import end_by_kernel
+from limber.core.progress import Progress, damage_told_to
+
+_REPORT_SECONDS = 0.05
+
+
+@dataclass(frozen=True)
+class Task:
+    """A function and its arguments."""
+
+    function: Callable
+    arguments: tuple
+
+    def run(self, progress: Progress) -> Any:
+        """Call it; a function that takes ``progress`` gets this one."""
+        if "progress" in inspect.signature(self.function).parameters:
+            return self.function(*self.arguments, progress=progress)
+        return self.function(*self.arguments)
+
+
+@dataclass(frozen=True)
+class Began:
+    """The process is ready for tasks."""
+
+
+@dataclass(frozen=True)
+class Reported:
+    """Progress of a task, or a warning."""
+
+    fraction: float
+    message: str
+    numbers: dict[str, Any] = field(default_factory=dict)
+    warning: bool = False
+
+
+@dataclass(frozen=True)
+class CacheDamaged:
+    """A warning about a damaged cache, from whatever the process does."""
+
+    message: str
+
+
+@dataclass(frozen=True)
+class Returned:
+    """A task's result."""
+
+    value: Any
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A task's error; before any task: that of the pool's beginning."""
+
+    error: BaseException
+
+
+def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) -> None:
+    """Do the tasks that come over ``pipe``; ends when it closes, with the parent or the pool.
+
+    Args:
+        pipe: Tasks come in, and None to cancel the one at work; progress and results go out.
+        begin: What to call first, and its arguments.
+        cores: The share of the core budget that is ours.
+    """
+    # Ctrl-C reaches the whole group of processes; the parent ends this one in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ[CORES] = str(cores)
+    parent = parent_process()
+    if parent is not None and parent.pid is not None:
+        end_by_kernel(parent.pid)
+    tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
+    voice = _Voice(pipe)
+    threading.Thread(target=_receive, args=(pipe, tasks, voice), daemon=True).start()
+    with damage_told_to(lambda message: voice.say(CacheDamaged(message))):
+        _work(tasks, voice, begin)
+
+
+def _work(tasks: "queue.SimpleQueue[Task]", voice: "_Voice",
+          begin: tuple[Callable | None, tuple]) -> None:
+    try:
+        if begin[0] is not None:
+            begin[0](*begin[1])
+    except BaseException as error:
+        voice.say(Failed(_sendable(error)))
+        return
+    voice.say(Began())
+    while True:
+        task = tasks.get()
+        try:
+            voice.say(Returned(task.run(voice.progress)))
+        except BaseException as error:
+            voice.say(Failed(_sendable(error)))
+
+
+class _Voice:
+    """Sends over the pipe; a task's progress goes through it and is cancelled by it."""
+
+    def __init__(self, pipe: Connection):
+        self._pipe = pipe
+        self._guard = threading.Lock()
+        self._reported_at = 0.0
+        self.fresh()
+
+    def fresh(self) -> None:
+        """Make a progress for the next task, not cancelled."""
+        self.progress = Progress(self._report, self._warn)
+
+    def say(self, said: object) -> None:
+        try:
+            with self._guard:
+                self._pipe.send(said)
+        except OSError:
+            # Nobody listens any more.
+            os._exit(1)
+
+    def _report(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        now = time.monotonic()
+        if now - self._reported_at >= _REPORT_SECONDS or fraction >= 1.0:
+            self._reported_at = now
+            self.say(Reported(fraction, message, numbers))
+
+    def _warn(self, message: str) -> None:
+        self.say(Reported(0.0, message, warning=True))
+
+
+def _receive(pipe: Connection, tasks: "queue.SimpleQueue[Task]", voice: _Voice) -> None:
+    while True:
+        try:
+            said = pipe.recv()
+        except (EOFError, OSError):
+            # The parent ended, or wants no more of us: nothing here is worth finishing.
+            os._exit(0)
+        except Exception as error:
+            # A task that cannot be unpickled here.
+            voice.say(Failed(_sendable(error)))
+            continue
+        if said is None:
+            voice.progress.cancel()
+        else:
+            voice.fresh()
+            tasks.put(said)
+
+
+def _sendable(error: BaseException) -> BaseException:
+    """Return the error as it can be sent: with its trace as a note, if it is one of a bug."""
+    import pickle
+
+    if not isinstance(error, LimberError):
+        error.add_note("In a process of the pool:\n" + "".join(traceback.format_exception(error)))
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return WorkError(f"A process of the pool failed: {error!r}.",
+                         "".join(traceback.format_exception(error)))
+    return error if isinstance(error, Exception) else WorkError(f"A process was ended: {error!r}.")

@@ -1,0 +1,163 @@
+"""One stage as a process: its progress relayed, its result returned, ended with its parent."""
+
+import json
+import math
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, TextIO
+
+from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
+from limber.core.processes.budget import CORES
+from limber.core.processes.ending import PARENT_PIPE, kill_tree
+from limber.core.processes.pool import UNLIMITED, Limits, memory_mb
+from limber.core.progress import SILENT, Progress
+
+_ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop, 130: Cancelled}
+_GRACE_SECONDS = 10.0
+_TICK_SECONDS = 0.1
+_MEMORY_SECONDS = 0.5
+
+
+def run_stage(arguments: Sequence[str], progress: Progress = SILENT, *,
+              limits: Limits = UNLIMITED, cores: int | None = None) -> dict[str, Any]:
+    """Run ``limber ARGUMENTS`` in a process of its own and return its JSON result.
+
+    Memory and native crashes stay in that process. A cancel of ``progress``, or Ctrl-C, ends it.
+
+    Args:
+        arguments: The stage and its options.
+        progress: Gets what it reports.
+        limits: What it may take.
+        cores: How many of our cores it may use; all of them by default.
+
+    Raises:
+        LimberError: the stage's own error, by its exit code; :class:`WorkError` if it crashed or
+            went over its limits.
+    """
+    command = [sys.executable, "-m", "limber", *map(str, arguments),
+               "--json", "--progress", "json"]
+    return run_json_process(arguments[0], command, progress, limits=limits, cores=cores,
+                            fix=f"Run it alone to see more: limber {' '.join(map(str, arguments))}")
+
+
+def run_json_process(name: str, command: Sequence[str], progress: Progress = SILENT, *,
+                     limits: Limits = UNLIMITED, cores: int | None = None,
+                     fix: str = "") -> dict[str, Any]:
+    """Run a program that writes progress and result as stages do; returns its result.
+
+    Args:
+        name: What it is called in an error.
+        command: The program and its arguments. It gets a standard input that closes when this
+            process ends, and ``LIMBER_PARENT_PIPE=stdin`` to tell it so.
+        progress: Gets what it reports.
+        limits: What it may take.
+        cores: As in :func:`run_stage`.
+        fix: What to do when it ends without a word.
+
+    Raises:
+        LimberError: as :func:`run_stage`.
+    """
+    environment = os.environ | {PARENT_PIPE: "stdin"}
+    if cores is not None:
+        environment[CORES] = str(cores)
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                   stderr=errors, text=True, encoding="utf-8", errors="replace",
+                                   env=environment)
+        try:
+            result = _followed(name, process, progress, limits)
+        except BaseException:
+            _stop(process)
+            raise
+        finally:
+            if process.stdin is not None:
+                process.stdin.close()
+        if process.returncode != 0:
+            raise _failure(name, process.returncode, result, errors, fix)
+    return result
+
+
+def _followed(name: str, process: subprocess.Popen, progress: Progress,
+              limits: Limits) -> dict[str, Any]:
+    """Relay what the process reports until it has ended; returns its result."""
+    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
+    reader.start()
+    started = time.monotonic()
+    next_memory_check = started
+    result: dict[str, Any] = {}
+    while True:
+        try:
+            line = lines.get(timeout=_TICK_SECONDS)
+        except queue.Empty:
+            line = ""
+        if line is None or (not line and process.poll() is not None):
+            # A grandchild may keep the pipe open; what matters was said by then.
+            process.wait()
+            return result
+        result = _taken(line, progress) or result
+        if progress.cancelled:
+            raise Cancelled
+        now = time.monotonic()
+        if limits.seconds is not None and now - started > limits.seconds:
+            raise WorkError(f"{name} was stopped after {now - started:.0f} s.",
+                            "It had not finished within its time limit.",
+                            "Allow it more time, or make the task smaller.")
+        if limits.memory_mb is not None and now > next_memory_check:
+            next_memory_check = now + _MEMORY_SECONDS
+            used = memory_mb(process.pid)
+            if used > limits.memory_mb:
+                raise WorkError(f"{name} was stopped at {used:.0f} MB of memory.",
+                                f"Its limit is {limits.memory_mb:.0f} MB.",
+                                "Allow it more, or make the task smaller.")
+
+
+def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:
+    for line in stream:
+        lines.put(line)
+    lines.put(None)
+
+
+def _taken(line: str, progress: Progress) -> dict[str, Any]:
+    """Pass a line of progress on; returns what it holds if it is a result."""
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError):
+        # Native libraries (fTetWild, Blender) print lines of their own.
+        return {}
+    if not isinstance(content, dict):
+        return {}
+    fraction = content.pop("progress", None)
+    if isinstance(fraction, int | float) and math.isfinite(fraction):
+        numbers = {name: value for name, value in content.items()
+                   if name not in ("self", "fraction", "message", "seconds")}
+        progress(fraction, str(content.get("message", "")), **numbers)
+        return {}
+    return content if "status" in content else {}
+
+
+def _stop(process: subprocess.Popen) -> None:
+    process.terminate()
+    try:
+        process.wait(_GRACE_SECONDS)
+    except subprocess.TimeoutExpired:
+        kill_tree(process.pid)
+        process.wait()
+
+
+def _failure(name: str, code: int, result: dict[str, Any], errors: TextIO,
+             fix: str) -> LimberError:
+    kind = _ERRORS.get(code, WorkError)
+    if result.get("error"):
+        # What to do is kept apart: a command that runs others has other options.
+        advice = str(result.get("fix") or "")
+        return kind(f"{name}: {str(result['error']).removesuffix(advice).rstrip()}", "", advice)
+    errors.seek(0)
+    tail = " | ".join(errors.read().strip().splitlines()[-4:])
+    return kind(f"{name} ended with exit code {code} and no result.", tail, fix)

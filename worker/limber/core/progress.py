@@ -1,0 +1,179 @@
+"""What long work tells: how far it is, and warnings; the same for a terminal and a test.
+
+A long function takes ``progress: Progress = SILENT`` and calls it as it goes::
+
+    progress(0.4, "contracting", iteration=7)
+
+A call raises :class:`limber.core.errors.Cancelled` once the work has been cancelled, so every call
+is also a place where the work can stop. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
+What the user should know though the work goes on is told with ``progress.warn(message)``.
+"""
+
+import contextlib
+import json
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any, TextIO
+
+from limber.core.errors import Cancelled, DamagedCacheWarning
+
+Sink = Callable[[float, str, dict[str, Any]], None]
+
+
+class Progress:
+    """Passes what work tells to whom it concerns; raises ``Cancelled`` after :meth:`cancel`.
+
+    Args:
+        sink: Gets fraction, message and numbers.
+        on_warning: Gets each warning.
+    """
+
+    def __init__(self, sink: Sink | None = None, on_warning: Callable[[str], None] | None = None,
+                 *, _span: tuple[float, float] = (0.0, 1.0),
+                 _stop: threading.Event | None = None):
+        self._sink = sink
+        self._on_warning = on_warning
+        self._span = _span
+        self._stop = _stop or threading.Event()
+
+    def __call__(self, fraction: float, message: str = "", **numbers: Any) -> None:
+        """Report ``fraction`` in [0, 1] with a short message and named numbers."""
+        if self._stop.is_set():
+            raise Cancelled
+        if self._sink is not None:
+            start, stop = self._span
+            clipped = min(max(float(fraction), 0.0), 1.0)
+            self._sink(start + (stop - start) * clipped, message, numbers)
+
+    def warn(self, message: str) -> None:
+        """Tell the user something that does not stop the work."""
+        if self._on_warning is not None:
+            self._on_warning(message)
+
+    def part(self, start: float, stop: float) -> "Progress":
+        """Return a progress whose 0..1 is ``start..stop`` of this one."""
+        low, high = self._span
+        span = (low + (high - low) * start, low + (high - low) * stop)
+        return Progress(self._sink, self._on_warning, _span=span, _stop=self._stop)
+
+    def named(self, name: str) -> "Progress":
+        """Return the same progress, its warnings beginning with ``name``."""
+        return self._with_warnings(lambda message: self.warn(f"{name}: {message}"))
+
+    def keeping(self, warnings: list[str]) -> "Progress":
+        """Return the same progress, each of its warnings also appended to ``warnings``."""
+        def keep(message: str) -> None:
+            warnings.append(message)
+            self.warn(message)
+        return self._with_warnings(keep)
+
+    def _with_warnings(self, on_warning: Callable[[str], None]) -> "Progress":
+        return Progress(self._sink, on_warning, _span=self._span, _stop=self._stop)
+
+    def to_the_end(self) -> "Progress":
+        """Return the same progress of work that is finished though it was cancelled."""
+        return Progress(self._sink, self._on_warning, _span=self._span)
+
+    def cancel(self) -> None:
+        """Make the next report, from any thread, raise ``Cancelled``."""
+        self._stop.set()
+
+    @property
+    def cancelled(self) -> bool:
+        return self._stop.is_set()
+
+
+SILENT = Progress()
+
+
+class JsonSink:
+    """Writes one JSON object a line: ``{"progress", "message", "seconds", ...numbers}``."""
+
+    def __init__(self, stream: TextIO | None = None, *, interval_seconds: float = 0.05):
+        self._stream = stream or sys.stdout
+        self._interval = interval_seconds
+        self._lock = threading.Lock()
+        self._start = time.perf_counter()
+        self._last = -1.0
+        self._last_message = ""
+
+    def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        now = time.perf_counter() - self._start
+        due = now - self._last >= self._interval or message != self._last_message
+        if not (due or fraction >= 1.0):
+            return
+        self._last, self._last_message = now, message
+        self.say({"progress": round(fraction, 4), "message": message, "seconds": round(now, 3)}
+                 | numbers)
+
+    def say(self, content: dict[str, Any]) -> None:
+        """Write one line, from any thread."""
+        text = json.dumps(content, default=float) + "\n"
+        with self._lock:
+            self._stream.write(text)
+            self._stream.flush()
+
+
+class BarSink:
+    """Draws a bar on standard error, with the last message and the numbers beside it."""
+
+    def __init__(self, title: str):
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as RichProgress
+        from rich.table import Column
+
+        # The message gives way where the window is narrow, never the bar and its percentage.
+        self._bar = RichProgress(
+            TextColumn("{task.fields[title]}",
+                       table_column=Column(no_wrap=True, min_width=len(title))),
+            BarColumn(bar_width=20, table_column=Column(no_wrap=True, min_width=20)),
+            TextColumn("{task.percentage:3.0f} %", table_column=Column(no_wrap=True, min_width=5)),
+            TimeElapsedColumn(table_column=Column(no_wrap=True, min_width=7)),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1)),
+            console=Console(stderr=True), expand=True,
+        )
+        self._task = self._bar.add_task("", total=1.0, title=title)
+
+    def __enter__(self) -> "BarSink":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        shown = " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
+        self._bar.update(self._task, completed=fraction, description=f"{message} {shown}".strip())
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        self._bar.console.print(line, markup=False, highlight=False)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+@contextlib.contextmanager
+def damage_told_to(tell: Callable[[str], None]) -> Iterator[None]:
+    """Hand the first warning about a damaged cache to ``tell``; it comes from deep below.
+
+    Where one file of a cache is damaged others mostly are too: the user reads of one.
+    """
+    told: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", DamagedCacheWarning)
+        shown = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if not issubclass(category, DamagedCacheWarning):
+                shown(message, category, *place, **more)
+            elif not told:
+                told.append(str(message))
+                tell(told[0])
+        warnings.showwarning = show
+        yield

@@ -1,0 +1,122 @@
+"""Settings that a user chooses: what all models of them share, and how a refused value is told.
+
+A model is the one source of an option's name, type, range, default and help; of its place in
+``--help``, in the JSON schema and in the add-on's panel; and of what a manifest remembers. The
+unit of a value stands in its description in square brackets.
+"""
+
+import math
+import re
+import shlex
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+
+from limber.core.errors import InputError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+def _with_length(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    length = math.hypot(*vector)
+    if not 1e-9 < length < math.inf:
+        raise ValueError("a direction has a length")
+    return vector
+
+
+Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
+"""A direction: three numbers that are not all 0; of any length."""
+
+Groups = dict[str, tuple[str, ...]]
+"""Title to the names of the fields that stand under it."""
+
+_UNIT = re.compile(r"\[([^\[\]]+)\]")
+
+
+class Settings(BaseModel):
+    """Base of all settings and inputs: frozen, and closed to names that it does not know.
+
+    Attributes:
+        groups: Title to the names of the fields that stand under it; a model that inherits adds
+            to those of its bases.
+        experts: Fields that only ``--help-all`` shows.
+        results_version: Raised where the same settings on the same input give other results than
+            before: branches then count as out of date, and a batch runs the stage again.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    groups: ClassVar[Groups] = {}
+    experts: ClassVar[tuple[str, ...]] = ()
+    results_version: ClassVar[int] = 1
+
+    @classmethod
+    def group_of(cls, name: str) -> str:
+        """Return the title that a field stands under."""
+        for base in cls.__mro__:
+            for title, names in vars(base).get("groups", {}).items():
+                if name in names:
+                    return title
+        return "options"
+
+    @classmethod
+    def is_expert(cls, name: str) -> bool:
+        """Whether a field is shown to experts only."""
+        return any(name in vars(base).get("experts", ()) for base in cls.__mro__)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        schema = handler.resolve_ref_schema(handler(core_schema))
+        for name, content in schema.get("properties", {}).items():
+            content["title"] = name.replace("_", " ").capitalize()
+            content["group"] = cls.group_of(name)
+            content["expert"] = cls.is_expert(name)
+            if unit := _UNIT.search(content.get("description", "")):
+                content["unit"] = unit.group(1)
+        return schema
+
+
+def checked_settings(model: type[Model], values: dict[str, Any]) -> Model:
+    """Return ``model(**values)``; a refused value becomes an :class:`InputError` that names it."""
+    try:
+        return model(**values)
+    except ValidationError as error:
+        raise _refusal(model, values, error) from error
+
+
+def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationError) -> InputError:
+    missing = [str(one["loc"][0]) for one in error.errors()
+               if one["type"] == "missing" and len(one["loc"]) == 1]
+    if missing:
+        return _missing(model, values, missing)
+    first = error.errors()[0]
+    message = first["msg"].removeprefix("Value error, ")
+    if not first["loc"]:
+        # It is about several values together, and names them.
+        return InputError(f"{message}.", "", "See the options' help.")
+    return InputError(f"{_flag(str(first['loc'][0]))} {first.get('input')!r}: {message}.",
+                      "It is outside what the stage can work with.",
+                      "See the option's help for its range.")
+
+
+def _missing(model: type[BaseModel], values: dict[str, Any], names: list[str]) -> InputError:
+    """Say which options are missing, what each is, and propose values."""
+    stem = next((value.resolve().stem for value in values.values() if isinstance(value, Path)),
+                "NAME")
+    seen, meant, proposed = [], [], []
+    for name in names:
+        field, flag = model.model_fields[name], _flag(name)
+        declared = field.json_schema_extra
+        extra = declared if isinstance(declared, dict) else {}
+        short = str(extra.get("short", flag))
+        seen.append(flag if short == flag else f"{short} ({flag})")
+        meant.append(f"{short}: {field.description}" if len(names) > 1 else field.description or "")
+        proposed.append(f"{short} " + shlex.quote(
+            str(extra.get("example", name.upper())).format(stem=stem)))
+    what = "option" if len(names) == 1 else "options"
+    return InputError(f"Missing {what} {' and '.join(seen)}.", " ".join(meant),
+                      f"Add, for example: {' '.join(proposed)}")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

@@ -1,0 +1,153 @@
+"""From a branch and its pulls to what an optimiser needs."""
+
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.progress import SILENT, Progress
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.forward.forward_model import Forward, under_its_weight
+from limber.estimation.forward.observed_path import WatchedForward
+from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
+from limber.estimation.parameters import ParameterSpace
+from limber.estimation.settings import EstimateSettings
+from limber.recordings.cell_errors import calibration_of
+from limber.recordings.recording import Pull, PullEntry
+from limber.recordings.synchronisation import Frames, frames_of
+
+
+def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
+                progress: Progress = SILENT,
+                ) -> list[Forward]:
+    """Make the forward simulation of each pull.
+
+    Raises:
+        InputError: a pull has nothing that could be compared, or watches other points.
+    """
+    forwards = []
+    for pull in pulls:
+        entry = _with_overrides(pull.entry, settings)
+        frames = frames_of(pull)
+        for message in frames.warnings:
+            progress.warn(message)
+        rest = subject.control_points if entry.rest_points_m is None else np.array(
+            entry.rest_points_m)
+        if frames.positions.shape[1] not in (0, len(rest)):
+            raise InputError(
+                f"{pull.name} watches {frames.positions.shape[1]} points, {len(rest)} are known.",
+                "Each observed point needs its place at rest.",
+                "Give rest_points_m in pull.toml, or as many --fractions as markers.")
+        rest = rest if frames.positions.shape[1] else np.empty((0, 3))
+        _check_rest(pull, frames, rest, progress)
+        forwards.append(_forward(pull.name, entry, frames, rest, subject, settings))
+    return forwards
+
+
+def require_scale_in_principle(forwards: list[Forward]) -> None:
+    """Refuse pulls of which no amount of data would give the scale of Young's modulus.
+
+    Raises:
+        InputError: all are pose-driven, slow, without gravity and without measured force.
+    """
+    for forward in forwards:
+        entry = forward.entry
+        if forward.uses_force or entry.drive == "force" or entry.motion == "dynamic" or (
+                entry.gravity_m_s2 is not None):
+            return
+    raise InputError(
+        "No pull has a measured force, gravity or inertia.",
+        "A branch that is moved slowly to given poses takes the same shape whether it is soft or "
+        "stiff: only the ratios of Young's modulus along it show, and a fit would look perfect "
+        "with every modulus wrong.",
+        "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 or motion in "
+        "pull.toml).")
+
+
+def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
+             settings: EstimateSettings) -> Forward:
+    if entry.motion == "swing":
+        raise InputError(f"{name} is a swing: nothing led the branch or held it.",
+                         "Its release, load and damping are fitted together, in time.",
+                         f"Use `limber swing --pull {name}`, or name other pulls with --pull.")
+    if entry.motion == "dynamic":
+        from limber.estimation.forward.dynamic_pull import DynamicForward
+
+        return DynamicForward(name, subject.model, subject.weights, entry, frames, rest,
+                              field=subject.field)
+    kind = WatchedForward if is_watched(entry, frames, settings) else QuasiStaticForward
+    return kind(name, subject.model, subject.weights, entry, frames, rest,
+                key_count=settings.key_frames, field=subject.field)
+
+
+def is_watched(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
+    """Whether a slow pull's force leads and the gripper's recorded path is an observation.
+
+    So it is wherever the force was measured, of a clamped grasp the torque too, and the gripper's
+    frame may be off. Without the force there is nothing else to lead but the path; it then counts
+    as exact.
+    """
+    measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+    known = calibration_of(entry)
+    return (entry.drive == "pose" and settings.drive is None and settings.forward == "full"
+            and bool(measured.mean() > 0.8)
+            and (known.pose_sigma_m > 0 or known.pose_sigma_rad > 0)
+            and (entry.grasp.mode == "pinned" or uses_torque(entry, frames)))
+
+
+def parameter_space(subject: Subject, forwards: list[Forward], settings: EstimateSettings,
+                    ) -> ParameterSpace:
+    """What is free, and what is known beforehand of what is not asked for.
+
+    Poisson's ratio, the density where weight or inertia acts, and the form of the field are free
+    within their priors; asked for (``--fit-poisson``, ``--fit-density``), they are so without.
+    """
+    wanted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
+              "alpha": settings.fit_damping, "beta": settings.fit_damping}
+    chosen = {name for name, is_wanted in wanted.items() if is_wanted}
+    form = subject.field.names if subject.field is not None else ()
+    priors = [(name, 0.0, 1.0) for name in form]
+    if settings.forward == "full" and settings.method == "gauss-newton":
+        weighs = any(forward.is_dynamic or under_its_weight(
+            subject.model, forward.entry).gravity.any() for forward in forwards)
+        if settings.poisson_sigma > 0 and "poisson" not in chosen:
+            priors.append(("poisson", subject.start.poisson, settings.poisson_sigma))
+        if settings.density_sigma > 0 and "density" not in chosen and weighs:
+            priors.append(("density", float(np.log(subject.start.density)),
+                           settings.density_sigma))
+    free = chosen | {name for name, _, _ in priors}
+    extra = (*form, *(name for name in wanted if name in free))
+    return ParameterSpace(subject.start, tuple(range(len(subject.start.young))), extra,
+                          priors=tuple(priors))
+
+
+def _with_overrides(entry: PullEntry, settings: EstimateSettings) -> PullEntry:
+    given = {"drive": settings.drive, "motion": settings.motion}
+    return entry.model_copy(update={k: v for k, v in given.items() if v is not None})
+
+
+def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress) -> None:
+    """Warn where the first frame, at rest, shows the points elsewhere than the branch has them.
+
+    Raises:
+        InputError: all of them lie farther off than the branch is long.
+    """
+    at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
+    if not len(rest) or not at_rest.any() or pull.entry.gravity_m_s2 is not None:
+        return
+    shown = frames.positions[at_rest]
+    if not np.isfinite(shown).any():
+        return
+    off = np.linalg.norm(np.nanmedian(shown, axis=0) - rest, axis=1)
+    size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
+    if np.nanmin(off) > max(2 * size, 0.1):
+        raise InputError(
+            f"{pull.name}: at rest the observed points lie {np.nanmin(off):.3g} to "
+            f"{np.nanmax(off):.3g} m from where this branch, about {size:.2g} m long, has them.",
+            "The recording is in another unit or another frame of reference.",
+            "Import it with --unit, or with --nominal (where on the branch the markers are).")
+    limit = 5e-3 + 5 * pull.entry.sensor.position_sigma_m
+    if np.nanmax(off) > limit:
+        progress.warn(
+            f"{pull.name}: at rest the observed points lie up to {np.nanmax(off) * 1e3:.0f} mm "
+            "from where this branch has them: another branch, another frame of reference, or "
+            "markers in another order.")

@@ -1,0 +1,1 @@
+"""What an optimiser minimises, and the optimisers."""

@@ -1,0 +1,229 @@
+"""Where a fit starts: the uniform modulus that explains the measured force best."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.core.errors import WorkError
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.optimise import gauss_newton
+from limber.estimation.forward.forward_model import Forward
+from limber.estimation.forward.observed_path import WatchedForward, is_watched
+from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
+
+PARTS = (0.25, 0.45, 0.7)
+"""Of a fast pull's frames, how many are fitted before all of them are: over a quarter a branch
+cannot be a whole swing off. The parts between are chosen, not measured."""
+ROUGH_KEYS = 5
+"""Simulated frames of a first fit by force alone: chosen, it only has to lead near."""
+FEWEST_FRAMES = 6
+"""Fewer frames say nothing of a motion."""
+FALL = 0.9
+"""By which log E falls from one control point to the next of a start, as the paper's branches."""
+RAN_OFF = 4.0
+"""Mean squared residual of a first fit by force alone above which it found nothing: of drawn
+branches those that led to the solution ended at 0.9 to 1.8, those that ran off at 11 to 16, with
+moduli up to fiftyfold off under which a branch folds up and each simulation takes long."""
+WORSE = 2.0
+"""So many times as much is left under a force that was followed where its linearisation misled:
+20 times in the one fit seen, where a branch folded up; else less is left than before."""
+STIFFER = (1.6, 2.5, 4.0)
+"""What moduli without an equilibrium are raised by: a fit by a drifting force ended with the right
+course along the branch, its tip half as stiff as one that stands; chosen, not tuned."""
+
+
+def scaled_start(objective: Objective, values: Values) -> Values:
+    """Return ``values`` with all moduli scaled to the measurements.
+
+    How far a force moves a branch depends on force over modulus alone: a few solutions give the
+    scale. Where a force or gravity drives, a few decades are tried instead.
+    """
+    if any(forward.is_dynamic for forward in objective.forwards):
+        return _step_by_step(objective, values)
+    return _scaled(objective, values)
+
+
+def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
+    """Fit pulls whose path is watched by their force alone first, without the path.
+
+    Far from the solution no force explains both the path and the points; a force as it was read
+    merely moves a branch of wrong moduli too far. Near it, force and path are settled together.
+
+    Returns:
+        The values, and whether they explain the pulls at all.
+    """
+    watched = [forward for forward in objective.forwards if is_watched(forward)]
+    if not watched:
+        return values, True
+    space = objective.space
+    likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
+    counts = [forward.key_count for forward in watched]
+    for forward, count in zip(watched, counts, strict=True):
+        forward.is_watching = False
+        forward.set_key_count(min(ROUGH_KEYS, count))
+    try:
+        rough = objective.with_forwards(objective.forwards).with_space(likely)
+        found = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
+                             force_rounds=0).evaluation
+        explains = found.mean_square < RAN_OFF
+        for forward in watched:
+            forward.keep()
+        if explains:
+            found = _followed(rough, found, watched)
+    except WorkError:
+        return values, True
+    finally:
+        for forward, count in zip(watched, counts, strict=True):
+            forward.is_watching = True
+            forward.set_key_count(count)
+    objective.forward_count = rough.forward_count
+    return likely.unpack(found.free), explains
+
+
+def _followed(rough: Objective, found: Evaluation, watched: list[WatchedForward]) -> Evaluation:
+    """Fit on where the force is as a first fit says that it was; there, unless that is worse."""
+    rough.follow_forces(found)
+    there = rough.evaluate(found.free, jacobian=True)
+    if there is None or there.objective > WORSE * found.objective:
+        for forward in watched:
+            forward.step_back()
+        return found
+    fit = gauss_newton(rough, found.free, evaluation_limit=12, tolerance=3e-2, is_near=True,
+                       force_rounds=0)
+    for forward in watched:
+        forward.keep()
+    return fit.evaluation
+
+
+def _scaled(objective: Objective, values: Values) -> Values:
+    factors = [factor for forward in objective.forwards
+               if (factor := _force_ratio(forward, values)) is not None]
+    if factors:
+        young = values.young * float(np.exp(np.mean(np.log(factors))))
+        return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
+    if all(forward.drive == "force" for forward in objective.forwards):
+        return _from_the_stiff_side(objective, values)
+    return _scanned(objective, values)
+
+
+def _step_by_step(objective: Objective, values: Values) -> Values:
+    """Fit the beginning of fast pulls first, then more and more of them.
+
+    A branch of wrong moduli swings at other frequencies: later in the motion it is anywhere, and
+    a fit to all frames at once ends beside the truth. Over a quarter of the frames it cannot be a
+    whole swing off; what is found there foretells the next part.
+    """
+    space = objective.space
+    likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
+    for number, part in enumerate(PARTS):
+        forwards = [forward.until(max(int(part * len(forward.frames)), FEWEST_FRAMES))
+                    for forward in objective.forwards]
+        short = objective.with_forwards(forwards).with_space(likely)
+        if number == 0:
+            values = _scaled(short, values)
+        fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2,
+                           force_rounds=1)
+        values = likely.unpack(fit.evaluation.free)
+        objective.forward_count = short.forward_count
+    return values
+
+
+def _force_ratio(forward: Forward, values: Values) -> float | None:
+    usable = forward.uses_force and (forward.drive == "pose" or forward.watches_pose)
+    return forward.force_ratio(values) if usable else None
+
+
+def _from_the_stiff_side(objective: Objective, values: Values) -> Values:
+    """Scale the moduli by how far a known force moves the points: simulated over observed.
+
+    It starts where the branch hardly moves and displacements go with force over modulus; a branch
+    that is far too soft folds up, and its equilibrium takes minutes to be found, or is none.
+    """
+    young = values.young
+    for _ in range(12):
+        trial = replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
+        found = objective.evaluate(objective.space.pack(trial))
+        if found is None:
+            young = 10 * young
+            continue
+        moved, seen = [], []
+        for forward, pull in zip(objective.forwards, found.pulls, strict=True):
+            known = np.isfinite(forward.frames.positions)
+            moved.append((pull.positions - forward.rest_points)[known])
+            seen.append((forward.frames.positions - forward.rest_points)[known])
+        ratio = float(np.linalg.norm(np.concatenate(moved))
+                      / max(float(np.linalg.norm(np.concatenate(seen))), 1e-12))
+        # A small step to the soft side: a bent branch stiffens, so that the ratio overshoots.
+        young = young * np.clip(ratio, 0.2, 1e4)
+        if abs(ratio - 1) < 0.05 or ratio <= 0:
+            break
+    return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
+
+
+def _scanned(objective: Objective, values: Values) -> Values:
+    """Descend over decades, then halve the step: the objective has one valley along the scale."""
+    best = (np.inf, 0.0)
+    tried: dict[float, float] = {}
+
+    def cost(shift: float) -> float:
+        if shift not in tried:
+            scaled = replace(values, young=np.clip(values.young * 10**shift, *YOUNG_BOUNDS_PA))
+            found = objective.evaluate(objective.space.pack(scaled))
+            tried[shift] = np.inf if found is None else found.objective
+        return tried[shift]
+
+    centre, step = 0.0, 1.0
+    while step >= 0.25:
+        around = [(cost(shift), shift) for shift in (centre, centre - step, centre + step)]
+        best = min(around)
+        if best[1] == centre:
+            step /= 2
+        centre = best[1]
+        if abs(centre) > 6:
+            break
+    return replace(values, young=np.clip(values.young * 10**centre, *YOUNG_BOUNDS_PA))
+
+
+def standing_start(objective: Objective, start: Values, uniform: Values, *, explains: bool = True,
+                   ) -> tuple[Values, Evaluation] | None:
+    """Return the start, or one near it where there is an equilibrium, and what is found there.
+
+    A fit by force alone can end at moduli that carry no force at all. Then the same ones stiffer
+    are tried; where they explain the pulls no better than others might, the uniform modulus as well
+    and one that falls outwards as of branches, softer or stiffer; the better of what both lead to.
+    None: none of them stands.
+
+    Args:
+        explains: Whether the start explains the pulls at all; else the others come first.
+    """
+    place = np.arange(len(uniform.young))
+    falling = np.exp(FALL * (place.mean() - place))
+    likely = [replace(uniform, young=uniform.young * factor * course)
+              for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)]
+    if not explains and (first := _first_standing(objective, likely)) is not None:
+        return first
+    found = objective.evaluate(objective.space.pack(start), jacobian=True)
+    if found is not None:
+        return start, found
+    stiffer = _first_standing(objective, [replace(start, young=start.young * factor)
+                                          for factor in STIFFER])
+    if not explains or (stiffer is not None and stiffer[1].mean_square < RAN_OFF):
+        return stiffer
+    other = _first_standing(objective, likely)
+    if stiffer is None or other is None or other[1].objective <= stiffer[1].objective:
+        return other or stiffer
+    # The simulations go on from where they were last.
+    return _first_standing(objective, [stiffer[0]]) or other
+
+
+def _first_standing(objective: Objective, trials: list[Values],
+                    ) -> tuple[Values, Evaluation] | None:
+    """Return the first that has an equilibrium; the force is taken as it was read."""
+    for trial in trials:
+        for forward in objective.forwards:
+            if is_watched(forward):
+                forward.forget()
+        found = objective.evaluate(objective.space.pack(trial), jacobian=True)
+        if found is not None:
+            return trial, found
+    return None

@@ -1,0 +1,319 @@
+"""Errors of cell and sensors as unknowns of a fit: what each does to what is measured.
+
+Gripper frame, zero and gain of the force, camera frame, clock and slip of the grasp all stay
+through a recording; taken as exact, they end up in the moduli (1 mm of the gripper's pose: over
+60 %). To first order each changes the predicted measurements linearly, so that all of them are
+eliminated from the residuals together with what is known of them beforehand (variable projection,
+Golub and Pereyra 1973, with the prior as further rows). What is left depends on the moduli alone,
+and their covariance has the errors in it; so have the errors their own.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from limber.core.present import present
+from limber.estimation.forward.forward_model import Forward
+from limber.recordings.cell_errors import CalibrationEntry, calibration_of
+from limber.recordings.recording import PullEntry
+from limber.recordings.synchronisation import Frames
+
+AXES = "xyz"
+BEND_OF_DRIFT = 0.3
+"""A sensor's zero drifts as it warms: beside a straight course, a bend of so much of its size."""
+NAMED = 3.0
+"""An error so many of its deviations from zero is told: without it the fit would be poor."""
+NAMED_SHARE = 0.3
+"""If it also is more than this part of what was expected beforehand."""
+UNLIKELY = 10.0
+"""An error so many of its deviations beforehand gives no result: seen was a gain of force 35 off,
+at moduli that were five times too high with narrow intervals."""
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """One error that stays through a recording.
+
+    Attributes:
+        name: In words, such as "gripper place x".
+        unit: "m", "rad", "N", "N m", "s" or "" (relative).
+        sigma: Its standard deviation beforehand, in that unit.
+        pull: Whose it is; None: of the cell, alike in all pulls of the same calibration.
+    """
+
+    name: str
+    unit: str
+    sigma: float
+    pull: str | None
+
+
+@dataclass(frozen=True)
+class ErrorSlopes:
+    """Change of a pull's predicted measurements by k errors, each in units of its deviation.
+
+    Attributes:
+        points: [m], shape [f, m, 3, k].
+        forces: [N], shape [f, 3, k].
+        torques: [N m], shape [f, 3, k].
+        grasps: Of the simulated less the recorded grasp point [m], shape [f, 3, k].
+    """
+
+    points: np.ndarray
+    forces: np.ndarray
+    torques: np.ndarray
+    grasps: np.ndarray
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """What a fit says of the errors, for given values of its free vector.
+
+    Attributes:
+        values: In units of their deviations, shape [k].
+        covariance: Of these, the free vector held, shape [k, k].
+        gain: How they follow the free vector, shape [k, p]; None without derivatives.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    gain: np.ndarray | None
+
+    def total_covariance(self, free: np.ndarray) -> np.ndarray:
+        """With the covariance of the free vector, shape [p, p], in it."""
+        if self.gain is None:
+            return self.covariance
+        return self.covariance + self.gain @ free @ self.gain.T
+
+
+def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray | None, Eliminated]:
+    """Take out of residuals what k errors of unit deviation would explain.
+
+    Args:
+        residual: Standardised, shape [r].
+        jacobian: To the free vector, shape [r, p], or None.
+        columns: To the errors, shape [r, k].
+
+    Returns:
+        Residual [r + k] and Jacobian [r + k, p] with the rows of what was known beforehand, and
+        the errors.
+    """
+    count = columns.shape[1]
+    basis, triangle = np.linalg.qr(np.vstack([columns, np.eye(count)]))
+    residual = np.concatenate([residual, np.zeros(count)])
+    inside = basis.T @ residual
+    values = -solve_triangular(triangle, inside)
+    inverse = solve_triangular(triangle, np.eye(count))
+    gain = None
+    if jacobian is not None:
+        jacobian = np.vstack([jacobian, np.zeros((count, jacobian.shape[1]))])
+        along = basis.T @ jacobian
+        gain = -solve_triangular(triangle, along)
+        jacobian = jacobian - basis @ along
+    return residual - basis @ inside, jacobian, Eliminated(values, inverse @ inverse.T, gain)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Errors that come together, and their slopes."""
+
+    names: tuple[str, ...]
+    unit: str
+    sigma: tuple[float, ...]
+    is_shared: bool
+    slopes: Callable[["_Pull"], dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class _Pull:
+    """A pull as its errors see it."""
+
+    entry: PullEntry
+    frames: Frames
+    pivot: np.ndarray
+    tangent: np.ndarray | None
+    positions: np.ndarray
+    forces: np.ndarray
+
+    @property
+    def grip_axis(self) -> np.ndarray:
+        """Direction of the branch at the grasp, shape [f, 3]; of a pull whose path is watched."""
+        return present(self.tangent, "direction of the branch at the grasp")
+
+    @property
+    def share(self) -> np.ndarray:
+        """Part of the recording's time, shape [f]."""
+        since = self.frames.times - self.frames.times[0]
+        return since / max(float(since[-1]), 1e-12)
+
+
+class CellErrors:
+    """The errors of all pulls of a fit.
+
+    Args:
+        forwards: Of the pulls.
+    """
+
+    def __init__(self, forwards: Sequence[Forward]):
+        self.nuisances: list[Nuisance] = []
+        self._places: list[list[tuple[_Source, np.ndarray]]] = []
+        self._forwards = forwards
+        known: dict[tuple[object, ...], int] = {}
+        self._pivots: dict[CalibrationEntry, np.ndarray] = {}
+        for forward in forwards:
+            places = []
+            calibration = calibration_of(forward.entry)
+            self._pivots.setdefault(calibration, np.array(forward.entry.grasp.point_m))
+            for source in _sources(forward, calibration):
+                used = np.empty(len(source.names), int)
+                for place, (name, sigma) in enumerate(zip(source.names, source.sigma,
+                                                          strict=True)):
+                    pull = None if source.is_shared else forward.name
+                    key = (name, pull if pull is not None else calibration)
+                    if key not in known:
+                        known[key] = len(self.nuisances)
+                        self.nuisances.append(Nuisance(name, source.unit, sigma, pull))
+                    used[place] = known[key]
+                places.append((source, used))
+            self._places.append(places)
+
+    @property
+    def count(self) -> int:
+        return len(self.nuisances)
+
+    def slopes(self, index: int, positions: np.ndarray, forces: np.ndarray) -> ErrorSlopes:
+        """Slopes of pull ``index`` at its simulated positions [f, m, 3] and forces [f, 3]."""
+        forward = self._forwards[index]
+        frames, count = forward.frames, self.count
+        total = {"points": np.zeros((*positions.shape, count)),
+                 **{kind: np.zeros((len(frames), 3, count))
+                    for kind in ("forces", "torques", "grasps")}}
+        pull = _Pull(forward.entry, frames, self._pivots[calibration_of(forward.entry)],
+                     forward.grasp_tangent, positions, forces)
+        for source, used in self._places[index]:
+            for kind, slope in source.slopes(pull).items():
+                total[kind][..., used] += slope * np.array(source.sigma)
+        return ErrorSlopes(**total)
+
+
+def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
+    found = []
+
+    def add(names: Sequence[str], unit: str, sigma: float | Sequence[float], is_shared: bool,
+            slopes: Callable[[_Pull], dict[str, np.ndarray]]) -> None:
+        each = tuple(np.broadcast_to(sigma, len(names)).tolist())
+        if any(value > 0 for value in each):
+            found.append(_Source(tuple(names), unit, each, is_shared, slopes))
+
+    if forward.frames.positions.shape[1]:
+        add([f"camera place {axis}" for axis in AXES], "m", known.camera_sigma_m, True, _shifted)
+        add([f"camera turn about {axis}" for axis in AXES], "rad", known.camera_sigma_rad, True,
+            _turned)
+        if len(forward.frames) > 3:
+            add(["camera clock"], "s", known.clock_sigma_s, False, _late)
+    if forward.uses_force and not forward.force_is_stated:
+        add(["force gain"], "", known.force_gain_sigma, True,
+            lambda pull: {"forces": pull.forces[..., None]})
+        add([f"force zero {axis}" for axis in AXES], "N", known.force_bias_sigma_n, False,
+            lambda pull: {"forces": _alike(pull, np.ones(len(pull.frames)))})
+        add([f"force drift {axis}" for axis in AXES], "N", known.force_drift_sigma_n, False,
+            lambda pull: {"forces": _alike(pull, pull.share)})
+        add([f"bend of the force drift {axis}" for axis in AXES], "N",
+            BEND_OF_DRIFT * known.force_drift_sigma_n, False,
+            lambda pull: {"forces": _alike(pull, 4 * pull.share * (1 - pull.share))})
+        if forward.uses_torque:
+            add([f"torque zero {axis}" for axis in AXES], "N m", known.torque_bias_sigma_nm,
+                False, lambda pull: {"torques": _alike(pull, np.ones(len(pull.frames)))})
+    if forward.watches_pose:
+        add([f"gripper place {axis}" for axis in AXES], "m", known.pose_sigma_m, True,
+            lambda pull: {"grasps": _alike(pull, np.ones(len(pull.frames)))})
+        add([f"gripper turn about {axis}" for axis in AXES], "rad", known.pose_sigma_rad, True,
+            lambda pull: {"grasps": _rotations(pull.frames.poses[:, :3] - pull.pivot)})
+        add(["grasp place along the branch"], "m", known.pose_sigma_m, False,
+            lambda pull: {"grasps": pull.grip_axis[..., None]})
+        add(["slip of the grasp along the branch"], "m", known.slip_sigma_m, False,
+            lambda pull: {"grasps": (pull.share[:, None] * pull.grip_axis)[..., None]})
+    return found
+
+
+def _alike(pull: _Pull, course: np.ndarray) -> np.ndarray:
+    """A course over time on each axis, shape [f, 3, 3]."""
+    return course[:, None, None] * np.eye(3)
+
+
+def _rotations(arms: np.ndarray) -> np.ndarray:
+    """Change of arms [..., 3] by a small turn about each axis, shape [..., 3, 3]."""
+    return np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=-1)
+
+
+def _shifted(pull: _Pull) -> dict[str, np.ndarray]:
+    return {"points": np.broadcast_to(np.eye(3), (*pull.positions.shape, 3))}
+
+
+def _turned(pull: _Pull) -> dict[str, np.ndarray]:
+    middle = pull.positions.mean(axis=(0, 1))
+    return {"points": _rotations(pull.positions - middle)}
+
+
+def _late(pull: _Pull) -> dict[str, np.ndarray]:
+    times = pull.frames.times
+    # Frames at one instant, as those of a settled load, have no speed.
+    if np.any(np.diff(times) <= 0):
+        return {"points": np.zeros((*pull.positions.shape, 1))}
+    return {"points": np.gradient(pull.positions, times, axis=0)[..., None]}
+
+
+def told(nuisances: Sequence[Nuisance], found: Eliminated, free: np.ndarray) -> list[dict]:
+    """Each error with its value, 95 % interval and deviation beforehand, in its own unit.
+
+    Args:
+        nuisances: As eliminated.
+        found: At the fit's end.
+        free: Covariance of the free vector, shape [p, p].
+    """
+    deviation = np.sqrt(np.diag(found.total_covariance(free)))
+    listed = []
+    for nuisance, value, sure in zip(nuisances, found.values, deviation, strict=True):
+        middle, width = value * nuisance.sigma, 1.96 * sure * nuisance.sigma
+        listed.append({"name": nuisance.name, "unit": nuisance.unit, "pull": nuisance.pull,
+                       "value": middle, "interval": [middle - width, middle + width],
+                       "prior_sigma": nuisance.sigma,
+                       "explains_misfit": bool(abs(value) > NAMED * sure
+                                               and abs(value) > NAMED_SHARE)})
+    return listed
+
+
+def in_words(listed: Sequence[dict]) -> list[str]:
+    """A sentence for each error that explains what would be a misfit, largest first."""
+    named = sorted((each for each in listed if each["explains_misfit"]),
+                   key=lambda each: -abs(each["value"] / each["prior_sigma"]))
+    return [_sentence(each) for each in named]
+
+
+def unlikely(listed: Sequence[dict]) -> str | None:
+    """Return in words the error that is far beyond what the cell states, if there is one."""
+    def deviations(each: dict) -> float:
+        return abs(each["value"]) / each["prior_sigma"]
+
+    worst = max(listed, key=deviations, default=None)
+    if worst is None or deviations(worst) <= UNLIKELY:
+        return None
+    scale, unit = _SHOWN[worst["unit"]]
+    whose = f"{worst['pull']}: the" if worst["pull"] else "The"
+    return (f"{whose} {worst['name']} would be {scale * worst['value']:+.2g} {unit} off, "
+            f"{deviations(worst):.0f} deviations of what the pull's [calibration] states: the fit "
+            "may have ended in a wrong place, or the cell is not as it is stated.")
+
+
+_SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "N": (1.0, "N"),
+          "N m": (1.0, "N m"), "s": (1e3, "ms"), "": (100.0, "%")}
+
+
+def _sentence(each: dict) -> str:
+    scale, unit = _SHOWN[each["unit"]]
+    width = scale * (each["interval"][1] - each["value"])
+    whose = f"{each['pull']}: the" if each["pull"] else "The"
+    return (f"{whose} {each['name']} seems {scale * each['value']:+.2g} {unit} off (to within "
+            f"{width:.1g} {unit}; it was allowed for, and is not in the moduli).")

@@ -1,0 +1,493 @@
+"""What an optimiser minimises: differences of simulated and measured, each over its deviation."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from limber.core.errors import Cancelled
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
+from limber.estimation.forward.forward_model import Forward, Simulated
+from limber.estimation.forward.input_force import Response
+from limber.estimation.forward.observed_path import is_watched
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.recordings.synchronisation import Frames
+
+FAILED_OBJECTIVE = 1e12
+"""Objective of parameters under which the simulation finds no equilibrium."""
+SETTLING_ROUNDS = 12
+LONGEST_MOVE = 0.05
+"""So far, over the branch's size, the gripper is moved at once by a change of its force: a branch
+that is led farther along its first answer overshoots."""
+STILL_SETTLING = 0.6
+"""A change of the force that moves the gripper by more than this part of the last one did leads
+nowhere."""
+SETTLED_FORCE_M = 5e-4
+"""Change of the gripper's place by a change of its force at which the force stays."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All pulls under one free vector.
+
+    Attributes:
+        free: Shape [p].
+        residual: Differences over standard deviations, shape [r].
+        jacobian: Its derivative to the free vector, shape [r, p], or None.
+        loss: The paper's J: sum of squared distances of all seen points [m^2].
+        pulls: The simulated pulls as cell and sensors would show them, their errors as fitted.
+        unknown_count: Unknowns of measured input forces, and errors of cell and sensors, that
+            were eliminated from it.
+        errors: These errors; None: there are none.
+    """
+
+    free: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray | None
+    loss: float
+    pulls: tuple[Simulated, ...]
+    unknown_count: int = 0
+    errors: Eliminated | None = None
+
+    @property
+    def objective(self) -> float:
+        """Half the sum of squared residuals."""
+        return 0.5 * float(self.residual @ self.residual)
+
+    @property
+    def mean_square(self) -> float:
+        """Mean squared residual: about 1 where the model fits and the noise is as stated."""
+        freedom = len(self.residual) - len(self.free) - self.unknown_count
+        return 2 * self.objective / max(freedom, 1)
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """The Jacobian of an evaluation with derivatives, shape [r, p].
+
+        Raises:
+            ValueError: it was made without them.
+        """
+        return present(self.jacobian, "derivative of this evaluation")
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviation that each free value has by these derivatives, shape [p]."""
+        _, values, rows = np.linalg.svd(self.slopes, full_matrices=False)
+        spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
+        return np.sqrt(np.sum(spread**2, axis=1))
+
+
+@dataclass(frozen=True)
+class RawSlopes:
+    """Derivatives of a pull's r standardised residuals.
+
+    Attributes:
+        free: To the free vector, shape [r, p].
+        errors: To the errors of cell and sensors, shape [r, k].
+        response: To the unknowns of its force, shape [r, L]; None: it has none.
+        residual: With the errors as fitted, shape [r].
+        kinds: What each residual is of, as a cause of uncertainty; length r.
+    """
+
+    free: np.ndarray
+    errors: np.ndarray
+    response: np.ndarray | None
+    residual: np.ndarray
+    kinds: list[str]
+
+
+class Stopped(Cancelled):
+    """The optimiser was stopped; the evaluation log has the best so far."""
+
+
+class Objective:
+    """Evaluates free vectors, counts forward simulations and keeps each in a log."""
+
+    def __init__(self, forwards: list[Forward], space: ParameterSpace, *,
+                 log: EvaluationLog | None = None, force_sigma: list[float] | None = None,
+                 progress: Progress = SILENT, expected_count: int = 20):
+        self.forwards = forwards
+        self.space = space
+        self.log = log or EvaluationLog(None, "")
+        self.forward_count = 0
+        self.force_sigma = force_sigma or [0.1] * len(forwards)
+        self._progress = progress
+        self._expected = expected_count
+        self._last: Evaluation | None = None
+        self._whitening = [_whitening(forward.frames) for forward in forwards]
+        self._spans: dict[int, tuple[Response, np.ndarray, np.ndarray]] = {}
+        self.cell_errors = CellErrors(forwards)
+
+    def with_space(self, space: ParameterSpace) -> "Objective":
+        """Return an objective on other parameters that goes on with the same log and count."""
+        other = Objective(self.forwards, space, log=self.log, force_sigma=self.force_sigma,
+                          progress=self._progress, expected_count=self._expected)
+        other.forward_count = self.forward_count
+        return other
+
+    def with_forwards(self, forwards: list[Forward]) -> "Objective":
+        """Return an objective of other models of the same pulls; log and count go on."""
+        other = Objective(forwards, self.space, log=self.log, force_sigma=self.force_sigma,
+                          progress=self._progress, expected_count=self._expected)
+        other.forward_count = self.forward_count
+        return other
+
+    def apart(self) -> "Objective":
+        """Return an objective on copies of the pulls with a log of its own: what is tried on it
+        leaves this one as it is."""
+        return Objective([copy.copy(forward) for forward in self.forwards], self.space,
+                         force_sigma=self.force_sigma)
+
+    def forget(self) -> None:
+        """Evaluate anew what was evaluated last: a forward has changed."""
+        self._last = None
+
+    def evaluate(self, free: np.ndarray, *, jacobian: bool = False) -> Evaluation | None:
+        """Simulate all pulls; None where one finds no equilibrium.
+
+        Raises:
+            Stopped: by Ctrl-C or the progress' cancel.
+        """
+        free = np.array(free, float)
+        last = self._last
+        if last is not None and np.array_equal(last.free, free) and (
+                not jacobian or last.jacobian is not None):
+            return last
+        values = self.space.unpack(free)
+        try:
+            found = self._simulated(free, values, jacobian)
+            if last is None or not np.array_equal(last.free, free):
+                # The derivative at a state that is known already is not another simulation.
+                self.forward_count += 1
+                self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
+                             found.loss if found else np.inf)
+            best = present(self.log.best, "evaluation in the log")
+            self._progress(min(self.forward_count / self._expected, 0.99), "fitting",
+                           loss_m2=found.loss if found else np.inf, best_m2=best.loss,
+                           young_mpa=" ".join(f"{young / 1e6:.3g}" for young in values.young),
+                           **_known_so_far(found, self.space))
+        except (KeyboardInterrupt, Cancelled) as stop:
+            raise Stopped("The estimate was stopped.") from stop
+        if found is not None:
+            self._last = found
+        return found
+
+    def standardised(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per pull: residuals over deviations of points [f, m, 3] and force [f, 3]; NaN: none."""
+        return [(self._points(index, simulated), self._forces(index, simulated))
+                for index, simulated in enumerate(evaluation.pulls)]
+
+    def scored(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per pull: standardised residual of each point [f, m] (RMS of axes) and force [f]."""
+        scored = []
+        for index, simulated in enumerate(evaluation.pulls):
+            points = self._points(index, simulated)
+            scored.append((np.sqrt(np.mean(points**2, axis=2)),
+                           np.sqrt(np.mean(self._forces(index, simulated)**2, axis=1))))
+        return scored
+
+    def follow_forces(self, evaluation: Evaluation) -> bool:
+        """Move measured input forces to where an evaluation says they were.
+
+        Returns whether there are any; what was evaluated before is then of another linearisation.
+        """
+        moved = False
+        for index, forward in enumerate(self.forwards):
+            if forward.response is None or forward.watches_pose:
+                continue
+            forward.shift_force(self._force_change(index, evaluation.pulls[index]))
+            moved = True
+        if moved:
+            self.forget()
+        return moved
+
+    def _simulated(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
+        """Simulate all pulls; forces that are unknowns beside a recorded path are settled."""
+        settling = {index: forward for index, forward in enumerate(self.forwards)
+                    if is_watched(forward)}
+        if not settling:
+            return self._compared(free, values, jacobian)
+        left = sum(forward.iteration_limit for forward in settling.values())
+        last, part, longest = np.inf, 1.0, LONGEST_MOVE * max(
+            float(np.linalg.norm(np.ptp(forward.mesh.nodes, axis=0)))
+            for forward in settling.values())
+        for _ in range(SETTLING_ROUNDS):
+            found = self._compared(free, values, False)
+            if found is None:
+                break
+            # Linear in what is left of the way, the comparison has it already.
+            changes = [self._force_change(index, found.pulls[index]) for index in settling]
+            moved = max(forward.moved_by(change)
+                        for forward, change in zip(settling.values(), changes, strict=True))
+            if moved < SETTLED_FORCE_M:
+                found = self._compared(free, values, True) if jacobian else found
+                self.keep_forces()
+                return found
+            left -= sum(forward.iteration_count for forward in settling.values())
+            if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last or left < 0:
+                break
+            last, part = moved, min(1.0, longest / moved)
+            for forward, change in zip(settling.values(), changes, strict=True):
+                forward.shift_force(part * change)
+        # Parameters under which the force finds no rest are too far off: no step there.
+        self.step_back()
+        return None
+
+    def keep_forces(self) -> None:
+        """Remember the forces of pulls that settle; :meth:`step_back` returns to them."""
+        for forward in self.forwards:
+            if is_watched(forward):
+                forward.keep()
+
+    def step_back(self) -> None:
+        """Return to the forces that were kept last."""
+        self._last = None
+        for forward in self.forwards:
+            if is_watched(forward):
+                forward.step_back()
+
+    def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
+        found = [forward.simulate(values, self.space.extra, jacobian) for forward in self.forwards]
+        pulls = [pull for pull in found if pull is not None]
+        return None if len(pulls) < len(found) else self._compare(free, pulls)
+
+    def _force_change(self, index: int, simulated: Simulated) -> np.ndarray:
+        """How the unknowns of a pull's force would have to change to explain its residuals."""
+        columns, triangle = self._span(
+            index, present(self.forwards[index].response, "response of the pull to its force"))
+        residual, _ = self._rows(index, simulated)
+        return -np.linalg.lstsq(triangle, columns.T @ residual, rcond=1e-9)[0]
+
+    def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
+        residuals, jacobians, columns, slopes, unknown_count = [], [], [], [], 0
+        with_errors = self.cell_errors.count > 0
+        for index, simulated in enumerate(pulls):
+            residual, jacobian = self._rows(index, simulated)
+            # What another force would explain is no sign of the moduli.
+            response = self.forwards[index].response
+            span = None if response is None else self._span(index, response)[0]
+            unknown_count += 0 if span is None else span.shape[1]
+            residuals.append(_beside(residual, span))
+            if jacobian is not None:
+                jacobians.append(_beside(jacobian, span))
+            if with_errors:
+                of_errors, by_errors = self._by_errors(index, simulated)
+                columns.append(_beside(by_errors, span))
+                slopes.append(of_errors)
+        residual = np.concatenate(residuals)
+        jacobian = self.on_free(np.vstack(jacobians)) if jacobians else None
+        errors: Eliminated | None = None
+        if with_errors:
+            residual, jacobian, told = eliminated(residual, jacobian, np.vstack(columns))
+            pulls = [_shown(simulated, of_errors, told.values)
+                     for simulated, of_errors in zip(pulls, slopes, strict=True)]
+            errors = told
+            unknown_count += self.cell_errors.count
+        rows, offsets = self.space.own_rows()
+        residual = np.concatenate([residual, rows @ free - offsets])
+        jacobian = None if jacobian is None else np.vstack([jacobian, rows])
+        loss = sum(float(np.sum((pull.positions - forward.frames.positions)[
+            _seen(forward.frames)]**2)) for pull, forward in zip(pulls, self.forwards,
+                                                                strict=True))
+        return Evaluation(free, residual, jacobian, loss, tuple(pulls), unknown_count, errors)
+
+    def raw_slopes(self, evaluation: Evaluation) -> list[RawSlopes]:
+        """Derivatives of each pull's standardised residuals, nothing eliminated.
+
+        Args:
+            evaluation: With derivatives.
+        """
+        found = []
+        for index, (forward, simulated) in enumerate(
+                zip(self.forwards, evaluation.pulls, strict=True)):
+            residual, jacobian = self._rows(index, simulated)
+            seen, force, torque = self._known(index, simulated.torques is not None)
+            kinds = ["noise of the points"] * (3 * int(seen.sum()))
+            kinds += ["noise of the force"] * (3 * sum(
+                int(known.sum()) for known in (force, torque) if known is not None))
+            if forward.compares_grasp:
+                kinds += ["single poses of the gripper"] * (3 * len(forward.frames))
+            errors = (self._by_errors(index, simulated)[1] if self.cell_errors.count
+                      else np.zeros((len(kinds), 0)))
+            response = None
+            if forward.response is not None:
+                span, triangle = self._span(index, forward.response)
+                response = span @ triangle
+            found.append(RawSlopes(
+                self.on_free(present(jacobian, "derivative of this evaluation")), errors, response,
+                residual, kinds))
+        return found
+
+    def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
+                        ) -> np.ndarray:
+        """Change of an evaluation's residuals by S things that change its pulls, shape [r, S].
+
+        Less what unknowns of a force and errors of cell and sensors would explain of it.
+
+        Args:
+            evaluation: With derivatives.
+            changes: Of each pull's predicted measurements.
+        """
+        rows, columns = [], []
+        for index, (piece, simulated, change) in enumerate(zip(
+                self.raw_slopes(evaluation), evaluation.pulls, changes, strict=True)):
+            row = self._standardised_slopes(
+                index, change.points, change.forces,
+                None if simulated.torques is None else change.torques, change.grasps)
+            response = self.forwards[index].response
+            span = None if response is None else self._span(index, response)[0]
+            rows.append(_beside(row, span))
+            columns.append(_beside(piece.errors, span))
+        found = np.vstack(rows)
+        if self.cell_errors.count:
+            _, left, _ = eliminated(np.zeros(len(found)), found, np.vstack(columns))
+            found = present(left, "derivative of the residuals")
+        return np.vstack([found, np.zeros((self.space.own_row_count, found.shape[1]))])
+
+    def _by_errors(self, index: int, simulated: Simulated) -> tuple[ErrorSlopes, np.ndarray]:
+        """What errors of cell and sensors do to a pull, and to its standardised residuals."""
+        found = self.cell_errors.slopes(index, simulated.positions, simulated.forces)
+        torques = None if simulated.torques is None else found.torques
+        return found, self._standardised_slopes(index, found.points, found.forces, torques,
+                                                found.grasps)
+
+    def _rows(self, index: int, simulated: Simulated) -> tuple[np.ndarray, np.ndarray | None]:
+        """Standardised residuals of a pull's points, forces and torques, and their derivative."""
+        seen, force, torque = self._known(index, simulated.torques is not None)
+        forward = self.forwards[index]
+        residual = [self._points(index, simulated)[seen].ravel()]
+        if force is not None:
+            residual.append(self._forces(index, simulated)[force].ravel())
+        if torque is not None:
+            off = simulated.torques - forward.frames.wrenches[:, 3:]
+            residual.append((off / self._torque_sigma(index)[:, None])[torque].ravel())
+        if forward.compares_grasp:
+            off = simulated.grasps - forward.frames.poses[:, :3]
+            residual.append((off / forward.pose_sigma).ravel())
+        if simulated.d_positions is None:
+            return np.concatenate(residual), None
+        return np.concatenate(residual), self._standardised_slopes(
+            index, simulated.d_positions,
+            present(simulated.d_forces, "derivative of the force"), simulated.d_torques,
+            simulated.d_grasps)
+
+    def _standardised_slopes(self, index: int, points: np.ndarray, forces: np.ndarray,
+                             torques: np.ndarray | None, grasps: np.ndarray | None,
+                             ) -> np.ndarray:
+        seen, force, torque = self._known(index, torques is not None)
+        slope = np.einsum("fmij,fmjp->fmip", self._whitening[index], points)
+        rows = [slope[seen].reshape(-1, slope.shape[-1])]
+        if force is not None:
+            slope = forces / self._sigma(index)[:, None, None]
+            rows.append(slope[force].reshape(-1, slope.shape[-1]))
+        if torque is not None:
+            slope = torques / self._torque_sigma(index)[:, None, None]
+            rows.append(slope[torque].reshape(-1, slope.shape[-1]))
+        if self.forwards[index].compares_grasp:
+            slope = present(grasps, "derivative of the grasp's place") / (
+                self.forwards[index].pose_sigma)
+            rows.append(slope.reshape(-1, slope.shape[-1]))
+        return np.vstack(rows)
+
+    def _known(self, index: int, has_torque: bool,
+               ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+        """Which points, forces and torques were measured; None: they are not compared."""
+        forward = self.forwards[index]
+        measured = np.isfinite(forward.frames.wrenches)
+        return (_seen(forward.frames),
+                measured[:, :3].all(axis=1) if forward.uses_force else None,
+                measured[:, 3:].all(axis=1) if has_torque else None)
+
+    def _span(self, index: int, response: Response) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal columns of all that a pull's input force can change, and their triangle."""
+        known = self._spans.get(index)
+        if known is None or known[0] is not response:
+            wrenches = response.wrenches
+            columns = self._standardised_slopes(
+                index, response.points, wrenches[:, :3],
+                wrenches[:, 3:] if wrenches.shape[1] == 6 else None, response.grasps)
+            known = self._spans[index] = (response, *np.linalg.qr(columns))
+        return known[1], known[2]
+
+    def on_free(self, jacobian: np.ndarray) -> np.ndarray:
+        """Derivatives to the free vector from those to the physical parameters, [r, p]."""
+        count = len(self.space.groups)
+        return np.hstack([jacobian[:, :count] @ self.space.membership, jacobian[:, count:]])
+
+    def _points(self, index: int, simulated: Simulated) -> np.ndarray:
+        off = simulated.positions - self.forwards[index].frames.positions
+        return np.einsum("fmij,fmj->fmi", self._whitening[index], off)
+
+    def _forces(self, index: int, simulated: Simulated) -> np.ndarray:
+        off = simulated.forces - self.forwards[index].frames.wrenches[:, :3]
+        return off / self._sigma(index)[:, None]
+
+    def _torque_sigma(self, index: int) -> np.ndarray:
+        forward = self.forwards[index]
+        counts = np.maximum(forward.frames.wrench_counts, 1)
+        return forward.entry.sensor.torque_sigma_nm / np.sqrt(counts)
+
+    def _sigma(self, index: int) -> np.ndarray:
+        counts = np.maximum(self.forwards[index].frames.wrench_counts, 1)
+        return self.force_sigma[index] / np.sqrt(counts)
+
+
+def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Simulated:
+    """Return a pull as cell and sensors with these errors would show it."""
+    def moved(measured: np.ndarray | None, slope: np.ndarray) -> np.ndarray | None:
+        return None if measured is None else measured + slope @ values
+
+    return replace(simulated, positions=simulated.positions + slopes.points @ values,
+                   forces=simulated.forces + slopes.forces @ values,
+                   torques=moved(simulated.torques, slopes.torques),
+                   grasps=moved(simulated.grasps, slopes.grasps))
+
+
+def _beside(rows: np.ndarray, span: np.ndarray | None) -> np.ndarray:
+    """What a force's unknowns, whose orthonormal columns are ``span``, leave of rows."""
+    return rows if span is None else rows - span @ (span.T @ rows)
+
+
+def _seen(frames: Frames) -> np.ndarray:
+    return np.isfinite(frames.positions).all(axis=2)
+
+
+def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, str]:
+    """By which factor each modulus may be wrong (95 %) if the fit ended here."""
+    if found is None or found.jacobian is None:
+        return {}
+    deviations = found.deviations[list(space.groups)]
+    return {"young_factor": " ".join(f"{np.exp(min(1.96 * each, 35.0)):.3g}"
+                                     for each in deviations)}
+
+
+def _whitening(frames: Frames) -> np.ndarray:
+    """Inverse square roots of the covariances, shape [f, m, 3, 3]."""
+    values, vectors = np.linalg.eigh(frames.covariance)
+    return np.einsum("fmij,fmj,fmkj->fmik", vectors, 1 / np.sqrt(values), vectors)
+
+
+def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
+    """RMS distance [m] of points and RMS force error [N] of one pull that a fit did not see."""
+    forward = objective.forwards[index]
+    simulated = forward.simulate(objective.space.unpack(free), (), False)
+    if simulated is None:
+        return np.inf, np.inf
+    simulated = forward.under_readings(simulated)
+    off = (simulated.positions - forward.frames.positions)[_seen(forward.frames)]
+    force = simulated.forces - forward.frames.wrenches[:, :3]
+    force = force[np.isfinite(force).all(axis=1)]
+    return (float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan,
+            float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) if len(force) else np.nan)
+
+
+def without(objective: Objective, index: int) -> Objective:
+    """Return the objective on all pulls but one; it keeps no log."""
+    kept = [k for k in range(len(objective.forwards)) if k != index]
+    return Objective([objective.forwards[k] for k in kept], objective.space,
+                     force_sigma=[objective.force_sigma[k] for k in kept])
+

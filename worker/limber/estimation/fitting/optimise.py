@@ -1,0 +1,262 @@
+"""The optimisers: the paper's Nelder-Mead, and Gauss-Newton with exact sensitivities."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import scipy
+
+from limber.core.errors import WorkError
+from limber.estimation.fitting.objective import FAILED_OBJECTIVE, Evaluation, Objective
+
+FIRST_STEP = 1.5
+"""Longest first step of Gauss-Newton in the space of log E: a factor of 4.5; chosen."""
+OUTLYING = 3.0
+"""Residuals beyond so many standard deviations count linearly in a robust fit."""
+SETTLED_ITERATIONS = 4
+"""So many iterations of Nelder-Mead for each corner of its simplex have to change nothing:
+chosen."""
+SETTLED_FALL = 0.01
+"""Fall of half the squared standardised residuals that is nothing: a seventh of a deviation."""
+SETTLED_STEP = 0.005
+"""Length, in standard deviations, of the step that is still wanted at which Gauss-Newton ends."""
+WANDERING_STEP = 0.1
+"""The same where forces are settled in every simulation: to half a millimetre of the gripper's
+place, which repeats no better, and an end that asks for more wanders. What it leaves adds half a
+percent to the deviation."""
+SHORTEST_STEP = 3e-4
+"""Over the free vector's length, at which it ends where no step leads down."""
+FORCE_ROUNDS = 6
+"""How often the course of a measured input force is linearised anew at most."""
+FORCE_SETTLED = 0.1
+"""Change of a fit, in standard deviations, below which the course is left where it is."""
+
+
+class FitStatus(StrEnum):
+    """How a fit ended; each is its own text.
+
+    converged: by the optimiser's own criterion.
+    out_of_evaluations: no more simulations were allowed.
+    misfit: it settled, but farther from the measurements than was asked for.
+    unconfirmed: a reduced model's fit that the full model could not confirm.
+    stopped: by the user.
+    """
+
+    converged = "converged"
+    out_of_evaluations = "out of evaluations"
+    misfit = "misfit"
+    unconfirmed = "unconfirmed"
+    stopped = "stopped"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where an optimiser ended.
+
+    Attributes:
+        evaluation: The best one, with derivatives where they were asked for.
+        status: How it ended.
+        reason: Why, in words with numbers.
+    """
+
+    evaluation: Evaluation
+    status: FitStatus
+    reason: str
+
+    @property
+    def converged(self) -> bool:
+        return self.status is FitStatus.converged
+
+
+def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
+                 evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
+                 force_rounds: int = FORCE_ROUNDS) -> Fit:
+    """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
+
+    Args:
+        objective: Gives residuals and derivatives.
+        start: Free vector.
+        robust: Residuals beyond ``OUTLYING`` count linearly (``soft_l1``), so that an outlier
+            cannot pull the fit.
+        evaluation_limit: At most so many forward simulations.
+        tolerance: Relative change of cost that ends it.
+        is_near: Whether the start is next to the solution already.
+        force_rounds: How often the course of a measured input force is linearised anew at most.
+
+    Raises:
+        WorkError: no equilibrium at the start.
+    """
+    lower, upper = objective.space.bounds()
+    start = np.clip(start, lower + 1e-6, upper - 1e-6)
+    size = len(_required(objective, start).residual)
+    # scipy takes the length of its first vector for the first step's limit: a change of the
+    # moduli by about a factor of e in all, where log E itself would allow any.
+    shift = start - FIRST_STEP / np.sqrt(len(start))
+
+    def residual(moved: np.ndarray) -> np.ndarray:
+        # Nearly every step is taken, and its derivative is cheapest right after the solve.
+        found = objective.evaluate(moved + shift, jacobian=True)
+        if found is None:
+            # Farther off than anything: the trust region shrinks.
+            return np.full(size, np.sqrt(FAILED_OBJECTIVE / size))
+        return found.residual
+
+    # Far from the solution all residuals are large, and a robust loss would only slow the way.
+    phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
+    if robust and is_near:
+        phases = phases[1:]
+
+    settles = any(forward.watches_pose for forward in objective.forwards)
+    shortest = WANDERING_STEP if settles else SETTLED_STEP
+
+    def minimised(moved: np.ndarray, loss: str, ending: float) -> "scipy.optimize.OptimizeResult":
+        def jacobian(moved: np.ndarray) -> np.ndarray:
+            found = _required(objective, moved + shift)
+            step, length = _wanted_step(found, loss)
+            aim = moved + shift + step
+            if length < shortest and np.all((lower < aim) & (aim < upper)):
+                raise _SettledError(moved)
+            return found.slopes
+
+        try:
+            return scipy.optimize.least_squares(
+                residual, moved, jacobian, bounds=(lower - shift, upper - shift), method="trf",
+                loss=loss, f_scale=OUTLYING, ftol=ending, xtol=SHORTEST_STEP, gtol=1e-12,
+                max_nfev=evaluation_limit)
+        except _SettledError as end:
+            return scipy.optimize.OptimizeResult(
+                x=end.moved, status=1, message="The step that is still wanted is shorter than "
+                f"{shortest:g} standard deviations.")
+
+    moved = start - shift
+    for loss, ending in phases:
+        found = minimised(moved, loss, ending)
+        moved = found.x
+    for _ in range(force_rounds):
+        # Measured input forces are known better now, and so is what they do to the points.
+        if not objective.follow_forces(_required(objective, moved + shift)):
+            break
+        before = _required(objective, moved + shift)
+        found = minimised(moved, *phases[-1])
+        away = before.jacobian @ (found.x - moved)
+        moved = found.x
+        if np.linalg.norm(away) < FORCE_SETTLED:
+            break
+    status = FitStatus.converged if found.status > 0 else FitStatus.out_of_evaluations
+    return Fit(_required(objective, found.x + shift), status, str(found.message))
+
+
+class _SettledError(Exception):
+    """Ends scipy's iteration at ``moved``."""
+
+    def __init__(self, moved: np.ndarray):
+        super().__init__()
+        self.moved = moved
+
+
+def _wanted_step(found: Evaluation, loss: str) -> tuple[np.ndarray, float]:
+    """Return the Gauss-Newton step from an evaluation, shape [p], and its length in standard
+    deviations."""
+    weight = np.ones(len(found.residual))
+    if loss == "soft_l1":
+        weight = (1 + (found.residual / OUTLYING)**2)**-0.25
+    slopes = weight[:, None] * found.slopes
+    step = -np.linalg.lstsq(slopes, weight * found.residual, rcond=None)[0]
+    return step, float(np.linalg.norm(slopes @ step))
+
+
+def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: int = 400,
+                delta_m2: float | None = None, tolerance: float = 1e-3) -> Fit:
+    """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
+
+    It stops when the mean squared error of the points falls below ``delta_m2`` [m^2]; when the
+    error settles, that is no longer falls by what could matter beside the noise; or when the
+    simplex spans less than ``tolerance`` in every log E and in the objective. Settled above
+    ``delta_m2`` is not converged.
+
+    Raises:
+        WorkError: no candidate had an equilibrium.
+    """
+    lower, upper = objective.space.bounds()
+    rule = _Settling(objective, delta_m2)
+    if any(forward.drive == "force" for forward in objective.forwards):
+        # What its errors do to the points is found with the derivatives.
+        _required(objective, start)
+
+    def cost(free: np.ndarray) -> float:
+        known = objective.log.find(free)
+        if known is not None:
+            rule.seen(known.objective, known.loss)
+            return known.objective
+        found = objective.evaluate(free)
+        if found is None:
+            return FAILED_OBJECTIVE
+        rule.seen(found.objective, found.loss)
+        return found.objective
+
+    steps = np.r_[np.full(objective.space.group_count, 0.5),
+                  [0.03 if name == "poisson" else 0.3 for name in objective.space.extra]]
+    simplex = np.vstack([start, start + np.diag(steps)])
+    found = scipy.optimize.minimize(
+        cost, start, method="Nelder-Mead", bounds=list(zip(lower, upper, strict=True)),
+        callback=rule.after_iteration, options={
+            "initial_simplex": np.clip(simplex, lower, upper), "xatol": tolerance,
+            "fatol": tolerance, "maxfev": evaluation_limit, "adaptive": False})
+    return Fit(_required(objective, found.x), *rule.verdict(bool(found.success), evaluation_limit))
+
+
+class _Settling:
+    """The paper's end: the mean squared error of the points settles below a threshold."""
+
+    def __init__(self, objective: Objective, delta_m2: float | None):
+        self._delta = delta_m2
+        self._points = max(sum(int(np.isfinite(f.frames.positions).all(axis=2).sum())
+                               for f in objective.forwards), 1)
+        self._window = SETTLED_ITERATIONS * (objective.space.size + 1)
+        self._best = (np.inf, np.inf)
+        self._course: list[float] = []
+        self._has_settled = False
+
+    @property
+    def _error(self) -> float:
+        """Mean squared distance of the best candidate [m^2]."""
+        return self._best[1] / self._points
+
+    def seen(self, objective: float, loss: float) -> None:
+        self._best = min(self._best, (objective, loss))
+
+    def after_iteration(self, _free: np.ndarray) -> None:
+        self._course.append(self._best[0])
+        if self._delta is not None and self._error < self._delta:
+            raise StopIteration
+        if len(self._course) > self._window:
+            fell = self._course[-1 - self._window] - self._course[-1]
+            self._has_settled = fell <= min(SETTLED_FALL, 1e-3 * self._course[-1])
+        if self._has_settled:
+            raise StopIteration
+
+    def verdict(self, is_small: bool, limit: int) -> tuple[FitStatus, str]:
+        """How it ended, and why."""
+        error = f"the mean squared distance of the points, {self._error:.3g} m2,"
+        if self._delta is not None and self._error < self._delta:
+            return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
+        if not (self._has_settled or is_small):
+            return FitStatus.out_of_evaluations, (
+                f"{limit} simulations were not enough: {error} still falls. Allow more "
+                "(--evaluations), or use --method gauss-newton")
+        if self._delta is None:
+            return FitStatus.converged, f"{error} settled"
+        return FitStatus.misfit, (
+            f"{error} settled above the {self._delta:.3g} m2 asked for (--delta-m2): noise or the "
+            "model's error is larger than that")
+
+
+def _required(objective: Objective, free: np.ndarray) -> Evaluation:
+    found = objective.evaluate(free, jacobian=True)
+    if found is None:
+        values = objective.space.unpack(free)
+        young = ", ".join(f"{value:.3g}" for value in values.young)
+        raise WorkError(f"The simulation finds no equilibrium with E = {young} Pa.",
+                        "The pull may be impossible for this branch (poses out of its reach).",
+                        "Check the grasp point and the poses, or start from another --young.")
+    return found

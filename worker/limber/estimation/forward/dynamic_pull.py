@@ -1,0 +1,132 @@
+"""A fast pull, simulated in time: inertia, damping and what swings on after the gripper stops."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.present import present
+from limber.estimation.forward.force_motion import motion_response
+from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
+from limber.estimation.forward.input_force import Response, nodal_loads
+from limber.estimation.forward.quasi_static import mechanics_names
+from limber.estimation.interpolation_prior import YoungField
+from limber.estimation.parameters import Values
+from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
+from limber.mechanics.materials.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.sensitivities import ParameterSet
+from limber.recordings.recorded_grasp import grasp_on, pose_on
+from limber.recordings.recording import PullEntry
+from limber.recordings.synchronisation import Frames
+
+
+class DynamicForward(Forward):
+    """Simulates one pull by Newmark steps.
+
+    Arguments as for :class:`limber.estimation.forward.quasi_static.QuasiStaticForward`. Every frame
+    counts, none is thinned: motion has no shortcuts.
+    """
+
+    is_dynamic = True
+
+    def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
+                 frames: Frames, rest_points: np.ndarray, *, field: YoungField | None = None):
+        super().__init__(name, entry, frames, rest_points)
+        measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+        if entry.drive == "force" and not measured.all():
+            raise InputError(f"{name}: the force is missing in {np.sum(~measured)} frames.",
+                             "A force-driven motion needs it throughout.", "Use --drive pose.")
+        if self.drive == "force" and entry.grasp.mode == "clamped":
+            raise InputError(
+                f"{name}: the force of a clamped gripper is to drive a motion.",
+                "Such a gripper bends the branch by a torque as well; here only a force drives "
+                "what moves fast.",
+                'Use --drive pose; or set mode = "pinned" under [grasp] of pull.toml if the '
+                "branch could turn.")
+        self._forces = frames.wrenches[:, :3]
+        self._arguments = (name, model, weights, entry)
+        self.weights = weights
+        self.field = field or YoungField(weights)
+        self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._model = under_its_weight(model, entry).gripped(self.grasp)
+        self._operator = point_operator(model.mesh, self.rest_points)
+        # Only the nodes that the observed points hang on need derivatives.
+        self._nodes = np.unique(self._operator.indices // 3)
+        columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        self._near = self._operator[:, columns]
+
+    @property
+    def has_force_unknowns(self) -> bool:
+        return self.drive == "force"
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None:
+        model = self._model.with_parameters(
+            young=self.field.young(values), poisson=values.poisson, density=values.density,
+            damping=RayleighDamping(*values.damping))
+        frames, by_pose = self.frames, self.drive == "pose"
+        drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
+                                     for pose in frames.poses])} if by_pose
+                 else {"grasp_forces": self._forces})
+        wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
+        asked = {"sensitivities": wanted, "sensitivity_nodes": self._nodes} if sensitivities else {}
+        # The same scheme with and without derivatives: one loss, one minimum.
+        result = simulate_dynamics(model, grasp=self.grasp, times=frames.times,
+                                   settings=NewmarkSettings(), **drive, **asked)
+        if not result.converged:
+            return None
+        moved = (self._operator @ result.displacement.reshape(len(frames), -1).T).T
+        positions = self.rest_points + moved.reshape(len(frames), -1, 3)
+        forces = result.reaction_force if by_pose else self._forces
+        if not sensitivities:
+            return Simulated(positions, forces)
+        if self.response is None and not by_pose:
+            self.response = self._response(model)
+        slopes = present(result.sensitivities, "derivative of the motion")
+        count = slopes.displacement.shape[-1]
+        # Damping enters the fit by its logarithm.
+        scale = np.array([*np.ones(len(values.young)), *(
+            {"alpha": values.damping[0], "beta": values.damping[1]}.get(name, 1.0)
+            for name in extra)])
+        flat = slopes.displacement.reshape(len(frames), -1, count)
+        d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
+        d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
+        return Simulated(positions, forces, d_positions * scale, d_forces * scale)
+
+    def until(self, count: int) -> "DynamicForward":
+        """Return the first ``count`` frames, driven by force where that is known.
+
+        Led along a path, a branch of wrong moduli is stretched, and its force is thousandfold;
+        by a force it is merely moved too far.
+        """
+        name, model, weights, entry = self._arguments
+        measured = np.isfinite(self.frames.wrenches[:, :3]).all()
+        if measured and entry.grasp.mode == "pinned":
+            entry = entry.model_copy(update={"drive": "force"})
+        return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points,
+                              field=self.field)
+
+    def led_elsewhere(self, poses: np.ndarray) -> "DynamicForward":
+        name, model, weights, entry = self._arguments
+        return DynamicForward(name, model, weights, entry, replace(self.frames, poses=poses),
+                              self.rest_points, field=self.field)
+
+    def shift_force(self, change: np.ndarray) -> None:
+        self._forces = self._forces + change.reshape(-1, 3)
+        self.response = None
+
+    def under_readings(self, simulated: Simulated) -> Simulated:
+        if self.response is None:
+            return simulated
+        change = (self.frames.wrenches[:, :3] - self._forces).ravel()
+        return replace(simulated, positions=simulated.positions + self.response.points @ change,
+                       forces=np.full_like(simulated.forces, np.nan))
+
+    def _response(self, model: BranchModel) -> Response:
+        loads = nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[0],
+                            model.mesh.nodes, 3)
+        count = len(self.frames)
+        points = motion_response(model, loads, self._operator, self.frames.times)
+        return Response(points, np.eye(3 * count).reshape(count, 3, 3 * count))

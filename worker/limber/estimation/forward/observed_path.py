@@ -1,0 +1,159 @@
+"""A slow pull of a gripper whose recorded path has errors: its force drives, its path is watched.
+
+Held at poses that are a millimetre off, a slender branch is stretched: its force is wrong by its
+stiffness along the axis, thousandfold that of bending, and the moduli with it. The same pull can
+be simulated by its force, an unknown course with its readings as observations (see
+:mod:`limber.estimation.forward.input_force`), and the recorded places of the gripper be
+observations as the points are: with what the calibration leaves open of the gripper's frame. A
+branch answers softly to an error of force, so that all stays well conditioned, and whichever of
+force and path tells more counts more.
+"""
+
+from dataclasses import replace
+from typing import TypeGuard
+
+import numpy as np
+
+from limber.core.present import present
+from limber.estimation.forward.forward_model import Forward, Simulated
+from limber.estimation.forward.input_force import Response
+from limber.estimation.forward.quasi_static import QuasiStaticForward, equal_values
+from limber.estimation.parameters import Values
+
+AT_REST_M = 5e-3
+"""A first pose so near the grasp point is the branch at rest: what the sensor then reads is its
+zero."""
+ROUGH_POSE_M = 5e-3
+"""Deviation of the recorded path in a first fit, where force and gripper frame are taken as they
+were read: without the path the branch beyond the last point might be anything."""
+TANGENT_RADII = 4.0
+SAME_RESPONSE = 0.02
+"""After a smaller change over the branch's size it answers to its force as before."""
+
+
+class WatchedForward(QuasiStaticForward):
+    """Simulates one pose-recorded pull by its force; arguments as of its base class."""
+
+    is_watching = True
+    """False for a first fit by force alone."""
+    _drives_for: Values | None = None
+    """For which values the force was found last."""
+    _good: tuple | None = None
+    """Force, its values, states and response that were kept."""
+
+    @property
+    def drive(self) -> str:
+        return "force"
+
+    @property
+    def watches_pose(self) -> bool:
+        return self.is_watching
+
+    @property
+    def compares_grasp(self) -> bool:
+        return True
+
+    @property
+    def pose_sigma(self) -> float:
+        return super().pose_sigma if self.is_watching else ROUGH_POSE_M
+
+    def set_key_count(self, count: int) -> None:
+        """As of the base class; a force that was kept is kept on the new key frames."""
+        known = None if self._good is None else self.spread @ np.array(self._good[0])
+        super().set_key_count(count)
+        first = self.entry.grasp.point_m - self.frames.poses[0, :3]
+        if known is not None:
+            self._drives = list(known[self.keys])
+        elif np.linalg.norm(first) < AT_REST_M:
+            self._zero[:self._measured.shape[1]] = self._measured[0]
+            self._drives = [drive - self._measured[0] for drive in self._drives]
+        self.keep()
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None:
+        known = self._drives_for
+        if self.is_watching and known is not None and not equal_values(known, values):
+            # At the same places the force goes with the stiffness.
+            factor = np.exp(np.mean(np.log(values.young) - np.log(known.young)))
+            self._drives = [drive * factor for drive in self._drives]
+            self.response = None
+        self._drives_for = values
+        return super().simulate(values, extra, sensitivities)
+
+    def begin_at(self, other: QuasiStaticForward) -> None:
+        """As of the base class, and for the values that the force was found for."""
+        super().begin_at(other)
+        if isinstance(other, WatchedForward):
+            self._drives_for = other._drives_for
+
+    def keep(self) -> None:
+        """Remember force and states; :meth:`step_back` returns to them."""
+        self._good = (list(self._drives), self._drives_for, list(self._memory), self._values,
+                      self.response)
+
+    def step_back(self) -> None:
+        """Return to the force and states kept last, where there are any."""
+        if self._good is not None:
+            drives, self._drives_for, memory, self._values, self.response = self._good
+            self._drives, self._memory, self._hints = list(drives), list(memory), None
+
+    def forget(self) -> None:
+        """Return to the force as it was read, and to no state."""
+        self._good = self._drives_for = None
+        self._memory = [None] * len(self.keys)
+        self.set_key_count(self.key_count)
+
+    def moved_by(self, change: np.ndarray) -> float:
+        """How far the gripper's place moves by a change of the force's unknowns, at most [m]."""
+        response = present(self.response, "response of the pull to its force")
+        moved = (response.grasps @ change).reshape(-1, 3)
+        return float(np.linalg.norm(moved, axis=1).max())
+
+    def shift_force(self, change: np.ndarray) -> None:
+        if not self.is_watching:
+            super().shift_force(change)
+            return
+        response = self.response
+        size = float(np.linalg.norm(np.ptp(self.mesh.nodes, axis=0)))
+        is_small = self.moved_by(change) < SAME_RESPONSE * size
+        super().shift_force(change)
+        if is_small:
+            self.response = response
+
+    def under_readings(self, simulated: Simulated) -> Simulated:
+        return simulated
+
+    def _held(self, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        states = self.states()
+        places = np.array([self.place(state.displacement) for state in states])
+        self.grasp_tangent = self.spread @ np.array(
+            [self._tangent(state.displacement) for state in states])
+        if not sensitivities:
+            return places, None
+        return places, np.array([self.grasp.place_slopes(
+            self.mesh.nodes, state.displacement,
+            present(state.slope, "derivative of a key frame")) for state in states])
+
+    def _response(self, compliances: list[np.ndarray]) -> Response:
+        found = super()._response(compliances)
+        at_keys = np.array([self.grasp.place_slopes(
+            self.mesh.nodes, state.displacement, np.moveaxis(np.asarray(each), 0, -1)).T
+            for state, each in zip(self.states(), self._compliances, strict=True)])
+        grasps = np.einsum("fk,kci->fikc", self.spread, at_keys)
+        return replace(found, grasps=grasps.reshape(*grasps.shape[:2], -1))
+
+    def _tangent(self, displacement: np.ndarray) -> np.ndarray:
+        """Of the branch at the grasp, shape [3]: the longest extent of what is near."""
+        nodes = self.mesh.nodes
+        away = np.linalg.norm(nodes - self.grasp.centre, axis=1)
+        near = away < max(TANGENT_RADII * self.entry.grasp.radius_m, np.sort(away)[30])
+        placed = nodes[near] + displacement[near]
+        axis = np.linalg.svd(placed - placed.mean(axis=0), full_matrices=False)[2][0]
+        outward = placed.mean(axis=0) - nodes[self._model.fixed].mean(axis=0)
+        return axis * np.sign(axis @ outward or 1.0)
+
+
+def is_watched(forward: Forward) -> TypeGuard[WatchedForward]:
+    """Whether the force of a pull is an unknown at present, and its gripper's path an observation.
+    """
+    return isinstance(forward, WatchedForward) and forward.watches_pose

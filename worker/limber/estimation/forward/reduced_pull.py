@@ -1,0 +1,126 @@
+"""A slow pull on the reduced model: a few milliseconds a frame."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.present import present
+from limber.estimation.forward.forward_model import Forward, Simulated
+from limber.estimation.forward.key_frames import key_frames, travel
+from limber.estimation.forward.quasi_static import uses_torque
+from limber.estimation.parameters import Values
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.points import point_operator
+from limber.recordings.recorded_grasp import pose_on
+from limber.recordings.recording import PullEntry
+from limber.recordings.synchronisation import Frames
+from limber.reduced.reduced_model import ReducedModel, ReducedSensitivities, ReducedState
+
+STEPS = {"poisson": 2e-3, "density": 2e-2}
+"""Steps of the central differences for what the reduced model has no derivatives to."""
+
+
+class ReducedForward(Forward):
+    """Simulates one pose-driven pull on the reduced model.
+
+    Args:
+        name: The pull's name.
+        reduced: Reduced model of the branch held at the recorded grasp.
+        mesh: Its mesh.
+        entry: The pull's settings.
+        frames: Aligned frames.
+        rest_points: Observed points at rest [m], shape [m, 3].
+        density: Of the branch that the model was made from [kg/m^3].
+        key_count: Frames that are simulated at most; a spline gives the others.
+
+    Raises:
+        InputError: the pull is driven by force; a reduced model is held at poses.
+    """
+
+    def __init__(self, name: str, reduced: ReducedModel, mesh: TetMesh, entry: PullEntry,
+                 frames: Frames, rest_points: np.ndarray, *, density: float = 900.0,
+                 key_count: int = 100):
+        if entry.drive != "pose" or entry.motion != "quasi_static":
+            raise InputError(f"{name} is {entry.drive}-driven and {entry.motion}.",
+                             "The reduced model is held at poses, slowly.",
+                             "Use the full model for this pull (--forward full).")
+        super().__init__(name, entry, frames, rest_points)
+        self.uses_torque = uses_torque(entry, frames)
+        self.keys, self.spread = key_frames(travel(frames.poses), key_count)
+        self._reduced, self._density = reduced, density
+        columns = reduced.basis.columns.reshape(reduced.size, -1)
+        self._observe = np.asarray(point_operator(mesh, self.rest_points) @ columns.T)
+        self._poses = [pose_on(reduced.grasp, entry.grasp, pose)
+                       for pose in frames.poses[self.keys]]
+        self._states: list[ReducedState | None] = [None] * len(self._poses)
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None:
+        model = self._model(values)
+        moved = {name: [self._model(_shifted(values, name, sign * STEPS[name]))
+                        for sign in (1, -1)] for name in extra if name in STEPS}
+        count = len(values.young)
+        shape = (len(self._poses), len(self.rest_points), 3)
+        positions, forces = np.empty(shape), np.empty((len(self._poses), 6))
+        d_positions = np.zeros((*shape, count + len(extra))) if sensitivities else None
+        d_forces = np.zeros((len(self._poses), 6, count + len(extra))) if sensitivities else None
+        before = None
+        for index, pose in enumerate(self._poses):
+            state = model.solve_static(pose, start=self._states[index] or before)
+            if not state.converged:
+                return None
+            self._states[index] = before = state
+            positions[index] = self._seen(state)
+            # About the recorded grasp point, which the patch's centre lies beside.
+            arm = pose[:3] - self.frames.poses[self.keys[index], :3]
+            forces[index] = _wrench(state, arm)
+            if d_positions is None or d_forces is None:
+                continue
+            slopes = model.sensitivities(state)
+            d_positions[index, ..., :count] = (self._observe @ slopes.coordinates).reshape(
+                *shape[1:], count)
+            d_forces[index, :, :count] = _wrench(slopes, arm)
+            for name, pair in moved.items():
+                column, step = count + extra.index(name), 2 * STEPS[name]
+                ahead, behind = (beside.solve_static(pose, start=state) for beside in pair)
+                if not (ahead.converged and behind.converged):
+                    return None
+                d_positions[index, ..., column] = (self._seen(ahead) - self._seen(behind)) / step
+                d_forces[index, :, column] = (_wrench(ahead, arm) - _wrench(behind, arm)) / step
+        positions, wrenches = (
+            np.tensordot(self.spread, value, axes=1) for value in (positions, forces))
+        d_positions, d_wrenches = (
+            None if value is None else np.tensordot(self.spread, value, axes=1)
+            for value in (d_positions, d_forces))
+        torques = (wrenches[:, 3:], None if d_wrenches is None else d_wrenches[:, 3:])
+        return Simulated(positions, wrenches[:, :3], d_positions,
+                         None if d_wrenches is None else d_wrenches[:, :3],
+                         *(torques if self.uses_torque else (None, None)))
+
+    def displacements(self, frames: np.ndarray) -> list[np.ndarray]:
+        """Nodal displacements [m] at the simulated frames nearest to ``frames``, as of the last
+        simulation.
+        """
+        nearest = [int(np.argmin(np.abs(self.keys - frame))) for frame in frames]
+        return [self._reduced.displacement(present(self._states[index], "state of a key frame"))
+                for index in nearest]
+
+    def _seen(self, state: ReducedState) -> np.ndarray:
+        return self.rest_points + (self._observe @ state.coordinates).reshape(-1, 3)
+
+    def _model(self, values: Values) -> ReducedModel:
+        model = self._reduced.with_young(values.young, values.poisson)
+        return model.with_density(values.density / self._density)
+
+
+def _wrench(of: ReducedState | ReducedSensitivities, arm: np.ndarray) -> np.ndarray:
+    """Force, and torque about a point that lies ``arm`` behind the pose's position."""
+    torque = of.reaction_torque.T + np.cross(arm, of.reaction_force.T)
+    return np.concatenate([of.reaction_force, torque.T])
+
+
+def _shifted(values: Values, name: str, step: float) -> Values:
+    if name == "poisson":
+        return replace(values, poisson=values.poisson + step)
+    return replace(values, density=values.density * float(np.exp(step)))

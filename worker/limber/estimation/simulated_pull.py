@@ -1,0 +1,234 @@
+"""Simulated pulls with a known Young's modulus and sensor noise, where no robot has been.
+
+The truth lives on another mesh than the fit: finer, swept along the axes, of the true geometry
+where the branch was generated. What is known of it goes into ``pull.toml`` under ``truth``, so
+that an estimate can be scored; nothing that estimates reads it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from limber.core.constants import GRAVITY
+from limber.core.errors import InputError, WorkError
+from limber.core.progress import SILENT, Progress
+from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.uncertainty.model_error import refined
+from limber.geometry.cloud.camera import D455, Camera, write_camera
+from limber.geometry.shape_samples import likely_skeletons, reshaped
+from limber.geometry.skeleton.control_points import FRACTIONS, control_points
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.marks import base_nodes
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
+from limber.mechanics.loads.loaded_branch import hang
+from limber.mechanics.materials.materials import RayleighDamping
+from limber.mechanics.materials.young_field import young_weights
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.perception.observe import write_depth
+from limber.perception.simulated_camera import render_depth, with_noise
+from limber.recordings.cell_errors import EXACT
+from limber.recordings.recorded_grasp import grasp_on
+from limber.recordings.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+)
+
+BODY_LIMIT = 25_000
+"""Most tetrahedra of a meshed body's truth: a finer one takes minutes a pull."""
+SHAPE_TRIES = 8
+DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
+"""A gradient like that of the paper's branches, at the stiffness of young wood."""
+
+
+@dataclass(frozen=True)
+class TrueBranch:
+    """What a virtual pull is made with.
+
+    Attributes:
+        mesh: With point data ``fixed``.
+        skeleton: True axes.
+        control_points: [m], shape [K, 3].
+        fractions: Their places on the main path.
+        young: [Pa], shape [K].
+        gravity: In the branch's frame [m/s^2].
+        is_weightless: Whether it has no weight, whatever the settings ask for.
+        is_assumed: Whether its moduli are assumed: the scan is of a branch that nobody pulled.
+    """
+
+    mesh: TetMesh
+    skeleton: Skeleton
+    control_points: np.ndarray
+    fractions: tuple[float, ...]
+    young: np.ndarray
+    gravity: tuple[float, float, float] = GRAVITY
+    is_weightless: bool = False
+    is_assumed: bool = False
+
+
+def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
+                body: TetMesh | None = None, scan: np.ndarray | None = None,
+                fractions: tuple[float, ...] = FRACTIONS,
+                young: Sequence[float] = DEFAULT_YOUNG_PA,
+                gravity: tuple[float, float, float] = GRAVITY) -> TrueBranch:
+    """Return the branch of true axes, on a mesh of its own; the settings' moduli come first.
+
+    Args:
+        body: Tetrahedra of a body that was meshed as it is: it is the truth then, each cut in eight
+            where that stays small, and not the round branch of its axes.
+        scan: The points that the axes were fitted to [m], shape [n, 3]: the branch is another
+            one then that they allow as well (:mod:`limber.geometry.shape_samples`).
+
+    Raises:
+        InputError: not one modulus a control point. WorkError: no other shape can be meshed.
+    """
+    if settings.young:
+        young = settings.young
+        if len(young) != len(fractions):
+            raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
+                             "Each control point needs one.", "Give --young A,B,C,D.")
+    if body is not None:
+        mesh = refined(body) if 8 * body.tet_count <= BODY_LIMIT and body.is_quadratic else body
+    else:
+        # Reconstructed branches have sections four radii apart, of six sides.
+        mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)
+                           ).mesh
+    if scan is not None and body is None:
+        skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng([settings.seed, 2]))
+    mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
+    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
+                      np.array(young, float), gravity)
+
+
+def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random.Generator,
+             ) -> tuple[Skeleton, TetMesh]:
+    """Axes and tetrahedra of a branch that the scan allows as well."""
+    for shape in likely_skeletons(skeleton, scan, SHAPE_TRIES, rng):
+        moved = reshaped(mesh, skeleton, shape)
+        if moved.volumes.min() > 0:
+            return shape, moved
+    raise WorkError(f"None of {SHAPE_TRIES} other shapes that the scan allows can be pulled.",
+                    "The scan leaves so much open that their tetrahedra turn inside out.",
+                    "Scan with less noise, or give --shape fitted.")
+
+
+def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,
+                  progress: Progress = SILENT) -> tuple[Pull, list[np.ndarray]]:
+    """Pull the true branch and measure it; returns the pull and the true displacements [m].
+
+    Raises:
+        InputError: settings that do not go together. WorkError: the branch cannot be pulled so.
+    """
+    rng = np.random.default_rng(settings.seed)
+    model = _model(truth, settings, progress)
+    is_weightless = not (model.gravity.any() and (settings.own_weight or model.hanging))
+    entry = _entry(truth, settings, is_weightless)
+    grasp = grasp_on(truth.mesh, entry.grasp)
+    model = model.gripped(grasp)
+    arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
+    phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
+    made = moved(model, grasp, MotionWanted(
+        kind=_kind(settings), point=np.array(entry.grasp.point_m),
+        axis=np.array(entry.grasp.point_m) - truth.skeleton.nodes[0], travel=settings.reach * arc,
+        turn=settings.turn, phase=phase, times=settings.times,
+        weight=(settings.weight or 0.0) * np.array(truth.gravity)
+        / np.linalg.norm(truth.gravity)), progress=progress)
+    operator = point_operator(truth.mesh, truth.control_points)
+    positions = np.array([truth.control_points + (operator @ displacement.ravel()).reshape(-1, 3)
+                          for displacement in made.displacements])
+    sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
+             for part in (slice(0, 3), slice(3, 6))]
+    wrenches = made.wrenches.copy()
+    count = len(wrenches)
+    wrenches[:, :3] += settings.force_noise * sizes[0] * rng.standard_normal((count, 3))
+    positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
+    stray = rng.random(positions.shape[:2]) < settings.outliers
+    positions[stray] += 0.05 * rng.standard_normal((int(stray.sum()), 3))
+    wrenches[:, 3:] += settings.torque_noise * sizes[1] * rng.standard_normal((count, 3))
+    torque_sigma = max(settings.torque_noise, 2e-3) * sizes[1]
+    entry = entry.model_copy(update={"sensor": SensorEntry(
+        position_sigma_m=max(settings.position_noise, 1e-4),
+        force_sigma_n=max(settings.force_noise, 2e-3) * sizes[0],
+        torque_sigma_nm=torque_sigma if settings.mode == "clamped" and torque_sigma > 0 else None)})
+    observations = None if settings.camera else Observations(settings.times, positions)
+    pull = Pull(name, entry, settings.times, made.poses, wrenches, observations)
+    return pull, made.displacements
+
+
+def _model(truth: TrueBranch, settings: VirtualPullSettings,
+           progress: Progress) -> BranchModel:
+    weights = young_weights(truth.mesh, truth.control_points)
+    has_weight = settings.gravity and not truth.is_weightless
+    model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
+                        density=settings.density, gravity=truth.gravity if has_weight else None,
+                        damping=RayleighDamping(*settings.damping))
+    return model if settings.own_weight else hang(model, progress=progress).model
+
+
+def _kind(settings: VirtualPullSettings,
+          ) -> Literal["pull", "turned", "shake", "release", "weight"]:
+    if settings.weight is not None:
+        if settings.motion == "dynamic":
+            raise InputError("A weight that is hung on in motion.",
+                             "A hung weight is a slow pull that its force drives.",
+                             "Leave --weight or --motion dynamic out.")
+        return "weight"
+    if settings.motion == "dynamic":
+        return "release" if settings.drive == "force" else "shake"
+    return "turned" if settings.mode == "clamped" and settings.drive == "pose" else "pull"
+
+
+def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) -> PullEntry:
+    point = truth.skeleton.point_at(settings.grasp_fraction)
+    radius = truth.skeleton.radius_at(settings.grasp_fraction)
+    known = {"young_pa": truth.young.tolist(), "poisson": settings.poisson,
+             "density": settings.density, "damping": list(settings.damping),
+             "fractions": list(truth.fractions),
+             "control_points_m": truth.control_points.tolist(),
+             "tet_count": truth.mesh.tet_count, "seed": settings.seed,
+             "assumed": truth.is_assumed}
+    return PullEntry(
+        observation="depth" if settings.camera else "markers",
+        drive="force" if settings.weight is not None else settings.drive,
+        motion=settings.motion, calibration=EXACT,
+        gravity_m_s2=truth.gravity if settings.own_weight and not is_weightless else None,
+        weightless=is_weightless,
+        grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
+                         mode=settings.mode),
+        rest_points_m=None if settings.camera else tuple(
+            tuple(map(float, p)) for p in truth.control_points),
+        source="limber virtual-pull", truth=known)
+
+
+def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, displacements: list[np.ndarray],
+                        settings: VirtualPullSettings) -> None:
+    """Write what a D455 would see of a pull's states: ``depth/`` and ``camera.toml``."""
+    camera = viewing(truth.mesh.nodes, displacements)
+    write_camera(folder / "camera.toml", camera)
+    (folder / "depth").mkdir(exist_ok=True)
+    faces = truth.mesh.surface_faces()
+    rng = np.random.default_rng([settings.seed, 1])
+    for time, displacement in zip(pull.times, displacements, strict=True):
+        depth = render_depth(camera, truth.mesh.nodes + displacement, faces)
+        write_depth(folder / "depth" / f"{time:.6f}.png", with_noise(camera, depth, rng), camera)
+
+
+def viewing(nodes: np.ndarray, displacements: list[np.ndarray], distance: float = 1.0) -> Camera:
+    """Return a D455 that sees all of a motion from ``distance`` [m], across its main extent."""
+    everything = np.vstack([nodes + moved for moved in displacements])
+    middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    _, _, axes = np.linalg.svd(everything - middle, full_matrices=False)
+    # The direction in which the motion spreads least: nothing hides behind anything else.
+    across = axes[2] * [1.0, 1.0, 0.0]
+    if np.linalg.norm(across) < 0.3:
+        across = np.array([0.0, -1.0, 0.0])
+    across = across / np.linalg.norm(across)
+    return D455.looking(eye=middle + distance * across, target=middle)

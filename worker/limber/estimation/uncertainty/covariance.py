@@ -1,0 +1,212 @@
+"""How sure an estimate is: covariance and intervals, and which measurements do not fit."""
+
+from dataclasses import dataclass
+from typing import TypedDict
+
+import numpy as np
+import scipy
+
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.recordings.cell_errors import calibration_of
+
+OUTLIER = 4.5
+"""Standardised residual (RMS over axes) from which a measurement is named an outlier: chosen,
+far beyond normal noise."""
+OUTLIER_SHARE = 0.15
+"""Above this share of residuals far off, the others are not the truth about the noise: chosen."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Of the free vector and of the moduli.
+
+    Attributes:
+        covariance: Of the free vector, shape [p, p].
+        young_interval: 95 % intervals at the control points [Pa], shape [K, 2].
+        variance_factor: Mean squared residual over the one expected; 1 where the noise is as
+            stated.
+        correlation: Of the free vector, shape [p, p].
+        repetition: How many frames in a row say the same thing: 1 where their errors are
+            independent.
+        recording_spread: Standard deviation of log E, all alike, from recording to recording.
+        quantile: How many deviations the half width of a 95 % interval has (Student's t).
+    """
+
+    covariance: np.ndarray
+    young_interval: np.ndarray
+    variance_factor: float
+    correlation: np.ndarray
+    repetition: float = 1.0
+    recording_spread: float = 0.0
+    quantile: float = 1.96
+
+
+def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
+    """Gauss' approximation at the fit's end.
+
+    The stated noise is scaled by what the residuals show, each kind of residual weighing as in
+    the fit; a robust share of the residuals is used, so that outliers do not widen the interval.
+    Errors that last from frame to frame, as those of points found in depth images do, do not
+    average out: the covariance grows by how many frames repeat each other. What the mesh gets
+    wrong is not in it (:mod:`limber.estimation.uncertainty.model_error`).
+    """
+    # Priors and links are no measurements: neither do they tell the noise, nor does its scale act
+    # on them.
+    count = len(evaluation.residual) - objective.space.own_row_count
+    jacobian, residual = evaluation.slopes[:count], evaluation.residual[:count]
+    freedom = max(len(residual) - jacobian.shape[1] - evaluation.unknown_count, 1)
+    # Huber's proposal: residuals beyond 3 deviations count as 3. Where they are many they are no
+    # outliers, but a model that does not fit.
+    limit = 3 * _scale(residual)
+    stray = float(np.mean(np.abs(residual) > 1.5 * limit))
+    clipped = np.clip(residual, -limit, limit) if stray < OUTLIER_SHARE else residual
+    factor = float(clipped @ clipped / freedom)
+    if _from_images(objective):
+        # Their stated error lasts from frame to frame: that residuals scatter less is no sign
+        # that it is smaller.
+        factor = max(factor, 1.0)
+    repetition = repeated(objective.standardised(evaluation))
+    covariance = inverse_information(scaled_rows(evaluation.slopes, objective.space.own_row_count,
+                                                 factor * repetition))
+    from_recording = recording_spread(evaluation, objective, factor * repetition)
+    together = np.zeros(len(covariance))
+    together[:objective.space.group_count] = 1.0
+    covariance += np.outer(together, together) * from_recording**2 / len(objective.forwards)
+    deviation = np.sqrt(np.diag(covariance))
+    quantile = float(scipy.special.stdtrit(freedom, 0.5 + level / 2))
+    width = quantile * deviation
+    space = objective.space
+    # Wider than 30 orders of magnitude says no more than that nothing is known.
+    width = np.minimum(width, 70.0)
+    centre = evaluation.free
+    low, high = space.unpack(centre - width), space.unpack(centre + width)
+    bounds = np.exp(space.bounds()[0][0]), np.exp(space.bounds()[1][0])
+    interval = np.clip(np.column_stack([low.young, high.young]), *bounds)
+    return Uncertainty(covariance, interval, factor,
+                       covariance / np.maximum(np.outer(deviation, deviation), 1e-300), repetition,
+                       from_recording, quantile)
+
+
+def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarray:
+    """Standardised residuals, or their slopes, with the noise that they show themselves.
+
+    Args:
+        rows: As of an evaluation; the last are priors and links, which stay.
+        own_row_count: How many these are.
+        scale: Variance of what was measured over the stated.
+    """
+    scaled, count = rows.copy(), len(rows) - own_row_count
+    scaled[:count] /= np.sqrt(max(scale, 1e-300))
+    return scaled
+
+
+def inverse_information(slopes: np.ndarray) -> np.ndarray:
+    """Covariance of the free vector from slopes [r, p] of residuals of unit variance, [p, p]."""
+    _, values, rows = np.linalg.svd(slopes, full_matrices=False)
+    spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
+    return spread @ spread.T
+
+
+def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:
+    """Standard deviation of log E, all alike, from recording to recording.
+
+    Each pull alone asks for a step of the common scale, known to within its own noise; by how much
+    more these steps differ is the spread (DerSimonian and Laird's random effect). Few pulls tell
+    it badly: what the calibration says of it counts as one further recording.
+
+    Args:
+        scale: Variance of what was measured over the stated.
+    """
+    stated = float(np.mean([calibration_of(forward.entry).repeat_sigma
+                            for forward in objective.forwards]))
+    count = len(objective.forwards)
+    if count < 2 or stated == 0.0:
+        return stated
+    steps, variances = [], []
+    group_count = objective.space.group_count
+    for piece in objective.raw_slopes(evaluation):
+        others = [piece.errors] + ([] if piece.response is None else [piece.response])
+        taken = np.vstack([np.hstack(others), np.eye(piece.errors.shape[1], sum(
+            each.shape[1] for each in others))])
+        basis = np.linalg.qr(taken)[0]
+        along, off = (np.concatenate([each, np.zeros(piece.errors.shape[1])]) for each in (
+            piece.free[:, :group_count].sum(axis=1), piece.residual))
+        along, off = (each - basis @ (basis.T @ each) for each in (along, off))
+        information = float(along @ along)
+        if information > 0:
+            steps.append(-float(along @ off) / information)
+            variances.append(scale / information)
+    if len(steps) < 2:
+        return stated
+    weights = 1 / np.array(variances)
+    mean = np.average(steps, weights=weights)
+    excess = float(weights @ (np.array(steps) - mean)**2) - (len(steps) - 1)
+    between = max(excess, 0.0) / (weights.sum() - (weights**2).sum() / weights.sum())
+    return float(np.sqrt((stated**2 + (len(steps) - 1) * between) / len(steps)))
+
+
+def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Integrated autocorrelation of residuals over the frames, all points and axes together.
+
+    1 + 2 sum of the correlations at growing lags, up to the first that is lost in its own noise,
+    or lies well past what is found so far (Sokal's estimate of how many samples of a sequence are
+    worth one independent sample).
+
+    Args:
+        series: Per pull, residuals of points [f, m, 3] and of force [f, 3], NaN where none.
+    """
+    product, count = np.zeros(0), np.zeros(0)
+    for points, forces in series:
+        columns = np.hstack([points.reshape(len(points), -1), forces])
+        # An outlier would hide the correlation of all others.
+        columns = np.clip(columns, -4.0, 4.0)
+        known = np.isfinite(columns)
+        values = np.where(known, columns, 0.0)
+        lags = len(columns) // 2
+        product, count = (np.pad(a, (0, max(lags - len(a), 0))) for a in (product, count))
+        for lag in range(lags):
+            product[lag] += np.sum(values[:len(values) - lag] * values[lag:])
+            count[lag] += np.sum(known[:len(known) - lag] & known[lag:])
+    if len(product) < 3 or product[0] <= 0:
+        return 1.0
+    correlation = product / product[0]
+    total = 1.0
+    for lag in range(1, len(correlation)):
+        if correlation[lag] < 2.0 / np.sqrt(count[lag]) or lag > 2.5 * total:
+            break
+        total += 2.0 * correlation[lag]
+    return float(total)
+
+
+class Outlier(TypedDict):
+    """A measurement that does not fit: of which pull, when [s], of what, by how many deviations."""
+
+    pull: str
+    time_s: float
+    what: str
+    deviations: float
+
+
+def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> list[Outlier]:
+    """Name the measurements that do not fit, worst first: pull, time, point or force, deviations.
+    """
+    found: list[Outlier] = []
+    for forward, (points, forces) in zip(objective.forwards, objective.scored(evaluation),
+                                         strict=True):
+        for frame, point in np.argwhere(points > OUTLIER):
+            found.append({"pull": forward.name, "time_s": float(forward.frames.times[frame]),
+                          "what": f"point {point + 1}",
+                          "deviations": float(points[frame, point])})
+        if forward.uses_force:
+            for frame in np.flatnonzero(forces > OUTLIER):
+                found.append({"pull": forward.name, "time_s": float(forward.frames.times[frame]),
+                              "what": "force", "deviations": float(forces[frame])})
+    return sorted(found, key=lambda entry: -entry["deviations"])[:limit]
+
+
+def _from_images(objective: Objective) -> bool:
+    return any(forward.entry.observation in ("depth", "clouds") for forward in objective.forwards)
+
+
+def _scale(residual: np.ndarray) -> float:
+    return max(1.4826 * float(np.median(np.abs(residual))), 1e-12)

@@ -1,0 +1,104 @@
+"""What a pull can tell and what not, before anything is fitted to it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.estimation.fitting.objective import Evaluation
+from limber.estimation.parameters import ParameterSpace
+
+UNRESOLVED_DEVIATION = 0.5
+"""A modulus whose logarithm has a larger standard deviation is linked to its neighbour: chosen."""
+SCALE_DEVIATION = 0.7
+"""The data must give the scale of all moduli together better than this (in its logarithm): a
+factor of two, chosen."""
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Singular values of the sensitivity matrix, and what follows from them.
+
+    Attributes:
+        singular_values: Of the derivative of the standardised residuals to the free vector,
+            largest first, shape [p].
+        deviations: Standard deviation that each free value would have, shape [p].
+        scale_deviation: That of the common scale of all moduli.
+    """
+
+    singular_values: np.ndarray
+    deviations: np.ndarray
+    scale_deviation: float
+
+
+def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiability:
+    """Judge the data at an evaluation with derivatives."""
+    jacobian = evaluation.slopes
+    values = np.linalg.svd(jacobian, compute_uv=False)
+    together = np.r_[np.ones(space.group_count), np.zeros(space.size - space.group_count)]
+    # Of the scale with the ratios known: the best that the data can do for it.
+    information = float(np.sum((jacobian @ together)**2))
+    return Identifiability(values, evaluation.deviations,
+                           float(information**-0.5) if information > 0 else np.inf)
+
+
+def require_scale(found: Identifiability) -> None:
+    """Refuse data that leave the overall scale of Young's modulus open.
+
+    Raises:
+        InputError: with the reason.
+    """
+    if found.scale_deviation <= SCALE_DEVIATION:
+        return
+    raise InputError(
+        "These pulls do not determine the overall scale of Young's modulus: multiplying every "
+        f"modulus by 2 would change what was measured by {0.7 / found.scale_deviation:.1g} "
+        "standard deviations.",
+        "A branch that is moved slowly, without measured force and without weight or inertia in "
+        "play, takes the same shape whether it is soft or stiff: a fit would look perfect with "
+        "every modulus wrong.",
+        "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 in pull.toml, "
+        "--motion dynamic).")
+
+
+def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
+                    ) -> tuple[ParameterSpace, list[str]]:
+    """Link control points that the data leave open to a neighbour, as neighbours on branches are.
+
+    A link is no equality: the two may differ by a factor of ten, and the interval says so. With
+    an equality the modulus of the neighbour would be wrong as well, and both be thought sure.
+    The worst-determined modulus is linked to the neighbour that is known better, until all others
+    are resolved. Returns the space, with a sentence for each link.
+
+    Args:
+        evaluation: With derivatives; its last rows are those of the space's links.
+    """
+    rows = evaluation.slopes[:len(evaluation.slopes) - len(space.links)]
+    links: list[tuple[int, int]] = []
+    messages = []
+    while len(links) < space.group_count - 1:
+        own = space.linked(tuple(links)).link_rows()
+        deviations = _deviations(np.vstack([rows, own]))[:space.group_count]
+        open_ones = deviations.copy()
+        open_ones[[group for group, _ in links]] = 0.0
+        worst = int(np.argmax(open_ones))
+        if open_ones[worst] <= UNRESOLVED_DEVIATION:
+            break
+        beside = [k for k in (worst - 1, worst + 1)
+                  if 0 <= k < space.group_count and (k, worst) not in links]
+        if not beside:
+            break
+        partner = min(beside, key=lambda k: deviations[k])
+        links.append((worst, partner))
+        messages.append(
+            f"{space.names[worst]} cannot be told well from these pulls (its logarithm only to "
+            f"within {min(deviations[worst], 99.0):.1f}): that it lies within a factor of ten of "
+            f"{space.names[partner]} was added. Pull at a point farther out, drive by the pose, "
+            "or let gravity bend the tip, to tell it.")
+    return space.linked(tuple(links)), messages
+
+
+def _deviations(jacobian: np.ndarray) -> np.ndarray:
+    _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
+    spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
+    return np.linalg.norm(spread, axis=1)

@@ -1,0 +1,89 @@
+"""What the gripper's frame leaves open where its path leads a fit, carried to Young's modulus.
+
+Where the force leads, the gripper's frame is an unknown of the fit
+(:mod:`limber.estimation.fitting.nuisances`). Where the recorded path leads (no force, or of a
+clamped grasp no torque; asked for; a fast pull; a reduced model) the branch is held where the
+record says. How
+the pull would differ with the frame a little aside, the fit would have taken up in the moduli.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.forward.forward_model import Forward
+from limber.recordings.cell_errors import CalibrationEntry, calibration_of
+
+STEP = 0.1
+"""Part of its deviation by which the frame is moved: a slender branch, stretched by all of it,
+would answer far from linearly."""
+WIDEST = 35.0
+"""Deviation of a log E that says no more than that nothing is known."""
+
+
+def led_by_path(forwards: Sequence[Forward]) -> list[Forward]:
+    """The pulls whose path leads and whose gripper frame may be off."""
+    return [forward for forward in forwards if forward.drive == "pose" and (
+        calibration_of(forward.entry).pose_sigma_m > 0
+        or calibration_of(forward.entry).pose_sigma_rad > 0)]
+
+
+def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
+    """Relative standard deviation of E at the control points from the gripper's frame, shape [K].
+
+    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr for each of the frame's
+    six errors, of its deviation in the calibration.
+
+    Args:
+        evaluation: At the fit's end.
+        objective: What was minimised.
+
+    Returns:
+        None where a simulation finds no equilibrium.
+    """
+    known = {calibration_of(forward.entry): np.array(forward.entry.grasp.point_m)
+             for forward in reversed(led_by_path(objective.forwards))}
+    base = _evaluated(evaluation, objective, [forward.led_elsewhere(forward.frames.poses)
+                                              for forward in objective.forwards], jacobian=True)
+    if base is None:
+        return None
+    changes = []
+    for calibration, pivot in known.items():
+        for error in range(6):
+            if (calibration.pose_sigma_m, calibration.pose_sigma_rad)[error // 3] == 0:
+                continue
+            moved = [forward.led_elsewhere(
+                _aside(forward.frames.poses, calibration, pivot, error)
+                if forward.drive == "pose" and calibration_of(forward.entry) == calibration
+                else forward.frames.poses) for forward in objective.forwards]
+            found = _evaluated(evaluation, objective, moved)
+            if found is None:
+                return None
+            changes.append((found.residual - base.residual) / STEP)
+    steps = np.linalg.lstsq(base.slopes, np.array(changes).T, rcond=1e-9)[0]
+    groups = list(objective.space.groups)
+    return np.minimum(np.linalg.norm(steps[groups], axis=1), WIDEST)
+
+
+def _aside(poses: np.ndarray, calibration: CalibrationEntry, pivot: np.ndarray,
+           error: int) -> np.ndarray:
+    """Poses [m, rad], shape [f, 6], with the frame moved or turned about the grasp at rest."""
+    moved = poses.copy()
+    if error < 3:
+        moved[:, error] += STEP * calibration.pose_sigma_m
+        return moved
+    turn = Rotation.from_rotvec(STEP * calibration.pose_sigma_rad * np.eye(3)[error - 3])
+    moved[:, :3] = pivot + turn.apply(poses[:, :3] - pivot)
+    moved[:, 3:] = (turn * Rotation.from_rotvec(poses[:, 3:])).as_rotvec()
+    return moved
+
+
+def _evaluated(evaluation: Evaluation, objective: Objective, forwards: list[Forward], *,
+               jacobian: bool = False) -> Evaluation | None:
+    alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
+    # A force with errors of its own is eliminated by its response, which comes with derivatives.
+    linearised = any(forward.has_force_unknowns and not forward.watches_pose
+                     for forward in forwards)
+    return alone.evaluate(evaluation.free, jacobian=jacobian or linearised)

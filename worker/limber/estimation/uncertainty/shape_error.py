@@ -1,0 +1,77 @@
+"""What a scan leaves open of shape and hung mass, carried to Young's modulus through the pulls.
+
+Branches as likely as the fitted one (:mod:`limber.geometry.shape_samples`) are pulled as the branch
+was, with the moduli found. By how much their points and forces differ, to first order, the fit
+would have taken up in the moduli: that is how far off these may be. Errors of neighbouring places,
+of axis and radius, and of several moduli go together as they do in the scan.
+"""
+
+import numpy as np
+import scipy
+
+from limber.core.progress import SILENT, Progress
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.uncertainty.path_error import WIDEST
+from limber.estimation.uncertainty.shape_sensitivity import hung_slopes, shape_slopes, taken_up
+from limber.geometry.shape_samples import likely_skeletons, reshaped
+from limber.mechanics.added_masses import HungTwig
+
+FEWEST = 8
+"""Fewer shapes do not tell how far shapes spread."""
+
+
+def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
+                points: np.ndarray, count: int, *, seed: int = 0,
+                progress: Progress = SILENT) -> np.ndarray | None:
+    """Relative standard deviation of E at the control points from axis and radii, shape [K].
+
+    Root mean square over the shapes of what the fit would have taken up, times Student's quantile
+    over the normal one since they are few.
+
+    Args:
+        evaluation: At the fit's end.
+        objective: What was minimised.
+        subject: The branch that was fitted.
+        points: Its scan [m], shape [m, 3].
+        count: How many shapes.
+        seed: Of the shapes.
+        progress: Called as it goes.
+
+    Returns:
+        None where shapes are too few, or as :func:`taken_up`.
+    """
+    if count < FEWEST:
+        return None
+    progress(0.0, "other shapes that the scan allows")
+    meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in likely_skeletons(
+        subject.skeleton, points, count, np.random.default_rng(seed))]
+    steps = taken_up(evaluation, objective,
+                     lambda forward, values: shape_slopes(forward, values, meshes))
+    if steps is None:
+        return None
+    spread = np.sqrt(np.mean(steps**2, axis=1))
+    student, normal = scipy.special.stdtrit(count, 0.975), scipy.special.ndtri(0.975)
+    return np.minimum(spread * student / normal, WIDEST)
+
+
+def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
+    """Relative standard deviation of E from the mass of twigs and leaves beside the mesh, [K].
+
+    Args:
+        evaluation, objective: As of :func:`shape_error`.
+        sigma: Relative standard deviation of that mass, all alike.
+
+    Returns:
+        None where nothing hangs on the branch or nothing weighs, or as :func:`taken_up`.
+    """
+    models = [forward.full.model for forward in objective.forwards
+              if isinstance(forward.full, QuasiStaticForward)]
+    # Masses that somebody stated are known; twigs' and leaves' are those of their volume.
+    if not sigma or not any(
+            model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)
+            for model in models):
+        return None
+    steps = taken_up(evaluation, objective, hung_slopes)
+    return None if steps is None else np.minimum(sigma * np.abs(steps[:, 0]), WIDEST)

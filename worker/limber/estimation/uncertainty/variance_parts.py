@@ -1,0 +1,134 @@
+"""Where the uncertainty of a modulus comes from, in parts that add up to its variance.
+
+With the information of all that was measured or known beforehand in rows J, the covariance is
+C = (J^T J)^-1, and C = sum over groups of rows of C J_g^T J_g C: each group's part is what its
+errors, passed through the fit, do to the result. The zero of a force sensor, unknown, costs what
+the fit has to spend to find it; that too is in the part of what it was found from.
+"""
+
+from dataclasses import dataclass
+from typing import TypedDict
+
+import numpy as np
+
+from limber.estimation.fitting.objective import Evaluation, Objective
+
+ADVICE = {
+    "noise of the points": "more frames, more pulls, or markers that are seen better",
+    "noise of the force": "a larger pull, or a slower one with more readings",
+    "single poses of the gripper": "more pulls",
+    "gripper frame": "calibrate the gripper's frame against the branch's (hand-eye), and state "
+                     "the deviation under [calibration] of pull.toml",
+    "force gain": "check the sensor with a known weight",
+    "zero of the force": "tare before each pull, and state it under [calibration]",
+    "camera frame": "register the camera to the branch (fixed markers), or add a second view",
+    "clock": "record all on one clock",
+    "slip of the grasp": "clamp without slip, or put a marker at the grasp",
+    "form of the modulus between the control points": "markers at more places along the branch, "
+                                                      "or a pull at another point",
+    "Poisson's ratio": "no pull tells it; give it (--poisson, --poisson-sigma)",
+    "density": "weigh a piece of the branch (--density, --density-sigma)",
+    "moduli that the pulls leave open": "pull at a point farther out",
+    "shape of the scan": "a scan from more sides, or with less noise",
+    "mass of twigs and leaves": "weigh what hangs on the branch, and state it "
+                                "(--hung-sigma); or mesh more twigs (--twig-radius of reconstruct)",
+    "length in the gripper": "measure it, and state it under [grasp] (radius_m: its half) and "
+                             "[calibration] (held_length_sigma_m) of pull.toml",
+    "mesh": "a finer mesh (--mesh-spacing of reconstruct)",
+    "clamp": "scan farther down, so that the clamped place is known",
+}
+"""What would narrow an interval, by cause."""
+
+_GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
+           ("grasp place", "gripper frame"), ("slip", "slip of the grasp"),
+           ("force gain", "force gain"), ("force", "zero of the force"),
+           ("bend of the force", "zero of the force"), ("torque", "zero of the force"),
+           ("form", "form of the modulus between the control points"),
+           ("poisson", "Poisson's ratio"), ("density", "density"))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    cause: str
+    rows: np.ndarray
+
+
+def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 1.0,
+                   ) -> dict[str, np.ndarray]:
+    """Part of each cause in the variance of log E at the control points, each of shape [K].
+
+    Args:
+        evaluation: At the fit's end, with derivatives.
+        objective: What was minimised.
+        scale: Variance of what was measured over the stated.
+    """
+    rows = _information(evaluation, objective, scale)
+    everything = np.vstack([each.rows for each in rows])
+    _, values, axes = np.linalg.svd(everything, full_matrices=False)
+    spread = axes.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
+    covariance = spread @ spread.T
+    wanted = covariance[list(objective.space.groups)]
+    parts: dict[str, np.ndarray] = {}
+    for each in rows:
+        part = np.sum((wanted @ each.rows.T)**2, axis=1)
+        parts[each.cause] = parts.get(each.cause, 0.0) + part
+    return parts
+
+
+class Cause(TypedDict):
+    """What makes up part of the moduli's variance; see :func:`largest`."""
+
+    cause: str
+    share: float
+    deviation: float
+    advice: str
+
+
+def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
+    """The causes that make up most of the variance over all moduli, with what would shrink each.
+
+    Each with ``cause``, ``share`` of the variance (mean over the moduli), ``deviation`` (largest
+    standard deviation of a log E by it) and ``advice``.
+    """
+    total = np.sum(list(parts.values()), axis=0)
+    share = {cause: float(np.mean(part / np.maximum(total, 1e-300)))
+             for cause, part in parts.items()}
+    order = sorted(parts, key=lambda cause: -share[cause])[:count]
+    return [{"cause": cause, "share": share[cause],
+             "deviation": float(np.sqrt(np.max(parts[cause]))), "advice": ADVICE[cause]}
+            for cause in order if share[cause] > 0.01]
+
+
+def cause_of(name: str) -> str:
+    """The cause that an unknown belongs to, by its name."""
+    return next(cause for start, cause in _GROUPS if name.startswith(start))
+
+
+def _information(evaluation: Evaluation, objective: Objective, scale: float,
+                 ) -> list[_Rows]:
+    """Rows of all unknowns together: free vector, errors, and each pull's course of the force."""
+    space, count = objective.space, objective.cell_errors.count
+    pieces = objective.raw_slopes(evaluation)
+    unknowns = [0 if piece.response is None else piece.response.shape[1] for piece in pieces]
+    width = space.size + count + sum(unknowns)
+    rows, start = [], space.size + count
+    for piece, unknown in zip(pieces, unknowns, strict=True):
+        block = np.zeros((len(piece.free), width))
+        block[:, :space.size] = piece.free
+        block[:, space.size:space.size + count] = piece.errors
+        if unknown:
+            block[:, start:start + unknown] = piece.response
+        start += unknown
+        block /= np.sqrt(scale)
+        kinds = np.array(piece.kinds)
+        rows += [_Rows(kind, block[kinds == kind]) for kind in dict.fromkeys(piece.kinds)]
+    for number, nuisance in enumerate(objective.cell_errors.nuisances):
+        row = np.zeros((1, width))
+        row[0, space.size + number] = 1.0
+        rows.append(_Rows(cause_of(nuisance.name), row))
+    own, _ = space.own_rows()
+    causes = [cause_of(name) for name, _, _ in space.priors]
+    causes += ["moduli that the pulls leave open"] * len(space.links)
+    for cause, row in zip(causes, own, strict=True):
+        rows.append(_Rows(cause, np.r_[row, np.zeros(width - space.size)][None]))
+    return rows

@@ -1,0 +1,1 @@
+"""Young's modulus and damping from vibrations: free swings and ringing."""

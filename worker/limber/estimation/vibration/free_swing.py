@@ -1,0 +1,416 @@
+"""Young's modulus and damping of a branch that is let go and swings: no robot, no force.
+
+The branch is held in its shape at rest until its weight and a hung load act all at once, or a load
+bends it until it is gone. Simulated in time from there, it is laid over the marker tracks. Free are
+one factor on Young's modulus, the moment of release, Rayleigh's two numbers, how much each marker
+moves for its place on the branch (known to the registration), and the branch's density within what
+is known of it. Frequency and displacement both tell the modulus.
+
+What the model gets wrong goes on through many frames: the residual counts as so many independent
+readings as its autocorrelation leaves, and the intervals are of what is left over, not of the
+camera's noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError, WorkError
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.estimation.uncertainty.model_error import MeshStiffness, mesh_error
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.dynamics.integration import simulate_dynamics
+from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.materials.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.sensitivities import ParameterSet
+from limber.recordings.hung_load import REGISTRATION_SHARE
+
+STEPS_PER_PERIOD = 40
+"""Of the first vibration: the step's own error in its frequency is then 0.2 %."""
+_FIRST_PERIODS = 1.5
+"""The fit begins with so many, so that simulated and seen phases cannot be a turn apart."""
+_DAMPING_BOUNDS = (1e-4, 1e3)
+"""Of Rayleigh's alpha over the first angular frequency, and beta times it: both without unit."""
+_GONE = 0.3
+"""Part of its way at which a branch has surely been let go."""
+_MARGIN = 0.1
+"""Deviation of how much a marker moves, where the registration is not known."""
+STARTS = ("held", "loaded")
+
+
+@dataclass(frozen=True)
+class SwingSeen:
+    """What was seen of a swing.
+
+    Attributes:
+        times: [s], shape [n].
+        moved: Displacement of the markers from the branch's shape at rest [m], shape [n, m, 3];
+            NaN where a marker was not seen.
+        rest_points: The markers' places on the branch [m], shape [m, 3].
+        start: "held": in the shape at rest until weight and load act; "loaded": bent by the load
+            until it is gone.
+        load: The load [N], shape [3].
+        load_mass: That swings with the branch [kg]; 0 where the load is a pull, or gone.
+        noise: Of one reading [m].
+        registration: RMS distance of the markers from their places [m], None: not known.
+    """
+
+    times: np.ndarray
+    moved: np.ndarray
+    rest_points: np.ndarray
+    start: str
+    load: np.ndarray
+    load_mass: float
+    noise: float
+    registration: float | None = None
+
+
+@dataclass(frozen=True)
+class SwingFit:
+    """What a swing tells. Intervals are of 95 %.
+
+    Attributes:
+        factor: On the start's Young's modulus, the mesh's own stiffness taken out;
+            factor_interval: shape [2].
+        mesh_factor: What was taken out; 1 where a finer mesh was out of reach.
+        release: [s] on the recording's clock; release_deviation: [s].
+        damping: Rayleigh's alpha [1/s] and beta [s]; damping_interval: shape [2, 2].
+        damping_ratio: Of the first vibration; damping_ratio_interval: shape [2].
+        frequency: Of the first vibration about the place of rest [Hz].
+        residual: RMS of seen less simulated [m]; over the largest displacement it is
+            ``relative_residual``.
+        readings: Independent ones, as the residual's autocorrelation leaves.
+        forward_count: Simulations.
+        window: First and last time used [s].
+        times, seen, simulated: For figures [s, m], shapes [f], [f, m, 3].
+        converged: Whether the last fit did.
+    """
+
+    factor: float
+    factor_interval: np.ndarray
+    mesh_factor: float
+    release: float
+    release_deviation: float
+    damping: tuple[float, float]
+    damping_interval: np.ndarray
+    damping_ratio: float
+    damping_ratio_interval: np.ndarray
+    frequency: float
+    residual: float
+    relative_residual: float
+    readings: float
+    forward_count: int
+    window: tuple[float, float]
+    times: np.ndarray
+    seen: np.ndarray
+    simulated: np.ndarray
+    converged: bool
+
+
+def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: float = 6.0,
+              density_sigma: float = 0.1, progress: Progress = SILENT) -> SwingFit:
+    """Fit Young's modulus and damping of a branch to a swing.
+
+    Args:
+        model: The branch, with the moduli to start from (their pattern stays) and its weight.
+        grasp: Where the load hangs or pulls.
+        periods: Of the swing that are fitted.
+        density_sigma: Relative standard deviation of the branch's density.
+
+    Raises:
+        InputError: no swing is to be seen. WorkError: the simulation does not follow.
+    """
+    swing = _Swing(model, grasp, seen, density_sigma)
+    released, period = first_guess(seen)
+    swing.scale_to(period, released)
+    found = None
+    for number, share in enumerate((_FIRST_PERIODS, periods)):
+        progress(number / 2, "fitting the swing", periods=share)
+        found = swing.fitted(released, share * period, found)
+    # Once more, what is known beforehand weighed against what the model really leaves over.
+    return swing.judged(swing.fitted(released, periods * period, found))
+
+
+def first_guess(seen: SwingSeen) -> tuple[float, float]:
+    """Return when a branch was released and its period [s], from the tracks alone.
+
+    Raises:
+        InputError: nothing moves, or it does not swing.
+    """
+    way = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
+    # Of the marker that goes farthest: others are jostled while the branch is still held.
+    far = way[:, np.argmax(np.nan_to_num(way).max(axis=0))]
+    far = np.where(np.isfinite(far), far, 0.0)
+    if far.max() < 10 * seen.noise:
+        raise InputError("Nothing swings in the recording.",
+                         f"No marker moves by more than {1e3 * far.max():.2g} mm.",
+                         "Start the recording before the branch is let go.")
+    gone = int(np.argmax(far > _GONE * far.max()))
+    at_rest = np.flatnonzero(far[:gone] < max(6 * seen.noise, 0.02 * far.max()))
+    start = int(at_rest[-1]) + 1 if len(at_rest) else 0
+    marker, axis = np.unravel_index(np.nanargmax(np.nanvar(seen.moved[start:], axis=0)),
+                                    seen.moved.shape[1:])
+    track = seen.moved[start:, marker, axis]
+    times = seen.times[start:][np.isfinite(track)]
+    track = track[np.isfinite(track)]
+    settled = np.median(track[-max(len(track) // 4, 5):])
+    away = track - settled
+    large = np.flatnonzero(np.abs(away) > 0.05 * np.abs(away).max())
+    away, times = away[:large[-1] + 1], times[:large[-1] + 1]
+    turns = np.flatnonzero((away[:-1] < 0) != (away[1:] < 0))
+    if len(turns) < 3:
+        raise InputError("The branch does not swing to and fro.",
+                         f"It passes its place of rest {len(turns)} times.",
+                         "Let it go at once, or fit the place of rest: --motion quasi_static.")
+    cross = times[turns] - away[turns] * (times[turns + 1] - times[turns]) / (
+        away[turns + 1] - away[turns])
+    # Over whole turns: where it rests may be a little beside, as of a branch that creeps.
+    period = float(np.median(cross[2:] - cross[:-2]))
+    rate = float(np.median(np.diff(seen.times)))
+    if period < 6 * rate:
+        raise InputError(f"The branch swings {1 / period:.3g} times a second.",
+                         f"At {1 / rate:.3g} frames a second that is too fast to be seen.",
+                         "Record with more frames a second.")
+    return float(seen.times[max(start - 1, 0)]), period
+
+
+class _Swing:
+    """The model laid over the tracks; free: log factor, release, log alpha/w, log beta w, log
+    density, and each marker's gain."""
+
+    def __init__(self, model: BranchModel, grasp: Grasp, seen: SwingSeen, density_sigma: float):
+        share = np.maximum(grasp.weights, 0.0) / np.maximum(grasp.weights, 0.0).sum()
+        if seen.load_mass and seen.start == "held":
+            model = model.with_point_masses(
+                PointMass(tuple(model.mesh.nodes[node]), float(seen.load_mass * part))
+                for node, part in zip(grasp.nodes, share, strict=True) if part > 0)
+        self.model, self.grasp, self.seen = model, grasp, seen
+        # A hung mass weighs by itself.
+        self.load = np.zeros(3) if seen.start == "held" and seen.load_mass else seen.load
+        self.operator = point_operator(model.mesh, seen.rest_points)
+        self.nodes = np.unique(self.operator.indices // 3)
+        columns = (3 * self.nodes[:, None] + np.arange(3)).ravel()
+        self.near = self.operator[:, columns]
+        size = float(np.nanmax(np.linalg.norm(seen.moved, axis=2)))
+        self.gain_sigma = (_MARGIN if seen.registration is None
+                           else REGISTRATION_SHARE * seen.registration / size + 1e-3)
+        self.density_sigma = max(density_sigma, 1e-6)
+        self.forward_count, self.factor0 = 0, 1.0
+        self._known: tuple[bytes, tuple] | None = None
+
+    def scale_to(self, period: float, released: float) -> None:
+        """Take the modulus from the period, and damping from how the swing dies away."""
+        frequency = self.frequency(self.model, RayleighDamping(0.0, 0.0))
+        self.factor0 = (1 / period / frequency) ** 2
+        self.omega, self.period = 2 * np.pi / period, period
+        after = self.seen.times > released
+        way = np.nan_to_num(np.linalg.norm(
+            self.seen.moved[after] - np.nanmean(self.seen.moved[-5:], axis=0), axis=2)).max(axis=1)
+        times = self.seen.times[after]
+        half = max(round(period / 2 / np.median(np.diff(times))), 1)
+        peaks = [way[k:k + half].max() for k in range(0, len(way) - half, half)][:6]
+        fall = np.polyfit(np.arange(len(peaks)), np.log(np.maximum(peaks, 1e-9)), 1)[0]
+        self.ratio0 = float(np.clip(-fall / np.pi, 2e-3, 0.3))
+
+    @property
+    def ramp(self) -> float:
+        """Middle of the step within which the load goes [s]."""
+        return 0.5 * self.period / STEPS_PER_PERIOD if self.seen.start == "loaded" else 0.0
+
+    def mesh_stiffness(self, model: BranchModel) -> MeshStiffness:
+        """Return how much the mesh is too stiff; nothing is said where no finer one is in reach."""
+        level = float(model.young.mean())
+        found = mesh_error(model.without_point_masses(), self.grasp, self.operator,
+                           (model.young / level)[:, None], np.array([level]))
+        return found or MeshStiffness(np.ones(1), np.zeros(1))
+
+    def frequency(self, model: BranchModel, damping: RayleighDamping) -> float:
+        """Return the first frequency about the place of rest [Hz]."""
+        from limber.mechanics.statics.solve import solve_static
+
+        model = model.with_parameters(damping=damping)
+        is_held = self.seen.start != "loaded" and self.load.any()
+        rest = solve_static(model, grasp=self.grasp if is_held else None,
+                            grasp_force=self.load if is_held else None).require()
+        tangent = model.equations().tangent(model, rest.displacement)
+        mode = np.random.default_rng(0).normal(size=rest.displacement.shape)
+        for _ in range(25):
+            mode = tangent.solve(model.mass_times(mode))
+            mode /= np.linalg.norm(mode)
+        stiffness = float((mode * model.tangent_times(rest.displacement, mode)).sum())
+        return float(np.sqrt(stiffness / (mode * model.mass_times(mode)).sum()) / (2 * np.pi))
+
+    def with_values(self, free: np.ndarray) -> BranchModel:
+        damping = RayleighDamping(float(np.exp(free[2]) * self.omega),
+                                  float(np.exp(free[3]) / self.omega))
+        return self.model.with_parameters(
+            young=self.model.young * self.factor0 * np.exp(free[0]), damping=damping,
+            density=self.model.density * np.exp(free[4]))
+
+    def simulated(self, free: np.ndarray, duration: float) -> tuple[np.ndarray, ...]:
+        """Return times from the release [s], displacements of markers, and their derivatives.
+
+        To log factor, log alpha, log beta and log density: shapes [f], [f, m, 3], [f, m, 3, 4].
+        """
+        key = np.r_[free[[0, 2, 3, 4]], duration].tobytes()
+        if self._known is not None and self._known[0] == key:
+            return self._known[1]
+        model, step = self.with_values(free), self.period / STEPS_PER_PERIOD
+        times = step * np.arange(int(np.ceil(duration / step)) + 2)
+        grasp: Grasp | None = None
+        forces: np.ndarray | None = None
+        if self.load.any():
+            forces = np.tile(self.load, (len(times), 1))
+            if self.seen.start == "loaded":
+                forces[1:] = 0.0
+            grasp = self.grasp
+        wanted = ParameterSet(("log_young", "damping_mass", "damping_stiffness", "log_density"))
+        result = simulate_dynamics(
+            model, grasp=grasp, grasp_forces=forces, times=times,
+            start="equilibrium" if self.seen.start == "loaded" else "rest",
+            settings=NewmarkSettings(max_step=step), sensitivities=wanted,
+            sensitivity_nodes=self.nodes)
+        self.forward_count += 1
+        if not result.converged:
+            raise WorkError(f"The simulated swing fails: {result.message}.",
+                            "Load, mass or modulus do not fit the branch.",
+                            "Check --weight, units and density.")
+        count = len(times)
+        moved = (self.operator @ result.displacement.reshape(count, -1).T).T.reshape(count, -1, 3)
+        slopes = np.stack([(self.near @ frame.reshape(-1, 4)).reshape(-1, 3, 4)
+                           for frame in present(
+                               result.sensitivities, "derivative of the swing").displacement])
+        slopes = slopes * np.array([1.0, model.damping.mass, model.damping.stiffness, 1.0])
+        self._known = key, (times, moved, slopes)
+        return self._known[1]
+
+    def rows(self, free: np.ndarray, chosen: np.ndarray, duration: float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+        """Return simulated displacements at the chosen frames, and derivatives to all free."""
+        from scipy.interpolate import CubicSpline
+
+        times, moved, slopes = self.simulated(free, duration)
+        at = self.seen.times[chosen] - free[1]
+        since = np.clip(at, 0.0, times[-1])
+        track = CubicSpline(times, moved, axis=0)
+        gain = 1 + free[5:, None]
+        model = gain * track(since)
+        d = np.zeros((*model.shape, len(free)))
+        d[..., [0, 2, 3, 4]] = gain[..., None] * CubicSpline(times, slopes, axis=0)(since)
+        d[..., 1] = -gain * track(since, 1) * ((at > 0) & (at < times[-1]))[:, None, None]
+        for marker in range(model.shape[1]):
+            d[:, marker, :, 5 + marker] = track(since)[:, marker]
+        return model, d
+
+    def fitted(self, released: float, duration: float, start: "_Found | None") -> "_Found":
+        from scipy.optimize import least_squares
+
+        seen = self.seen
+        chosen = np.flatnonzero((seen.times >= released - 2 * self.period / STEPS_PER_PERIOD)
+                                & (seen.times <= released + duration))
+        count = 5 + seen.moved.shape[1]
+        free = np.zeros(count) if start is None else start.free
+        if start is None:
+            free[1], free[2:4] = released, np.log(self.ratio0)
+        known = np.isfinite(seen.moved[chosen])
+        sigma = (max(seen.noise, 1e-3 * float(np.nanmax(np.abs(seen.moved)))) if start is None
+                 else self.left_over(start)[2])
+        priors = np.r_[np.inf, np.inf, np.inf, np.inf, self.density_sigma,
+                       np.full(count - 5, self.gain_sigma)]
+
+        def residual(x: np.ndarray) -> np.ndarray:
+            model, _ = self.rows(x, chosen, duration + self.period)
+            return np.r_[(model - seen.moved[chosen])[known] / sigma, x[4:] / priors[4:]]
+
+        def jacobian(x: np.ndarray) -> np.ndarray:
+            _, slopes = self.rows(x, chosen, duration + self.period)
+            return np.vstack([slopes[known] / sigma, np.diag(1 / priors)[4:]])
+
+        low, high = np.full(count, -np.inf), np.full(count, np.inf)
+        low[2:4], high[2:4] = np.log(_DAMPING_BOUNDS[0]), np.log(_DAMPING_BOUNDS[1])
+        low[1], high[1] = released - 0.5 * self.period, released + 0.5 * self.period
+        scale = np.r_[0.1, 0.02 * self.period, 1.0, 1.0, 0.1, np.full(count - 5, 0.05)]
+        found = least_squares(residual, np.clip(free, low + 1e-9, high - 1e-9), jacobian,
+                              bounds=(low, high), x_scale=scale, xtol=1e-5, ftol=1e-6, gtol=1e-8,
+                              loss="linear", max_nfev=25)
+        return _Found(found.x, chosen, duration, found.success, known, sigma, priors)
+
+    def left_over(self, found: "_Found") -> tuple[float, float, float]:
+        """Return the residual's RMS [m], how many readings count as one, and the deviation [m]
+        that each reading has if they are to count as independent."""
+        model, _ = self.rows(found.free, found.chosen, found.duration + self.period)
+        left = np.where(found.known, model - self.seen.moved[found.chosen], np.nan)
+        rms, stretch = float(np.sqrt(np.nanmean(left**2))), _correlated(left)
+        return rms, stretch, max(rms, self.seen.noise) * float(np.sqrt(stretch))
+
+    def judged(self, found: "_Found") -> SwingFit:
+        """Return the fit with the intervals that what is left over allows."""
+        seen, free = self.seen, found.free
+        model, slopes = self.rows(free, found.chosen, found.duration + self.period)
+        columns = slopes[found.known]
+        rms, stretch, sigma = self.left_over(found)
+        information = columns.T @ columns / sigma**2 + np.diag(1 / found.priors**2)
+        # Alpha and beta cannot both be told from one vibration: what is open stays wide.
+        information[[2, 3], [2, 3]] += 1 / np.log(_DAMPING_BOUNDS[1] / _DAMPING_BOUNDS[0]) ** 2
+        cov = np.linalg.inv(information)
+        wide = 1.96 * np.sqrt(np.diag(cov))
+        best = self.with_values(free)
+        frequency = self.frequency(best, best.damping)
+        omega = 2 * np.pi * frequency
+        parts = np.array([best.damping.mass / (2 * omega), best.damping.stiffness * omega / 2])
+        ratio = float(parts.sum())
+        spread = 1.96 * float(np.sqrt(parts @ cov[2:4, 2:4] @ parts))
+        ends, mesh = np.array([-1.0, 1.0]), self.mesh_stiffness(best)
+        wide[0] = np.hypot(wide[0], 1.96 * mesh.deviation[0])
+        factor = float(self.factor0 * np.exp(free[0]) * mesh.factor[0])
+        values = np.array([best.damping.mass, best.damping.stiffness])
+        return SwingFit(
+            factor=factor, factor_interval=factor * np.exp(wide[0] * ends),
+            mesh_factor=float(mesh.factor[0]), release=float(free[1] + self.ramp),
+            release_deviation=float(wide[1] / 1.96),
+            damping=(float(values[0]), float(values[1])),
+            damping_interval=values[:, None] * np.exp(np.clip(wide[2:4], 0, 30)[:, None] * ends),
+            damping_ratio=ratio, damping_ratio_interval=np.maximum(ratio + spread * ends, 0.0),
+            frequency=frequency, residual=rms,
+            relative_residual=rms / float(np.nanmax(np.abs(seen.moved))),
+            readings=float(found.known.sum() / stretch), forward_count=self.forward_count,
+            window=(float(seen.times[found.chosen[0]]), float(seen.times[found.chosen[-1]])),
+            times=seen.times[found.chosen], seen=seen.moved[found.chosen], simulated=model,
+            converged=bool(found.converged))
+
+
+@dataclass(frozen=True)
+class _Found:
+    free: np.ndarray
+    chosen: np.ndarray
+    duration: float
+    converged: bool
+    known: np.ndarray
+    sigma: float
+    priors: np.ndarray
+
+
+def _correlated(left: np.ndarray) -> float:
+    """Return how many readings count as one: the sum of the residual's autocorrelation.
+
+    Over time, and over markers and axes, which all follow the same motion.
+    """
+    flat = np.nan_to_num(left.reshape(len(left), -1))
+    power = float((flat**2).sum())
+    if power == 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, len(flat) // 2):
+        value = float((flat[lag:] * flat[:-lag]).sum()) / power
+        if value < 0.05:
+            break
+        total += 2 * value
+    # Axes and markers that move together are one: the participation of the principal ones.
+    values = np.linalg.eigvalsh(flat.T @ flat)
+    together = flat.shape[1] * float((values**2).sum()) / float(values.sum()) ** 2
+    return total * max(together, 1.0)
+

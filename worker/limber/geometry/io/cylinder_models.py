@@ -1,0 +1,171 @@
+"""Cylinder models (QSM) of other programs, in and out: TreeQSM, SmartQSM, SimpleForest, rTwig.
+
+======================  ===========================================================================
+``.mat``                TreeQSM: a struct ``QSM`` with ``cylinder`` (radius, length, start, axis,
+                        parent, extension, branch, BranchOrder, PositionInBranch, added).
+                        SmartQSM writes the same struct; its radius is that of a cone's thin end,
+                        UnmodRadius that of the thick one (its ``parameterize_and_export``).
+                        Version 7.3 by :mod:`limber.geometry.io.matlab`
+``.csv``                rTwig's minimum: id, parent, start_x ... end_z, radius; SimpleForest: ID,
+                        parentID, startX ... endZ, radius
+======================  ===========================================================================
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.optional import require_extra
+from limber.geometry.io.isolated_readers import read_apart
+from limber.geometry.io.matlab import is_hdf5, struct_arrays
+from limber.geometry.skeleton.skeleton import Skeleton
+
+TREEQSM_FIELDS = ("radius", "start", "axis", "length", "parent")
+_THICK = "UnmodRadius"
+
+
+def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
+    """Return the cylinders of a ``.mat`` file of TreeQSM or SmartQSM.
+
+    Of several models in a file the first counts. Cylinders without a parent that start where the
+    first one does hang on its start.
+
+    Returns:
+        Arrays ``id``, ``parent`` (-1: none), ``start``, ``end``, ``radius`` and ``start_radius``,
+        which is the same where the file does not tell it.
+
+    Raises:
+        InputError: it cannot be read, or has no cylinders.
+        MissingDependencyError: it is of version 7.3, and h5py is not installed.
+    """
+    found = _fields(Path(path))
+    if not found:
+        raise InputError(f"{path} has no struct with {', '.join(TREEQSM_FIELDS)}.",
+                         "A TreeQSM model was expected.", "Save the QSM of TreeQSM itself.")
+    try:
+        radius, length, parent = (np.asarray(found[name], float).ravel()
+                                  for name in ("radius", "length", "parent"))
+        start, axis = (np.atleast_2d(np.asarray(found[name], float))
+                       for name in ("start", "axis"))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}.", "A cylinder's fields are numbers.",
+                         "Save it again.") from error
+    count = len(radius)
+    if not (len(length) == len(parent) == count and start.shape == axis.shape == (count, 3)):
+        raise InputError(f"{path} has fields of unequal length.", "Each cylinder has all of them.",
+                         "Save it again.")
+    return {"id": np.arange(1.0, count + 1), "parent": np.where(parent > 0, parent, -1.0),
+            "start": start, "end": start + axis * length[:, None], "radius": radius,
+            "start_radius": _thick_ends(found, radius)}
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    """The fields of the cylinders and ``creator``; nothing where there are no cylinders."""
+    try:
+        is_new = is_hdf5(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).",
+                         "A TreeQSM model was expected.", "Check the path.") from error
+    if is_new:
+        require_extra("matlab", ("h5py",), f"{path} is a MAT file of version 7.3, which "
+                      "(unless you save it in Matlab with -v7)")
+        return read_apart(f"{__name__}:mat_v73_fields", path)
+    return _older_fields(path)
+
+
+def mat_v73_fields(path: Path) -> dict[str, np.ndarray]:
+    """Return the fields of the cylinders of a MAT file of version 7.3."""
+    return struct_arrays(path, TREEQSM_FIELDS, (_THICK,))
+
+
+def _older_fields(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, squeeze_me=True, struct_as_record=False)
+    except MemoryError:
+        raise
+    except Exception as error:  # scipy's reader raises whatever its parser raises
+        raise InputError(f"{path} cannot be read as a MAT file ({error}).",
+                         "A TreeQSM model was expected.", "Save it again.") from error
+    cylinder = _cylinder_struct(content)
+    if cylinder is None:
+        return {}
+    creator = getattr(getattr(content.get("QSM"), "rundata", None), "creator", "")
+    return {name: getattr(cylinder, name) for name in (*TREEQSM_FIELDS, _THICK)
+            if hasattr(cylinder, name)} | {"creator": creator}
+
+
+def _thick_ends(found: dict[str, Any], radius: np.ndarray) -> np.ndarray:
+    """SmartQSM keeps a cone's other radius where TreeQSM has the one before its corrections."""
+    try:
+        thick = np.asarray(found.get(_THICK, ()), float).ravel()
+    except (TypeError, ValueError):
+        return radius
+    fits = str(found["creator"]) == "SmartQSM" and thick.shape == radius.shape
+    return thick if fits and (np.isfinite(thick) & (thick > 0)).all() else radius
+
+
+def _cylinder_struct(content: dict[str, Any]) -> Any:
+    for value in content.values():
+        first = value.ravel()[0] if isinstance(value, np.ndarray) and value.size and (
+            value.dtype == object) else value
+        for found in (first, getattr(first, "cylinder", None)):
+            if found is not None and all(hasattr(found, name) for name in TREEQSM_FIELDS):
+                return found
+    return None
+
+
+def write_treeqsm(skeleton: Skeleton, path: Path) -> None:
+    """Write a TreeQSM ``.mat`` file in metres: a struct ``QSM`` with ``cylinder``."""
+    from scipy.io import savemat
+
+    start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
+    length = np.linalg.norm(end - start, axis=1)
+    count = len(end)
+    extension = np.zeros(count)
+    position = np.ones(count)
+    for node in range(2, count + 1):
+        up = int(skeleton.parent[node])
+        if up > 0 and skeleton.branch[up] == skeleton.branch[node]:
+            extension[up - 1] = node
+            position[node - 1] = position[up - 1] + 1
+    column = {name: np.asarray(values, float)[:, None] for name, values in {
+        "radius": skeleton.radius[1:], "length": length, "parent": skeleton.parent[1:],
+        "extension": extension, "branch": skeleton.branch[1:] + 1,
+        "BranchOrder": skeleton.order[1:], "PositionInBranch": position,
+        "added": np.zeros(count)}.items()}
+    axis = (end - start) / np.maximum(length, 1e-300)[:, None]
+    savemat(path, {"QSM": {"cylinder": {**column, "start": start, "axis": axis}}},
+            do_compression=True)
+
+
+def rtwig_text(skeleton: Skeleton) -> str:
+    """Return rTwig's minimal table [m]: what its ``reconstruct_qsm`` needs, with branch and order.
+    """
+    lines = ["id,parent,start_x,start_y,start_z,end_x,end_y,end_z,radius,branch,branch_order"]
+    for node in range(1, skeleton.node_count):
+        up = int(skeleton.parent[node])
+        ends = (*skeleton.nodes[up], *skeleton.nodes[node])
+        lines.append(",".join([str(node), str(up), *(f"{value:.9g}" for value in ends),
+                               f"{skeleton.radius[node]:.9g}", str(skeleton.branch[node] + 1),
+                               str(skeleton.order[node])]))
+    return "\n".join(lines) + "\n"
+
+
+def simpleforest_text(skeleton: Skeleton) -> str:
+    """Return a table with SimpleForest's names [m]."""
+    head = ("ID,parentID,startX,startY,startZ,endX,endY,endZ,axisX,axisY,axisZ,radius,length,"
+            "branchID,branchOrder")
+    lines = [head]
+    for node in range(1, skeleton.node_count):
+        up = int(skeleton.parent[node])
+        start, end = skeleton.nodes[up], skeleton.nodes[node]
+        length = float(np.linalg.norm(end - start))
+        numbers = (*start, *end, *((end - start) / max(length, 1e-300)),
+                   skeleton.radius[node], length)
+        lines.append(",".join([str(node - 1), str(up - 1), *(f"{v:.9g}" for v in numbers),
+                               str(skeleton.branch[node]), str(skeleton.order[node])]))
+    return "\n".join(lines) + "\n"

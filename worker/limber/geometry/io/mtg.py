@@ -1,0 +1,239 @@
+"""Multiscale tree graphs (MTG), as OpenAlea's text files hold them, in and out.
+
+A file has sections; the last one, ``MTG:``, holds a line a vertex. The column in which its code
+begins says what it refers to: the last vertex of the column before, or, after ``^``, the last one
+of its own column. The code is a chain of signs and labels: ``/`` a part of what stands before,
+``<`` its successor, ``+`` a side branch. Vertices of any scale with XX, YY and ZZ become nodes.
+
+Source: C. Pradal, C. Godin, *MTG user guide* (OpenAlea), and its example files.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.files.reading import read_text, require_finite
+from limber.geometry.skeleton.skeleton import Skeleton
+
+_SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
+_TOKEN = re.compile(r"(/|<<|\+\+|<|\+)?([A-Za-z$]+)(\d*)")
+_PLACE = (("XX", "YY", "ZZ"), ("X", "Y", "Z"))
+_RADII = {"radius": 1.0, "r": 1.0, "diameter": 0.5, "diam": 0.5, "dia": 0.5}
+_WHAT = "a multiscale tree graph"
+
+
+@dataclass
+class _Vertex:
+    """A vertex as it is read: what a part of it would hang on, and where it goes on."""
+
+    scale: int
+    whole: "_Vertex | None"
+    anchor: int
+    tail: int = field(default=-1)
+
+
+def read_mtg(path: Path, *, scale: float = 1.0) -> Skeleton:
+    """Read the nodes of an MTG: vertices with places, each on the one that it grows from.
+
+    A vertex without a radius or diameter has that of the node before it.
+
+    Args:
+        path: The file.
+        scale: Metres per unit; an MTG does not say its own.
+
+    Raises:
+        InputError: no MTG; no places or radii in it; or not one tree.
+    """
+    lines = read_text(path, _WHAT).splitlines()
+    scales, body = _sections(path, lines)
+    reader = _Reader(path, scales, *_header(path, body))
+    for number, line in body[1:]:
+        reader.take(number, line)
+    return reader.skeleton(scale)
+
+
+def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[int, str]]]:
+    """The scale of each class, and the lines of the graph with their numbers."""
+    found: dict[str, list[tuple[int, str]]] = {}
+    current: list[tuple[int, str]] | None = None
+    for number, line in enumerate(lines, start=1):
+        name, colon, _ = line.strip().partition(":")
+        if colon and name.strip() in _SECTIONS and "MTG" not in found:
+            current = found.setdefault(name.strip(), [])
+        elif current is not None and line.strip() and not line.lstrip().startswith("#"):
+            current.append((number, line))
+    missing = [name for name in ("CLASSES", "MTG") if not found.get(name)]
+    if missing:
+        raise InputError(f"{path} has no section {' and '.join(missing)}.",
+                         "An MTG has CODE, CLASSES, DESCRIPTION, FEATURES and MTG.",
+                         "Choose an MTG file (FORM-A).")
+    scales = {}
+    for number, line in found["CLASSES"][1:]:
+        words = line.split()
+        if len(words) < 2 or not words[1].isdigit():
+            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is no class.",
+                             "A class has a symbol and a scale.", "Correct that line.")
+        scales[words[0]] = int(words[1])
+    return scales, found["MTG"]
+
+
+def _header(path: Path, body: list[tuple[int, str]]) -> tuple[int, dict[str, int]]:
+    """How many columns are for codes, and where each feature stands."""
+    cells = [cell.strip() for cell in body[0][1].split("\t")]
+    features = {name: column for column, name in enumerate(cells) if name and column > 0}
+    places = next((names for names in _PLACE if all(name in features for name in names)), None)
+    if places is None:
+        raise InputError(f"{path} has no columns XX, YY and ZZ.",
+                         "Only an MTG with places of its vertices can be used.",
+                         f"It has: {', '.join(features) or 'no features'}.")
+    radius = next((name for name in features if name.lower() in _RADII), None)
+    if radius is None:
+        raise InputError(f"{path} has no column Radius or Diameter.",
+                         "A branch is as thick as its vertices.",
+                         f"It has: {', '.join(features)}.")
+    used = dict(zip(("x", "y", "z"), (features[name] for name in places), strict=True))
+    return min(features.values()), used | {radius.lower(): features[radius]}
+
+
+class _Reader:
+    """Takes line after line."""
+
+    def __init__(self, path: Path, scales: dict[str, int], columns: int, features: dict[str, int]):
+        self.path, self.scales, self.columns, self.features = path, scales, columns, features
+        self.radius_column = next(name for name in features if name in _RADII)
+        self.last: dict[int, _Vertex] = {}
+        self.nodes: list[tuple[float, float, float]] = []
+        self.parent: list[int] = []
+        self.radius: list[float] = []
+
+    def take(self, number: int, line: str) -> None:
+        cells = line.split("\t")
+        codes = [(column, cell.strip()) for column, cell in enumerate(cells[:self.columns])
+                 if cell.strip()]
+        if not codes:
+            return
+        values = self.values(number, cells)
+        vertex: _Vertex | None = None
+        for place, (column, code) in enumerate(codes):
+            if vertex is None:
+                stays = code.startswith("^")
+                vertex = self.last.get(column if stays else column - 1)
+                if vertex is None and (stays or column > 0):
+                    raise self.wrong(number, code, "There is no vertex that it refers to.")
+            vertex = self.chain(number, code.removeprefix("^"), vertex,
+                                values if place == len(codes) - 1 else None)
+            self.last = {at: one for at, one in self.last.items() if at < column}
+            self.last[column] = vertex
+
+    def chain(self, number: int, code: str, vertex: _Vertex | None,
+              values: tuple[float, ...] | None) -> _Vertex:
+        """Follow a code; its last vertex has the values of the line."""
+        at = 0
+        while at < len(code):
+            token = _TOKEN.match(code, at)
+            if token is None or (token.group(1) is None and vertex is not None):
+                raise self.wrong(number, code, "A code is made of /, < or + and labels.")
+            at = token.end()
+            if token.group(2) not in self.scales:
+                raise self.wrong(number, code, f"{token.group(2)} is no class of the file.")
+            vertex = self.vertex(number, code, (token.group(1) or "/")[0],
+                                 self.scales[token.group(2)], vertex,
+                                 values if at == len(code) else None)
+        if vertex is None:
+            raise self.wrong(number, code, "It names no vertex.")
+        return vertex
+
+    def vertex(self, number: int, code: str, sign: str, scale: int, before: _Vertex | None,
+               values: tuple[float, ...] | None) -> _Vertex:
+        anchor, whole = -1, None
+        if before is not None:
+            anchor, whole = before.anchor, before
+            if sign != "/":
+                # What follows a whole grows from where its parts have ended.
+                anchor = before.tail if before.scale == scale and before.tail >= 0 else anchor
+                while whole is not None and whole.scale >= scale:
+                    whole = whole.whole
+            elif before.scale >= scale:
+                raise self.wrong(number, code, "A part is of a finer scale than its whole.")
+        found = _Vertex(scale, whole, anchor)
+        if values is not None:
+            found.anchor = self.node(number, code, anchor, values)
+            while whole is not None and sign != "+":
+                whole.tail, whole = found.anchor, whole.whole
+        return found
+
+    def node(self, number: int, code: str, parent: int, values: tuple[float, ...]) -> int:
+        *place, radius = values
+        if np.isnan(radius):
+            if parent < 0:
+                raise self.wrong(number, code, "The first vertex with a place has no radius.")
+            radius = self.radius[parent]
+        self.nodes.append(tuple(place))
+        self.parent.append(parent)
+        self.radius.append(radius)
+        return len(self.nodes) - 1
+
+    def values(self, number: int, cells: list[str]) -> tuple[float, ...] | None:
+        """Place and radius of a line (nan where there is none); None without a place."""
+        def value(name: str) -> float:
+            column = self.features[name]
+            text = cells[column].strip() if column < len(cells) else ""
+            try:
+                return float(text) if text not in ("", "-", "NA") else np.nan
+            except ValueError as error:
+                raise self.wrong(number, text, "Places and radii are numbers.") from error
+        place = tuple(value(name) for name in "xyz")
+        if np.isnan(place).all():
+            return None
+        require_finite(self.path, {f"place in line {number}": np.array(place)}, _WHAT)
+        return *place, value(self.radius_column) * _RADII[self.radius_column]
+
+    def skeleton(self, scale: float) -> Skeleton:
+        roots = self.parent.count(-1)
+        if roots != 1:
+            raise InputError(f"{self.path} has {roots} vertices with a place on no other.",
+                             "A branch has exactly one root.", "Keep one plant in the file.")
+        nodes, radius = np.array(self.nodes), np.array(self.radius)
+        require_finite(self.path, {"radii": radius}, _WHAT)
+        return Skeleton.from_edges(nodes * scale, np.array(self.parent), radius * scale)
+
+    def wrong(self, number: int, code: str, why: str) -> InputError:
+        return InputError(f"{self.path}, line {number}: {code[:60]!r} cannot be read.", why,
+                          "Correct that line.")
+
+
+def mtg_text(skeleton: Skeleton) -> str:
+    """Return an MTG: a plant of axes of nodes, with places and radii [m].
+
+    An axis hangs with ``+`` on the node that it grows from; nodes follow each other with ``<``.
+    """
+    depth = int(skeleton.order.max()) + 1
+    tabs = "\t" * (depth + 1)
+    lines = ["CODE:\tFORM-A", "", "CLASSES:",
+             "SYMBOL\tSCALE\tDECOMPOSITION\tINDEXATION\tDEFINITION",
+             "$\t0\tFREE\tFREE\tIMPLICIT", "P\t1\tFREE\tFREE\tIMPLICIT",
+             "N\t2\tFREE\tFREE\tIMPLICIT", "", "DESCRIPTION:", "LEFT\tRIGHT\tRELTYPE\tMAX",
+             "N\tN\t+\t?", "N\tN\t<\t?", "", "FEATURES:", "NAME\tTYPE", "XX\tREAL", "YY\tREAL",
+             "ZZ\tREAL", "Radius\tREAL", "", "MTG:",
+             f"ENTITY-CODE{tabs}XX\tYY\tZZ\tRadius", f"/P1{tabs}", ""]
+    lines.pop()
+    children: dict[int, list[int]] = {}
+    for node in range(1, skeleton.node_count):
+        children.setdefault(int(skeleton.parent[node]), []).append(node)
+    waiting = [0]
+    while waiting:
+        node = waiting.pop()
+        up, column = int(skeleton.parent[node]), int(skeleton.order[node])
+        same = up < 0 or skeleton.branch[up] == skeleton.branch[node]
+        sign = "^/" if up < 0 else ("^<" if same else "+")
+        values = "\t".join(f"{value:.9g}" for value in (*skeleton.nodes[node],
+                                                        skeleton.radius[node]))
+        lines.append("\t" * column + f"{sign}N{node + 1}" + "\t" * (depth + 1 - column) + values)
+        # Side axes are told before the axis goes on: "^" means the last node of that column.
+        after = children.get(node, [])
+        on = [one for one in after if skeleton.branch[one] == skeleton.branch[node]]
+        waiting += on + [one for one in after if one not in on]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,247 @@
+"""Skeletons of other programs: SWC trees and cylinder models (QSM) as CSV."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.constants import UNIT_METRES
+from limber.core.errors import InputError
+from limber.geometry.io.cylinder_models import read_treeqsm
+from limber.geometry.io.mtg import read_mtg
+from limber.geometry.skeleton.skeleton import STATES, Skeleton
+
+_ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
+    f"{end}{axis}": f"{end[0]}{axis}" for end in ("start", "end") for axis in "xyz"}}
+"""Names of columns in rTwig and SimpleForest, in small letters and without underscores."""
+
+
+def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
+    """Read a skeleton: ``.swc``, ``.mtg``, or a cylinder model: ``.csv``, or TreeQSM's ``.mat``.
+
+    See :func:`read_swc`, :func:`~.mtg.read_mtg`, :func:`read_cylinders` and
+    :func:`~.cylinder_models.read_treeqsm`, which knows SmartQSM's, too.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return read_cylinders(path, scale=1.0 if scale is None else scale)
+    if path.suffix.lower() == ".mat":
+        read = read_treeqsm(path)
+        table = np.column_stack([read["id"], read["parent"], read["start"], read["end"],
+                                 read["radius"]])
+        return _tree_of(path, table, 1.0 if scale is None else scale,
+                        start_radius=read["start_radius"])
+    if path.suffix.lower() == ".mtg":
+        return read_mtg(path, scale=1.0 if scale is None else scale)
+    return read_swc(path, scale=scale)
+
+
+def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
+    """Read an SWC file.
+
+    Args:
+        path: The file.
+        scale: Metres per unit; None takes the header's ``# unit:``, or metres.
+
+    Raises:
+        InputError: not an SWC tree; see :meth:`Skeleton.from_edges`.
+    """
+    rows, header_scale = [], 1.0
+    for number, line in enumerate(_lines(path), start=1):
+        if line.startswith("#"):
+            header_scale = _header_unit(line, header_scale)
+            continue
+        if not line.strip():
+            continue
+        parts = line.replace(",", " ").split()
+        try:
+            rows.append([int(float(parts[0])), *map(float, parts[2:6]), int(float(parts[6]))])
+        except (ValueError, IndexError, OverflowError) as error:
+            raise InputError(
+                f"{path}, line {number}: {line.strip()[:60]!r} is not a node.",
+                "SWC lines hold: id type x y z radius parent.", "Correct that line.") from error
+    if not rows:
+        raise InputError(f"{path} has no nodes.", "It is empty or not an SWC file.",
+                         "Choose another file.")
+    table = np.array(rows, float)
+    _require_whole(path, table[:, [0, 5]])
+    parent = _parents(path, table[:, 0].astype(np.int64), table[:, 5].astype(np.int64))
+    factor = header_scale if scale is None else scale
+    return Skeleton.from_edges(table[:, 1:4] * factor, parent, table[:, 4] * factor)
+
+
+def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
+    """Read a cylinder model: columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order).
+
+    A cylinder's end becomes a node that hangs on the end of its parent; the root's start becomes
+    the root node. What :func:`write_cylinders` adds (deviations, states, probabilities) is read
+    where it is there. The names of rTwig and SimpleForest are known, too.
+
+    Args:
+        path: The CSV file.
+        scale: Metres per unit.
+
+    Raises:
+        InputError: columns are missing, a value is no number, or it is not one tree.
+    """
+    rows = [{_ALIASES.get(name.strip().lower().replace("_", ""), name.strip()): value
+             for name, value in row.items() if name is not None}
+            for row in csv.DictReader(_lines(path))]
+    names = ("id", "parent", "sx", "sy", "sz", "ex", "ey", "ez", "radius")
+    missing = [name for name in names if not rows or name not in rows[0]]
+    if missing:
+        raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
+                         f"A cylinder model has: {', '.join(names)}.",
+                         "Rename the columns of your export.")
+    try:
+        table = np.array([[float(row[name]) for name in names] for row in rows])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has a field that is not a number ({error}).",
+                         "All nine columns are numbers.", "Correct the file.") from error
+    return _tree_of(path, table, scale, rows)
+
+
+def _tree_of(path: Path, table: np.ndarray, scale: float,
+             rows: Sequence[dict[str, str]] = (), *,
+             start_radius: np.ndarray | None = None) -> Skeleton:
+    """The skeleton of cylinders: id, parent, start, end and radius, shape [n, 9]."""
+    _require_whole(path, table[:, :2])
+    ids, up = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    # Some programs count from 1 and give the root the parent 0.
+    parent = _parents(path, ids, np.where((up == 0) & ~(ids == 0).any(), -1, up))
+    roots = np.flatnonzero(parent < 0)
+    # Several may grow from the ground of the first one.
+    first_start = table[roots[:1], 2:5]
+    if len(roots) != 1 and not (np.abs(table[roots, 2:5] - first_start) < 1e-9).all():
+        raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
+                         "A branch has exactly one root.", "Keep one tree in the file.")
+    root = roots[0]
+    nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
+    first = _number(path, rows[root].get("start_radius") or rows[root]["radius"]
+                    ) if rows else (table[:, 8] if start_radius is None else start_radius)[root]
+    radius = np.concatenate([[first], table[:, 8]]) * scale
+    hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
+    fitted = _fitted_columns(path, rows, scale) if rows else {}
+    hang, keep = _without_repeats(nodes, hang)
+    return Skeleton.from_edges(nodes[keep], hang, radius[keep], **{
+        name: np.concatenate([values[root:root + 1], values])[keep]
+        for name, values in fitted.items()})
+
+
+def write_cylinders(skeleton: Skeleton, path: Path) -> None:
+    """Write one cylinder for each node but the root, as CSV in the skeleton's unit.
+
+    Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
+    standard deviation, its state (0 measured, 1 limited, 2 interpolated, 3 unresolved,
+    4 bridged), the probability that the node is there, and the radius at the start.
+    """
+    start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
+    length = np.linalg.norm(end - start, axis=1)
+    axis = (end - start) / np.maximum(length, 1e-300)[:, None]
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow("id parent sx sy sz ex ey ez radius length ax ay az branch order "
+                        "radius_sigma radius_state probability start_radius".split())
+        for i in range(len(end)):
+            node = i + 1
+            numbers = [*start[i], *end[i], skeleton.radius[node], length[i], *axis[i]]
+            up = skeleton.parent[node] - 1
+            writer.writerow([i, up, *(f"{v:.15g}" for v in numbers), skeleton.branch[node],
+                             skeleton.order[node], f"{skeleton.radius_sigma[node]:.3g}",
+                             skeleton.radius_state[node],
+                             f"{skeleton.probability[node]:.3f}",
+                             f"{skeleton.radius[skeleton.parent[node]]:.12g}"])
+
+
+def read_fitted(path: Path) -> Skeleton:
+    """Read what :func:`write_cylinders` wrote, with deviations, states and probabilities."""
+    skeleton = read_cylinders(path)
+    if "probability" not in _lines(path)[0]:
+        raise InputError(f"{path} has no radius_sigma, radius_state and probability.",
+                         "It was written by another program or an older Limber.",
+                         "Reconstruct the scan again.")
+    return skeleton
+
+
+def _require_whole(path: Path, numbers: np.ndarray) -> None:
+    if not (np.abs(numbers) < 2**53).all():
+        raise InputError(f"{path} has an id or a parent that is no whole number.",
+                         "Ids name the nodes.", "Correct the file.")
+
+
+def _number(path: Path, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{path} has a field that is not a number ({error}).",
+                         "Radii are numbers.", "Correct the file.") from error
+
+
+def _fitted_columns(path: Path, rows: list[dict[str, str]], scale: float,
+                    ) -> dict[str, np.ndarray]:
+    names = ("radius_sigma", "radius_state", "probability")
+    if any(name not in rows[0] for name in names):
+        return {}
+    try:
+        sigma, state, probability = (np.array([float(row[name]) for row in rows])
+                                     for name in names)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has a field that is not a number ({error}).",
+                         f"{', '.join(names)} are numbers.", "Correct the file.") from error
+    if not (((sigma >= 0) & np.isfinite(sigma)).all()
+            and np.isin(state, list(STATES.values())).all()
+            and ((probability >= 0) & (probability <= 1)).all()):
+        raise InputError(
+            f"{path} has a deviation, state or probability out of its range.",
+            f"Deviations are not negative, states {min(STATES.values())} to "
+            f"{max(STATES.values())}, probabilities 0 to 1.", "Correct the file.")
+    return {"radius_sigma": sigma * scale, "radius_state": state.astype(np.int8),
+            "probability": probability}
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return Path(path).read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).", "", "Check the path.",
+                         ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file.", "A skeleton is SWC or CSV text.",
+                         "Choose another file.") from error
+
+
+def _header_unit(line: str, scale: float) -> float:
+    words = line.lstrip("# ").replace("=", ":").split(":")
+    if len(words) == 2 and words[0].strip().lower() in ("unit", "units"):
+        return UNIT_METRES.get(words[1].strip(), scale)
+    return scale
+
+
+def _parents(path: Path, ids: np.ndarray, parent_ids: np.ndarray) -> np.ndarray:
+    unique, counts = np.unique(ids, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(f"{path} has id {unique[counts > 1][0]} more than once.",
+                         "Each node has an id of its own.", "Correct the file.")
+    where = {int(node): i for i, node in enumerate(ids)}
+    lost = [int(p) for p in parent_ids if p >= 0 and int(p) not in where]
+    if lost:
+        raise InputError(f"{path}: parent {lost[0]} is not in the file.",
+                         "Each node but the root hangs on another node.", "Correct the file.")
+    return np.array([where[int(p)] if p >= 0 else -1 for p in parent_ids], np.int64)
+
+
+def _without_repeats(nodes: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merge a node with its parent where both are at the same place: new parents, nodes kept."""
+    step = np.linalg.norm(nodes - nodes[parent], axis=1)
+    repeated = (parent >= 0) & (step < 1e-9)
+    target = np.arange(len(nodes))
+    for _ in range(len(nodes)):
+        following = np.where(repeated[target], parent[target], target)
+        if (following == target).all():
+            break
+        target = following
+    keep = ~repeated
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent < 0, -1, new_index[target[parent]])
+    return moved[keep], keep

@@ -1,0 +1,126 @@
+"""What a user's own surface must be before it can be filled, and what to do where it is not."""
+
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.surface_checks import crossings, pieces
+
+_LONG, _SHORT = 60.0, 0.01  # [m]: no branch is longer or shorter
+
+
+def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
+    """Return a surface that a solid fills, and warnings about what was done or looks wrong.
+
+    Args:
+        surface: As read [m].
+        path: Its file, for messages.
+
+    Raises:
+        InputError: it has holes, edges of more than two faces, faces that point in and out,
+            several bodies or cavities, no volume, or it crosses itself. Each says where.
+    """
+    warnings = []
+    corner = surface.faces
+    flat = ((corner[:, 0] == corner[:, 1]) | (corner[:, 1] == corner[:, 2])
+            | (corner[:, 2] == corner[:, 0]))
+    if flat.any():
+        surface = Surface(surface.vertices, corner[~flat])
+        warnings.append(f"{int(flat.sum())} faces without area were left out.")
+    _check_edges(surface, path)
+    surface, turned = _one_body(surface, path)
+    warnings += turned
+    found = crossings(surface)
+    if len(found):
+        raise InputError(
+            f"{path} crosses itself in {len(found)} places, one at {_place(found[0])}.",
+            "A solid does not overlap itself.",
+            "Unite its parts (in Blender: a Boolean modifier with Self), then mesh it again.")
+    return surface, warnings + _unit_warnings(surface)
+
+
+def _check_edges(surface: Surface, path: Path) -> None:
+    edges = np.vstack([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    unique, inverse, counts = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    middle = surface.vertices[unique].mean(axis=1)
+    if (counts == 1).any():
+        raise InputError(
+            f"{path} has holes: {int((counts == 1).sum())} open edges, one at "
+            f"{_place(middle[counts == 1][0])}.", "The surface must be closed.",
+            "Close its holes (in Blender: select non-manifold, fill), then mesh it again.")
+    if (counts > 2).any():
+        raise InputError(
+            f"{path} has {int((counts > 2).sum())} edges with more than two faces, one at "
+            f"{_place(middle[counts > 2][0])}.", "Around a solid each edge has two.",
+            "Delete double and inner faces (in Blender: Merge by Distance, then select "
+            "non-manifold), then mesh it again.")
+    balance = np.bincount(inverse.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(counts))
+    if balance.any():
+        raise InputError(
+            f"{path}: faces point in and out, for example at {_place(middle[balance != 0][0])}.",
+            "They must be oriented alike.", "Recalculate its normals (in Blender: Shift N).")
+
+
+def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
+    """Turn the surface outwards; refuse several bodies, or one with cavities."""
+    label = pieces(surface)[surface.faces[:, 0]]
+    parts = [Surface(surface.vertices, surface.faces[label == k]) for k in range(label.max() + 1)]
+    volume = np.array([part.volume for part in parts])
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    if np.abs(volume).max() <= 1e-9 * size**3:
+        raise InputError(f"{path} encloses no volume.", "A solid was expected, not a sheet.",
+                         "Give it thickness (in Blender: a Solidify modifier).")
+    if len(parts) > 1:
+        inner = _within(parts, volume)
+        if inner:
+            raise InputError(
+                f"{path} has {len(inner)} closed surfaces within its largest one, one at "
+                f"{_place(parts[inner[0]].vertices[parts[inner[0]].faces[0, 0]])}.",
+                "A branch is solid, without cavities.",
+                "Delete what is inside (in Blender: separate by loose parts), then mesh it again.")
+        share = np.sort(np.abs(volume))[::-1] / np.abs(volume).sum()
+        raise InputError(
+            f"{path} has {len(parts)} separate bodies, with "
+            + ", ".join(f"{100 * s:.2g} %" for s in share[:4]) + " of the volume.",
+            "One connected body was expected.",
+            "Keep one (in Blender: separate by loose parts), or unite them with a Boolean "
+            "modifier, then mesh it again.")
+    if volume[0] < 0:
+        return Surface(surface.vertices, surface.faces[:, ::-1]), [
+            "All faces pointed inwards; they were turned."]
+    return surface, []
+
+
+def _within(parts: list[Surface], volume: np.ndarray) -> list[int]:
+    """Parts that lie inside the largest one: its winding number around a corner is not 0."""
+    largest = int(np.argmax(np.abs(volume)))
+    outer = parts[largest]
+    return [k for k, part in enumerate(parts) if k != largest and abs(_winding(
+        outer, part.vertices[part.faces[0, 0]])) > 0.5]
+
+
+def _winding(surface: Surface, point: np.ndarray) -> float:
+    """How often a surface winds around a point (Van Oosterom and Strackee 1983)."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] - point for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    over = np.einsum("ij,ij->i", a, np.cross(b, c))
+    under = (la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la
+             + np.einsum("ij,ij->i", c, a) * lb)
+    return float(np.arctan2(over, under).sum() / (2 * np.pi))
+
+
+def _unit_warnings(surface: Surface) -> list[str]:
+    size = float(np.ptp(surface.vertices, axis=0).max())
+    if size > _LONG:
+        return [f"The surface is {size:.0f} m long: is its unit millimetres (--unit mm)?"]
+    if size < _SHORT:
+        return [f"The surface is {1000 * size:.2g} mm long: is its unit really that small? "
+                "(--unit m, cm, mm, in)"]
+    return []
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:.4f}" for v in point) + ") m"

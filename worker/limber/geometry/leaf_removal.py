@@ -1,0 +1,168 @@
+"""Leaves of a scan, cut off before its wood is made, and hung on it again as mass."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.core.constants import UNIT_METRES
+from limber.core.errors import InputError
+from limber.geometry.cloud.leaves import Leaf, find_leaves
+from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
+from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
+from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT, SkeletonResult, thinned
+
+UNASKED = 0.1
+"""Share of the points up to which leaves are cut off without the user's consent."""
+
+_LEAST = 0.05  # of the points, that leaves must be to be cut off
+# Of its radius, up to which a point lies on a round axis; a filled blade that a rod was fitted to
+# has a third of its points there.
+_ON_AXIS = 0.15
+_MOST = 0.5  # of a piece's points, that decide
+# Mean of the unit vectors from the axis: of an evenly seen arc of 120 degrees. One view of a stem
+# shows pi/4, since a sensor's points thin out towards the rim; a rod through a blade 0.83 to 0.97.
+_ARC = np.sin(np.pi / 3) / (np.pi / 3)
+
+
+def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonResult | None = None,
+                   ) -> tuple[Prepared, list[Leaf]]:
+    """Cut the leaves off a prepared scan.
+
+    Args:
+        prepared: The scan.
+        least: Share of the points under which leaves are left in place.
+        found: The skeleton of the whole scan: what its axes show to be round is no leaf.
+
+    Returns:
+        The wood, and the leaves that were cut off.
+    """
+    points = prepared.cloud.points
+    leaves = _leaves_of(points)
+    if found is not None and leaves:
+        wood = _on_round_axes(found, points)
+        leaves = [leaf for leaf in leaves if wood[leaf.points].mean() < _MOST]
+    if leaf_mask(leaves, len(points)).mean() < least:
+        return prepared, []
+    return cut_off(prepared, leaves)
+
+
+def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf]]:
+    """Return a scan without these leaves, and the leaves; whole and none if too little remains."""
+    wood = ~leaf_mask(leaves, len(prepared.cloud))
+    if wood.sum() < POINT_MINIMUM:
+        return prepared, []
+    return replace(prepared, cloud=prepared.cloud.subset(wood)), leaves
+
+
+def _leaves_of(points: np.ndarray) -> list[Leaf]:
+    """Find the leaves of a scan, among as many of its points as its axes are fitted to.
+
+    Leaves are told by neighbourhoods some spacings wide. Where points lie closer than a leaf needs
+    these show the scan's noise, and pairs of neighbours take memory without end. Every other point
+    goes with the nearest of those looked at.
+    """
+    some = thinned(points, FIT_POINT_LIMIT)
+    leaves = find_leaves(points[some])
+    if len(some) == len(points) or not leaves:
+        return leaves
+    leaf_of = np.full(len(some), -1)
+    for number, leaf in enumerate(leaves):
+        leaf_of[leaf.points] = number
+    own = leaf_of[cKDTree(points[some]).query(points)[1]]
+    return [Leaf(np.flatnonzero(own == number), leaf.area) for number, leaf in enumerate(leaves)]
+
+
+def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
+    """Refuse to cut off more than ``UNASKED`` of a scan unless its user agreed.
+
+    Args:
+        prepared: The whole scan.
+        leaves: What looks like leaves.
+        unit: Of the file, as the settings name it.
+
+    Raises:
+        InputError: they are more.
+    """
+    share = float(leaf_mask(leaves, len(prepared.cloud)).mean())
+    if share <= UNASKED:
+        return
+    largest = max(leaves, key=lambda leaf: leaf.area)
+    # The median point: the middle of a curled blade lies on no point.
+    blade = prepared.cloud.points[largest.points]
+    nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
+    place = (nearest + prepared.origin) / UNIT_METRES[unit]
+    count = f"{len(leaves)} {'leaf' if len(leaves) == 1 else 'leaves'}"
+    raise InputError(
+        f"{100 * share:.0f} % of the points look like {count}, flat and not round; the largest "
+        f"is at ({', '.join(f'{value:.6g}' for value in place)}), "
+        f"{1e4 * largest.area:.3g} cm2.",
+        f"Limber does not cut off more than {100 * UNASKED:.0f} % of a scan without being told "
+        "to: flat wood may look like a leaf.",
+        "If these are leaves, cut them off and keep their mass (--leaves cut). If they are wood, "
+        "keep all points (--leaves keep).")
+
+
+def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
+    """Which points [n, 3] lie on an axis whose points show that it is round, shape [n].
+
+    They must lie on its surface, and on enough of its circumference: any narrow strip lies on some
+    cylinder. A radius at its limit was not measured.
+    """
+    skeleton, node = found.skeleton, found.node_of_point
+    axis = skeleton.nodes[node] - skeleton.nodes[skeleton.parent[node]]
+    axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+    aside = points - skeleton.nodes[node]
+    aside -= np.einsum("ij,ij->i", aside, axis)[:, None] * axis
+    aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-300)[:, None]
+    count = np.maximum(np.bincount(node, minlength=skeleton.node_count), 1)
+    mean = np.stack([np.bincount(node, column, skeleton.node_count) for column in aside.T], axis=1)
+    is_round = (np.linalg.norm(mean / count[:, None], axis=1) < _ARC) & (
+        skeleton.radius_state != LIMITED)
+    return is_round[node] & (np.abs(found.residual) < _ON_AXIS * skeleton.radius[node])
+
+
+def leaf_mask(leaves: list[Leaf], count: int) -> np.ndarray:
+    """Return which of ``count`` points lie on leaves, shape [count]."""
+    found = np.zeros(count, bool)
+    for leaf in leaves:
+        found[leaf.points] = True
+    return found
+
+
+def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, density: float,
+                ) -> list[dict[str, Any]]:
+    """Return what leaves weigh and where: sheets of even thickness on the nearest axes.
+
+    Args:
+        leaves: Of the scan.
+        points: The scan [m], shape [n, 3], in the skeleton's frame.
+        skeleton: The wood.
+        density: Mass of a leaf's area [kg/m^2].
+
+    Returns:
+        For each leaf ``kind`` ("leaf"), ``mass_kg``, ``area_m2``, ``centre_m``, ``attached_m``
+        (the node nearest to any of its points) and ``inertia_kg_m2`` about its centre.
+    """
+    tree, masses = cKDTree(skeleton.nodes), []
+    for leaf in leaves:
+        blade = points[leaf.points]
+        distance, node = tree.query(blade)
+        centre = blade.mean(axis=0)
+        second = leaf.area * density * np.cov(blade.T, bias=True)
+        masses.append({
+            "kind": "leaf", "mass_kg": leaf.area * density, "area_m2": leaf.area,
+            "centre_m": centre.tolist(),
+            "attached_m": skeleton.nodes[node[np.argmin(distance)]].tolist(),
+            "inertia_kg_m2": (np.trace(second) * np.eye(3) - second).tolist()})
+    return masses
+
+
+def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
+    """What to tell of leaves that were cut off, ``share`` of the points."""
+    count = f"{len(masses)} {'leaf' if len(masses) == 1 else 'leaves'}"
+    return (f"{count} ({100 * share:.0f} % of the points, "
+            f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2) were told from the stems and cut "
+            f"off. Their mass, {1e3 * sum(m['mass_kg'] for m in masses):.3g} g, hangs on the stems "
+            "(--leaf-density; --leaves keep takes them as wood).")

@@ -1,0 +1,73 @@
+"""A cylinder model alone, without its scan, to a closed surface and tetrahedra."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.alignment import Alignment
+from limber.core.constants import UNIT_METRES
+from limber.core.errors import InputError
+from limber.core.files.reading import read_text
+from limber.core.progress import SILENT, Progress
+from limber.geometry.io.skeletons import read_skeleton
+from limber.geometry.mesh_surface import MeshedBody
+from limber.geometry.reconstruction import gravity_after, mesh_skeleton
+from limber.geometry.settings import MeshSurfaceSettings, ReconstructSettings
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.upright import upright_rotation
+
+SUFFIXES = (".mat", ".swc", ".mtg")
+"""Of cylinder models; a .csv may be one, or a table of sections."""
+
+
+def is_model(path: Path) -> bool:
+    """Whether a file is a cylinder model rather than a surface or a table of sections.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if path.suffix.lower() != ".csv":
+        return path.suffix.lower() in SUFFIXES
+    lines = (line for line in read_text(path, "a table").splitlines() if not line.startswith("#"))
+    return "radius" in [title.strip().lower() for title in next(lines, "").split(",")]
+
+
+def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = SILENT,
+               ) -> tuple[MeshedBody, list[dict[str, Any]]]:
+    """Return the branch that a cylinder model tells, and the masses of twigs the mesh leaves out.
+
+    Args:
+        path: ``.mat`` of TreeQSM or SmartQSM, rTwig's or SimpleForest's ``.csv``, MTG or SWC.
+        settings: ``unit``, ``up``, ``upright`` and the wood; the model has its own root.
+        progress: Called as it goes; gets what the user should know.
+
+    Raises:
+        InputError: it cannot be read, a radius is 0, or a root is given. MeshingError: it cannot
+            be meshed.
+    """
+    if settings.root is not None:
+        raise InputError("A root is given for a cylinder model.", "The model has its own.",
+                         "Leave --root out.")
+    scale = UNIT_METRES[settings.unit]
+    given = read_skeleton(path, scale=scale)
+    if (given.radius <= 0).any():
+        raise InputError(f"{int((given.radius <= 0).sum())} of {given.node_count} nodes of {path} "
+                         "have radius 0.", "A branch has a thickness.", "Give each its radius.")
+    alignment, skeleton = _aligned(given, scale, settings)
+    meshed = mesh_skeleton(skeleton, ReconstructSettings(
+        young=settings.young, poisson=settings.poisson, density=settings.density,
+        grasp_fraction=settings.grasp_fraction, mesh_time_limit=settings.mesh_time_limit,
+        mesh_memory_limit_mb=settings.mesh_memory_limit_mb, leave_out=True), progress)
+    return MeshedBody(alignment, skeleton, meshed.surface, meshed.mesh, meshed.numbers | {
+        "point_count": len(meshed.surface.vertices),
+        "gravity_m_s2": gravity_after(alignment, settings.up)}), meshed.masses
+
+
+def _aligned(given: Skeleton, scale: float, settings: MeshSurfaceSettings,
+             ) -> tuple[Alignment, Skeleton]:
+    root = given.nodes[0]
+    turn = upright_rotation(given, np.array(settings.up), settings.upright)
+    return (Alignment(scale=scale, origin=tuple(root.tolist()),
+                      rotation=tuple(map(tuple, turn.tolist()))),
+            given.moved((given.nodes - root) @ turn.T))

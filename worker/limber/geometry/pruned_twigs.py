@@ -1,0 +1,133 @@
+"""Wood that the mesh does not show as it is: twigs left out of it, and branches that touch."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.core.errors import MeshingError
+from limber.core.progress import Progress
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.skeleton import Skeleton
+
+_NAMED = 3  # branches and places that are named one by one
+_LEFT_OUT_MOST = 0.03  # of the mass, that the mesh may leave out unasked
+
+
+def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
+                    ) -> tuple[Skeleton, list[dict[str, Any]]]:
+    """Cut off thin or high-order side twigs; their mass stays, at their place.
+
+    Returns:
+        The skeleton to mesh, and for each twig cut off ``mass_kg``, its ``centre_m`` and
+        ``attached_m``, the point on the kept axis that carries it.
+    """
+    keep = np.ones(skeleton.node_count, bool)
+    masses: list[dict[str, Any]] = []
+    for run, members in enumerate(skeleton.runs()[1:], start=1):
+        own = members[1:]
+        carried = not keep[members[0]]
+        thin = float(np.median(skeleton.radius[own])) < settings.twig_radius
+        if not (carried or thin or skeleton.order[own[0]] > settings.twig_order):
+            continue
+        keep[own] = False
+        masses.append(twig_mass(skeleton, run, settings.density, keep))
+    return (skeleton, []) if keep.all() else (skeleton.subset(keep), masses)
+
+
+def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | None = None,
+              ) -> dict[str, Any]:
+    """Return what a run weighs that is not meshed: a rod on the axis that carries it.
+
+    ``mass_kg``, ``length_m``, ``centre_m``, ``attached_m`` (the point on the kept axis),
+    ``inertia_kg_m2`` about the centre, shape [3, 3], and ``branch``, its run in the skeleton.
+    """
+    members = skeleton.runs()[run]
+    own, base = members[1:], members[0]
+    while keep is not None and not keep[base]:
+        base = skeleton.parent[base]
+    up = skeleton.parent[own]
+    way = skeleton.nodes[own] - skeleton.nodes[up]
+    length = np.linalg.norm(way, axis=1)
+    part = np.maximum(np.pi * skeleton.radius[own]**2 * length * density, 1e-300)
+    middle = (skeleton.nodes[own] + skeleton.nodes[up]) / 2
+    centre = np.average(middle, axis=0, weights=part)
+    offset = middle - centre
+    # Each piece is a slender rod: m (r r^T + l l^T / 12) of its middle and its length.
+    second = np.einsum("k,ki,kj->ij", part, offset, offset) + np.einsum(
+        "k,ki,kj->ij", part, way, way) / 12
+    return {"mass_kg": float(part.sum()), "length_m": float(length.sum()),
+            "centre_m": centre.tolist(), "attached_m": skeleton.nodes[base].tolist(),
+            "inertia_kg_m2": (np.trace(second) * np.eye(3) - second).tolist(), "branch": run}
+
+
+def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: ReconstructSettings,
+                  progress: Progress) -> None:
+    """Name what the mesh leaves out by branch, length and mass, heaviest first.
+
+    Args:
+        masses: The twigs that are not in the mesh.
+        meshed: Mass of the mesh [kg].
+        settings: Whether the user accepts it.
+        progress: Gets what the user should know.
+
+    Raises:
+        MeshingError: it is over 3 % of all, and was not asked for.
+    """
+    if not masses:
+        return
+    total = sum(m["mass_kg"] for m in masses)
+    share = total / max(total + meshed, 1e-300)
+    first = sorted(masses, key=lambda m: -m["mass_kg"])[:_NAMED]
+    named = ", ".join(f"branch {m['branch']} ({1000 * m['length_m']:.0f} mm, "
+                      f"{1000 * m['mass_kg']:.3g} g)" for m in first)
+    more = f" and {len(masses) - _NAMED} more" if len(masses) > _NAMED else ""
+    text = (f"{len(masses)} branches of {sum(m['length_m'] for m in masses):.3g} m and "
+            f"{100 * share:.1f} % of the mass are not in the mesh: {named}{more}.")
+    asked = settings.leave_out or settings.twig_radius > 0 or settings.twig_order < 9
+    if share > _LEFT_OUT_MOST and not asked:
+        raise MeshingError(
+            text, "They would weigh on the branch, but neither bend nor be grasped.",
+            "Accept that (--leave-out), mesh with fTetWild (--mesher ftetwild), or mend the "
+            "skeleton there.")
+    progress.warn(f"{text} Their mass is kept.")
+
+
+def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
+    """Places where two branches touch that do not fork off each other there.
+
+    Returns:
+        For each pair of branches ``branches`` [2] and the place ``at_m`` [3] where they overlap
+        most.
+    """
+    tree = cKDTree(skeleton.nodes)
+    reach = 2 * float(skeleton.radius.max())
+    pairs = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2)
+    one, other = skeleton.branch[pairs[:, 0]], skeleton.branch[pairs[:, 1]]
+    overlap = skeleton.radius[pairs].sum(axis=1) - np.linalg.norm(
+        skeleton.nodes[pairs[:, 0]] - skeleton.nodes[pairs[:, 1]], axis=1)
+    start = np.array([members[0] for members in skeleton.runs()])
+    found: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    for place in np.flatnonzero((one != other) & (overlap > 0)):
+        key = tuple(sorted((int(one[place]), int(other[place]))))
+        at = skeleton.nodes[pairs[place]].mean(axis=0)
+        # Around the fork that joins them, or that both start from, they overlap as they should.
+        own = 3 * float(skeleton.radius[start[list(key)]].max())
+        if np.linalg.norm(skeleton.nodes[start[list(key)]] - at, axis=1).min() < own:
+            continue
+        if key not in found or overlap[place] > found[key][0]:
+            found[key] = float(overlap[place]), at
+    return [{"branches": list(key), "at_m": at.tolist()}
+            for key, (_, at) in sorted(found.items(), key=lambda item: -item[1][0])]
+
+
+def touching_texts(handles: int, touching: list[dict[str, Any]]) -> list[str]:
+    """What to tell of the handles of a surface: where branches grow together that are apart."""
+    if handles == 0:
+        return []
+    places = "; ".join(
+        f"branches {m['branches'][0]} and {m['branches'][1]} at ("
+        + ", ".join(f"{v:.3f}" for v in m["at_m"]) + ")" for m in touching[:_NAMED])
+    return [f"surface.ply has {handles} handle{'s' * (handles != 1)}: branches touch and grow "
+            f"together there that are apart in the skeleton{': ' + places if places else ''}. The "
+            "swept mesh keeps them apart."]

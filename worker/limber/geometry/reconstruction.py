@@ -1,0 +1,365 @@
+"""From a scan to tetrahedra: skeleton, surface and mesh of a branch, in its own frame."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from limber.core.alignment import Alignment
+from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
+from limber.core.errors import InputError
+from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.leaves import Leaf
+from limber.geometry.cloud.preparation import Prepared, prepare
+from limber.geometry.leaf_removal import (
+    check_agreed,
+    cut_off,
+    leaf_mask,
+    leaf_masses,
+    leaves_text,
+    without_leaves,
+)
+from limber.geometry.pruned_twigs import (
+    leave_out_twigs,
+    tell_left_out,
+    touching_runs,
+    touching_texts,
+    twig_mass,
+)
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.checkpoint import FoundSkeleton
+from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.edits import Edit, edited
+from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
+from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
+from limber.geometry.skeleton.upright import upright_rotation
+from limber.geometry.surface.forks import smooth_forks
+from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.tubes import branch_surface
+from limber.geometry.tets.marks import mark
+from limber.geometry.tets.quality import measure_quality
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
+
+Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
+"""Takes in a skeleton as it was found, and all that the search for it came to."""
+
+_OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # of cloud.ply, whatever the scan's are
+_LEAVES_ASKED = 0.2  # share of points on no round axis, from which leaves are looked for
+# Share of leaves that tells them by shape alone: of bare branches seen from one side up to 0.11 is
+# flat, of leafy seedlings 0.6 and more.
+_MOSTLY = 0.3
+
+
+@dataclass(frozen=True)
+class MeshedBranch:
+    """Surface and tetrahedra of an aligned skeleton.
+
+    Attributes:
+        skeleton: All of it, with the twigs that the mesh leaves out.
+        surface: Closed.
+        mesh: Marked with material, base, control points and grasp.
+        masses: Twigs left out, see :func:`leave_out_twigs`.
+        numbers: The stage's result as far as it is about them.
+    """
+
+    skeleton: Skeleton
+    surface: Surface
+    mesh: TetMesh
+    masses: list[dict[str, Any]]
+    numbers: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a scan became.
+
+    Attributes:
+        alignment: From the scan's coordinates to the branch's.
+        cloud: The prepared scan in the branch's frame.
+        meshed: Skeleton, surface and tetrahedra.
+        gravity: [m/s^2] in the branch's frame, shape [3].
+        numbers: The stage's result.
+    """
+
+    alignment: Alignment
+    cloud: Cloud
+    meshed: MeshedBranch
+    gravity: np.ndarray
+    numbers: dict[str, Any]
+
+
+def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleton | None = None,
+                      edits: Sequence[Edit] = (), eye: np.ndarray | None = None,
+                      known: FoundSkeleton | None = None, keep: Keep | None = None,
+                      progress: Progress = SILENT) -> Reconstruction:
+    """Make skeleton, surface and tetrahedra of a scan.
+
+    Args:
+        raw: The scan, in the file's unit.
+        settings: How.
+        own: The user's own skeleton in the scan's frame [m], instead of ours.
+        edits: What its user changed in the skeleton, in the file's coordinates; those that no
+            longer fit are left out and told.
+        eye: Where the depth camera stood [m], shape [3], if the scan is its image.
+        known: What an earlier run found of this scan with these settings, and did not come to use.
+        keep: Gets the alignment, the skeleton and what the search came to as soon as it is found,
+            before anything that may still refuse it or fail; not what is ``known``.
+        progress: Called as it goes; gets what the user should know.
+
+    Raises:
+        InputError: the scan or the skeleton cannot be used. WorkError: the work failed.
+    """
+    raw = raw.with_valid_columns(_OWN_COLUMNS)
+    prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=eye,
+                       up=np.array(settings.up, float))
+    for text in prepared.warnings:
+        progress.warn(text)
+    found, wood, leaves = (
+        _searched(prepared, settings, own, progress.part(0.02, 0.55)) if known is None
+        else _found_before(prepared, known, progress))
+    whole = found
+    if wood.view is not None and own is None:
+        found, text = seen_skeleton(found, wood, settings.silhouette_reach)
+        if text:
+            progress.warn(text)
+    alignment, cloud, found = _aligned(wood, found, settings)
+    if keep is not None and known is None:
+        keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
+    if own is None:
+        check_explained(whole, settings.unexplained)
+    # Kept beside the mesh's own, which edits of the skeleton make anew.
+    told = list(prepared.warnings)
+    for text in found.warnings_at(alignment.undo):
+        told.append(text)
+        progress.warn(text)
+    if edits:
+        found = _edited(found, [edit.aligned(alignment) for edit in edits], progress)
+        cloud = labelled(cloud, found.skeleton)
+    meshed = mesh_skeleton(found.skeleton, settings, progress.part(0.55, 0.98))
+    gravity = gravity_after(alignment, settings.up)
+    hung: list[dict[str, Any]] = []
+    if leaves:
+        cloud = _with_leaves(prepared, leaves, alignment, found.skeleton)
+        hung = leaf_masses(leaves, cloud.points, found.skeleton, settings.leaf_density)
+        meshed = replace(meshed, masses=[*meshed.masses, *hung])
+        told.append(leaves_text(hung, float(cloud.attributes["leaf"].mean())))
+        progress.warn(told[-1])
+    numbers = meshed.numbers | found.report() | {
+        "leaf_count": len(hung), "leaf_mass_kg": sum(leaf["mass_kg"] for leaf in hung),
+        "leaf_area_m2": sum(leaf["area_m2"] for leaf in hung),
+        "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,
+        "skeleton_warnings": told}
+    return Reconstruction(alignment, cloud, meshed, gravity, numbers)
+
+
+def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
+              progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
+    """The skeleton, the part of the scan that it was found of, and the leaves cut off that."""
+    found = _skeleton(prepared, settings, own, progress)
+    if own is not None or settings.leaves == "keep":
+        return found, prepared, []
+    if _may_be_leafy(found, prepared, settings):
+        wood, leaves = without_leaves(prepared, found=found)
+    elif prepared.view is None:
+        # A few fat rods may explain leaves that curl, in few points: what most of a scan is, its
+        # shape tells.
+        wood, leaves = without_leaves(prepared, _MOSTLY, found)
+    else:
+        return found, prepared, []
+    if settings.leaves == "ask":
+        check_agreed(prepared, leaves, settings.unit)
+    return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
+        found, prepared, [])
+
+
+def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
+                  ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
+    cut = sum(len(leaf.points) for leaf in known.leaves)
+    if len(known.result.node_of_point) + cut != len(prepared.cloud):
+        raise InputError(f"The skeleton that was found before is of {len(known.result.residual)} "
+                         f"points, the scan has {len(prepared.cloud) - cut}.",
+                         "It is of another scan.", "Reconstruct again with --force.")
+    wood, leaves = cut_off(prepared, known.leaves)
+    progress(0.55, "skeleton, as it was found before")
+    return known.result, wood, leaves
+
+
+def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
+    """Return a cloud that says which node each point belongs to, and how far off it lies [m]."""
+    node, residual = nearest_cylinders(skeleton, cloud.points)
+    return replace(cloud, attributes=cloud.attributes | {
+        "skeleton_node": node.astype(np.int32), "residual": residual.astype(np.float32)})
+
+
+def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: ReconstructSettings) -> bool:
+    """Whether so much lies on no round axis that leaves are looked for.
+
+    Leaves can swell the axes until half of what is on them counts as wood: a scan that would be
+    taken is asked too, whatever share its user allows. A depth camera's scatter alone does that
+    without a leaf; 3 mm of noise on branches of 3 mm radius leaves 15 % off the axes.
+    """
+    if found.leafy or (prepared.view is None and unexplained_share(found) > min(
+            settings.unexplained, _LEAVES_ASKED)):
+        return True
+    try:
+        check_explained(found, settings.unexplained)
+    except InputError:
+        return True
+    return False
+
+
+def _with_leaves(prepared: Prepared, leaves: list[Leaf], alignment: Alignment, skeleton: Skeleton,
+                 ) -> Cloud:
+    """The whole aligned scan, with ``leaf`` 1 where its points lie on leaves."""
+    turn = np.array(alignment.rotation)
+    points = alignment.apply((prepared.cloud.points + prepared.origin) / alignment.scale)
+    attributes = dict(prepared.cloud.attributes)
+    if "normal" in attributes:
+        attributes["normal"] = (attributes["normal"] @ turn.T).astype(np.float32)
+    attributes["leaf"] = leaf_mask(leaves, len(points)).astype(np.uint8)
+    return labelled(replace(prepared.cloud, points=points, attributes=attributes), skeleton)
+
+
+def _edited(found: SkeletonResult, edits: Sequence[Edit], progress: Progress) -> SkeletonResult:
+    misfits: list[str] = []
+    skeleton = edited(found.skeleton, edits, misfits)
+    for text in misfits:
+        progress.warn(f"{text} It was left out.")
+    return replace(found, skeleton=skeleton)
+
+
+def gravity_after(alignment: Alignment, up: tuple[float, float, float]) -> np.ndarray:
+    """Return gravity [m/s^2] in the branch's frame, of a file in whose axes ``up`` is up."""
+    unit = np.array(up) / np.linalg.norm(up)
+    return -STANDARD_GRAVITY * np.array(alignment.rotation) @ unit
+
+
+def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
+                  progress: Progress = SILENT) -> MeshedBranch:
+    """Make surface and mesh of an aligned skeleton."""
+    kept, masses = leave_out_twigs(skeleton, settings)
+    surface, check, sharp = smooth_forks(branch_surface(kept), kept)
+    check.require()
+    for text in sharp:
+        progress.warn(text)
+    progress(0.1, "surface", faces=len(surface.faces))
+    meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
+    for text in meshed.warnings:
+        progress.warn(text)
+    masses += [twig_mass(kept, run, settings.density) for run in meshed.left_out]
+    tell_left_out(masses, float(meshed.mesh.volumes.sum()) * settings.density, settings, progress)
+    touching = touching_runs(kept)
+    for text in touching_texts(surface.handle_count, touching):
+        progress.warn(text)
+    mesh = mark(meshed.mesh, kept, young=settings.young, poisson=settings.poisson,
+                density=settings.density, fractions=FRACTIONS,
+                grasp_fraction=settings.grasp_fraction)
+    progress(1.0, "mesh", tets=mesh.tet_count)
+    numbers = _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
+        "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses),
+        "surface_handles": surface.handle_count, "touching": touching}
+    return MeshedBranch(skeleton, surface, mesh, masses, numbers)
+
+
+def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed: MeshResult,
+             kept: Skeleton) -> dict[str, Any]:
+    quality = measure_quality(meshed.mesh, surface.volume, kept, surface)
+    return {
+        "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
+        "length_m": skeleton.length, "main_length_m": float(
+            skeleton.arc_length[skeleton.main_path()[-1]]),
+        "radius_min_m": float(skeleton.radius.min()), "radius_max_m": float(skeleton.radius.max()),
+        "radius_sigma_median_m": float(np.median(skeleton.radius_sigma)),
+        "clamped_radius_count": int((skeleton.radius_state == LIMITED).sum()),
+        "interpolated_radius_count": int((skeleton.radius_state == INTERPOLATED).sum()),
+        "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
+        "tet_count": meshed.mesh.tet_count, "mesh_node_count": meshed.mesh.node_count,
+        "mesher": meshed.mesher, "watertight": check["watertight"], "surface_check": check,
+        "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb()}
+
+
+def peak_memory_mb() -> float:
+    """Most memory that this process has held [MB]."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        import psutil
+
+        return psutil.Process().memory_info().peak_wset / 1e6
+    import sys
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
+                  ) -> tuple[SkeletonResult, str]:
+    """Hold a skeleton against the depth camera's image: twigs and radii; and what to tell.
+
+    Args:
+        found: The skeleton of the cloud.
+        prepared: The cloud, and where it was seen from.
+        reach: ``silhouette_reach`` of the settings.
+    """
+    skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
+    skeleton, limited = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
+    if not (dropped or limited):
+        return replace(found, skeleton=skeleton), ""
+    node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
+    text = ""
+    if dropped:
+        longest = max(twig["length"] for twig in dropped)
+        text = (f"{len(dropped)} twigs (up to {1000 * longest:.0f} mm) were dropped: in the depth "
+                "camera's image they do not leave their carrier, so they may be noise of its "
+                "depth (--silhouette-reach).")
+    return replace(found, skeleton=skeleton, node_of_point=node, residual=residual,
+                   pruned=found.pruned + len(dropped)), text
+
+
+def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
+              progress: Progress) -> SkeletonResult:
+    if own is not None:
+        from limber.geometry.skeleton.skeletonise import given_skeleton
+
+        if (own.radius <= 0).any():
+            raise InputError(
+                f"{int((own.radius <= 0).sum())} of {own.node_count} nodes of the given skeleton "
+                "have radius 0.", "A branch has a thickness.",
+                "Give each node its radius, or reconstruct from the cloud instead.")
+        size = np.linalg.norm(np.ptp(own.nodes, axis=0))
+        extent = np.linalg.norm(np.ptp(prepared.cloud.points, axis=0))
+        if size > 10 * extent:
+            raise InputError(
+                f"The skeleton is {size:.3g} m wide, the cloud {extent:.3g} m.",
+                "They do not belong together, or are in different units.",
+                "Give the skeleton in the cloud's coordinates and unit (--unit is for both).")
+        return given_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
+    scale = UNIT_METRES[settings.unit]
+    root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
+    return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
+                       camera=prepared.view is not None, progress=progress,
+                       where=lambda place: (place + prepared.origin) / scale)
+
+
+def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,
+             ) -> tuple[Alignment, Cloud, SkeletonResult]:
+    """Move the root to the origin and turn the branch upright."""
+    root = found.skeleton.nodes[0]
+    rotation = upright_rotation(found.skeleton, np.array(settings.up), settings.upright)
+    attributes = dict(prepared.cloud.attributes)
+    if "normal" in attributes:
+        attributes["normal"] = (attributes["normal"] @ rotation.T).astype(np.float32)
+    attributes["skeleton_node"] = found.node_of_point.astype(np.int32)
+    attributes["residual"] = found.residual.astype(np.float32)
+    cloud = replace(prepared.cloud, points=(prepared.cloud.points - root) @ rotation.T,
+                    attributes=attributes)
+    alignment = Alignment(scale=UNIT_METRES[settings.unit],
+                          origin=tuple((prepared.origin + root).tolist()),
+                          rotation=tuple(map(tuple, rotation.tolist())))
+    return alignment, cloud, found.moved(lambda points: (points - root) @ rotation.T)

@@ -1,0 +1,178 @@
+"""What the search for a skeleton came to, as a file: who is stopped after it goes on from there.
+
+Every number comes back to its last bit, so that the surface and the mesh made of it are those of
+an undisturbed run.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from limber.core.errors import InputError
+from limber.core.files.reading import read_arrays, require_shapes
+from limber.core.json_values import plain
+from limber.geometry.cloud.leaves import Leaf
+from limber.geometry.skeleton.contraction.laplacian_contraction import (
+    Contraction,
+    ContractionStatus,
+)
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeletonise import SkeletonResult
+
+_WHAT = "a skeleton as reconstruct has found it"
+_SKELETON: dict[str, tuple[int | str, ...]] = {
+    "nodes": ("n", 3), "parent": ("n",), "radius": ("n",), "radius_sigma": ("n",),
+    "branch": ("n",), "order": ("n",), "radius_state": ("n",), "probability": ("n",)}
+_POINTS: dict[str, tuple[int | str, ...]] = {
+    "node_of_point": ("m",), "residual": ("m",), "contracted": ("c", 3), "linearity": ("c",),
+    "leaf_points": ("l",)}
+_Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class FoundSkeleton:
+    """A skeleton in the prepared cloud's frame, and of what part of the cloud it was found.
+
+    Attributes:
+        result: What the search came to.
+        leaves: What was cut off the prepared cloud first.
+    """
+
+    result: SkeletonResult
+    leaves: list[Leaf]
+
+    def write(self, path: Path) -> None:
+        """Write an NPZ file."""
+        result = self.result
+        told = {name: getattr(result, name) for name in (
+            "noise", "bridges", "split_off", "loops", "pruned", "second_base", "other_root",
+            "leafy", "unlikely")} | {
+            "iterations": result.contraction.iterations, "status": result.contraction.status,
+            "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
+        np.savez(path, told=np.array(json.dumps(plain(told))), **asdict(result.skeleton),
+                 node_of_point=result.node_of_point, residual=result.residual,
+                 contracted=result.contraction.points, linearity=result.contraction.linearity,
+                 leaf_points=np.concatenate([np.zeros(0, np.int64), *(
+                     leaf.points for leaf in self.leaves)]))
+
+    @classmethod
+    def read(cls, path: Path) -> "FoundSkeleton":
+        """Read what :meth:`write` has written.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        arrays = read_arrays(path, _WHAT)
+        require_shapes(path, arrays, _SKELETON | _POINTS, _WHAT)
+        skeleton = Skeleton(**{name: arrays[name] for name in _SKELETON})
+        told = _told(path, arrays)
+        if not _is_tree(skeleton.parent) or not _are_below(
+                arrays["node_of_point"], skeleton.node_count):
+            raise _damaged(path, "Its nodes hang on no tree.")
+        if not ((skeleton.radius > 0).all() and 0 < skeleton.length < np.inf):
+            raise _damaged(path, "Its axes have no length, or no thickness.")
+        contraction = Contraction(arrays["contracted"], arrays["linearity"], told.iterations,
+                                  told.status)
+        return cls(SkeletonResult(
+            skeleton, contraction, arrays["node_of_point"], arrays["residual"], told.noise,
+            [bridge.found() for bridge in told.bridges],
+            [piece.found() for piece in told.split_off], told.loops, told.pruned,
+            _place(told.second_base), _place(told.other_root), told.leafy,
+            [twig.found() for twig in told.unlikely]), _leaves(path, arrays, told))
+
+
+class _Part(BaseModel):
+    """A place of the search's report, as a dict of numbers and positions."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    def found(self) -> dict[str, Any]:
+        return {name: np.array(value) if isinstance(value, tuple) else value
+                for name, value in self.model_dump(by_alias=True).items()}
+
+
+class _Bridge(_Part):
+    start: _Place = Field(alias="from")
+    to: _Place
+    length: float
+    price: float
+
+
+class _Piece(_Part):
+    points: int
+    distance: float
+    at: _Place
+
+
+class _Twig(_Part):
+    length: float
+    at: _Place
+    probability: float
+
+
+class _Leaf(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    count: int = Field(ge=1)
+    area: float
+
+
+class _Told(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    noise: float
+    bridges: list[_Bridge]
+    split_off: list[_Piece]
+    loops: list[float]
+    pruned: int
+    second_base: _Place | None
+    other_root: _Place | None
+    leafy: bool
+    unlikely: list[_Twig]
+    iterations: int
+    status: ContractionStatus
+    leaves: list[_Leaf]
+
+
+def _told(path: Path, arrays: dict[str, np.ndarray]) -> _Told:
+    text = arrays.get("told", np.zeros(0))
+    if text.dtype.kind != "U" or text.ndim != 0:
+        raise _damaged(path, "It lacks the report of the search.")
+    try:
+        return _Told.model_validate_json(str(text))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise _damaged(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
+
+
+def _leaves(path: Path, arrays: dict[str, np.ndarray], told: _Told) -> list[Leaf]:
+    points = arrays["leaf_points"]
+    ends = np.cumsum([leaf.count for leaf in told.leaves], dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    if len(points) != total or len(np.unique(points)) != total or not _are_below(
+            points, len(arrays["node_of_point"]) + total):
+        raise _damaged(path, "Its leaves are not parts of the scan.")
+    return [Leaf(own, leaf.area) for own, leaf in zip(
+        np.split(points, ends[:-1]), told.leaves, strict=True)] if total else []
+
+
+def _is_tree(parent: np.ndarray) -> bool:
+    """Whether the first node is the root and each other hangs on one before it."""
+    return (parent.dtype.kind == "i" and len(parent) > 1 and parent[0] == -1
+            and bool(((parent[1:] >= 0) & (parent[1:] < np.arange(1, len(parent)))).all()))
+
+
+def _are_below(index: np.ndarray, count: int) -> bool:
+    return index.dtype.kind == "i" and bool(((index >= 0) & (index < count)).all())
+
+
+def _place(place: _Place | None) -> np.ndarray | None:
+    return None if place is None else np.array(place)
+
+
+def _damaged(path: Path, why: str) -> InputError:
+    return InputError(f"{path} cannot be used.", why, "Reconstruct again with --force.")

@@ -1,0 +1,70 @@
+"""Twigs that start backwards, led straight back to their carrier.
+
+Where a scan lacks a twig's foot, it hangs on what was nearest: often a place farther out on its
+carrier, from which it first comes back. Wood forks forwards: followed back along its own line, such
+a twig meets its carrier nearer to the root.
+"""
+
+import numpy as np
+
+from limber.geometry.skeleton.doubtful_parts import start_angle
+from limber.geometry.skeleton.skeleton import Skeleton
+
+_BACKWARDS = np.deg2rad(80.0)  # angle to its carrier, from which a twig is looked at
+_FORWARDS = np.deg2rad(75.0)  # that it may have where it is led to
+_SKIPPED, _LED = 6.0, 10.0  # carrier's radii along its start, and straight back to the carrier
+_AHEAD, _LEAST = 8, 4  # nodes that tell its own line
+_NEAR = 1.2  # carrier's radii by which that may miss the carrier's axis
+
+
+def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
+    """Return the skeleton with such twigs hung anew, and how many there were."""
+    parent, keep, count = skeleton.parent.copy(), np.ones(skeleton.node_count, bool), 0
+    runs = skeleton.runs()
+    carried = set(np.flatnonzero(skeleton.child_counts() > 1).tolist())
+    for members in runs[1:]:
+        if start_angle(skeleton, members) < _BACKWARDS:
+            continue
+        found = _straight_back(skeleton, members, runs[int(skeleton.branch[members[0]])])
+        if found is None:
+            continue
+        place, fork = found
+        # What hangs on a start that would go keeps it.
+        if carried.isdisjoint(members[1:place].tolist()):
+            keep[members[1:place]] = False
+            parent[members[place]] = fork
+            count += 1
+    if count == 0:
+        return skeleton, 0
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
+    return Skeleton.from_edges(
+        skeleton.nodes[keep], moved, skeleton.radius[keep],
+        radius_sigma=skeleton.radius_sigma[keep], radius_state=skeleton.radius_state[keep]), count
+
+
+def _straight_back(skeleton: Skeleton, members: np.ndarray, carrier: np.ndarray,
+                   ) -> tuple[int, int] | None:
+    """The place in a run from which it is straight, and the carrier's node that it comes from."""
+    nodes, radius = skeleton.nodes, skeleton.radius
+    inner = carrier[1:]
+    outwards = nodes[inner] - nodes[skeleton.parent[inner]]
+    start, length = float(radius[members[0]]), 0.0
+    best, least = None, _NEAR
+    for place in range(1, len(members) - _LEAST):
+        length += float(np.linalg.norm(nodes[members[place]] - nodes[members[place - 1]]))
+        if place > 1 and length > _SKIPPED * start:
+            break
+        first = nodes[members[place]]
+        way = nodes[members[min(place + _AHEAD, len(members) - 1)]] - first
+        way /= max(float(np.linalg.norm(way)), 1e-300)
+        to_twig = first - nodes[inner]
+        back = to_twig @ way
+        missed = np.linalg.norm(to_twig - back[:, None] * way, axis=1) / radius[inner]
+        size = np.linalg.norm(outwards, axis=1) * np.linalg.norm(to_twig, axis=1)
+        cosine = np.einsum("kj,kj->k", outwards, to_twig) / np.maximum(size, 1e-300)
+        able = (back > 0) & (back < _LED * start) & (cosine > np.cos(_FORWARDS))
+        near = int(np.argmin(np.where(able, missed, np.inf)))
+        if able[near] and missed[near] < least:
+            best, least = (place, int(inner[near])), float(missed[near])
+    return best

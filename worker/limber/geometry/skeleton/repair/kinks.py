@@ -1,0 +1,69 @@
+"""Kinks within a branch that wood does not make: folded ends go, others are rounded."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.geometry.skeleton.doubtful_parts import KINK, turns
+from limber.geometry.skeleton.skeleton import Skeleton
+
+_END = 8.0  # radii from a kink to the tip, up to which what lies beyond is a folded end
+_ROUNDED = 4.0  # radii to each side of a kink that are evened out
+_ROUNDS = 60
+
+
+def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
+    """Mend kinks of over 70 degrees within runs.
+
+    Where a run folds back near its tip and carries nothing beyond, contraction led it back along
+    itself: it ends at the kink. Elsewhere nodes around the kink are evened out, as far as wood
+    bends.
+
+    Returns:
+        The skeleton, and how many kinks were mended.
+    """
+    count = 0
+    while True:
+        beyond = _folded(skeleton)
+        if len(beyond) == 0:
+            break
+        keep = np.ones(skeleton.node_count, bool)
+        keep[beyond] = False
+        skeleton, count = skeleton.subset(keep), count + 1
+    nodes = skeleton.nodes.copy()
+    for members in skeleton.runs():
+        sharp = np.flatnonzero(turns(skeleton, members) > KINK)
+        if len(sharp):
+            count += int((np.diff(sharp) > 1).sum()) + 1
+            _round_off(skeleton, nodes, members)
+    return replace(skeleton, nodes=nodes), count
+
+
+def _folded(skeleton: Skeleton) -> np.ndarray:
+    """Nodes of one folded end beyond its kink; none if there is none."""
+    children = skeleton.child_counts()
+    for members in skeleton.runs():
+        for place in np.flatnonzero(turns(skeleton, members) > KINK):
+            rest = members[place:]
+            step = np.linalg.norm(np.diff(skeleton.nodes[rest], axis=0), axis=1)
+            if place > 1 and len(rest) > 1 and (children[rest] < 2).all() and (
+                    step.sum() < _END * skeleton.radius[rest[0]]):
+                return rest[1:]
+    return np.empty(0, np.int64)
+
+
+def _round_off(skeleton: Skeleton, nodes: np.ndarray, members: np.ndarray) -> None:
+    """Even out a run's ``nodes`` around its kinks, in place."""
+    for _ in range(_ROUNDS):
+        now = skeleton.moved(nodes)
+        sharp = np.flatnonzero(turns(now, members) > KINK)
+        if len(sharp) == 0:
+            return
+        along = np.concatenate([[0], np.cumsum(np.linalg.norm(
+            np.diff(nodes[members], axis=0), axis=1))])
+        reach = _ROUNDED * skeleton.radius[members[sharp]]
+        near = (np.abs(along[:, None] - along[sharp]) < reach).any(axis=1)
+        near[[0, -1]] = False
+        inner = np.flatnonzero(near)
+        old = nodes[members]
+        nodes[members[inner]] = 0.5 * old[inner] + 0.25 * (old[inner - 1] + old[inner + 1])

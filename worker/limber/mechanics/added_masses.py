@@ -1,0 +1,172 @@
+"""What hangs on a branch beside its mesh: point masses, and stiff twigs with their own inertia.
+
+A twig that the mesh leaves out moves and turns with the section that carries it: a place p of it is
+at x(c) + F (p - c), with c the middle of an element there and F that element's mean deformation
+gradient. For a turn of any size that is exact, and linear in the nodes' displacements: its weight
+is a constant load (with the moment of its arm), its inertia a constant part of the mass matrix,
+both the same in each axis. The twig is shared out over the elements around its foot, so that it
+couples no nodes that the stiffness does not couple.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+
+from limber.core.errors import InputError
+from limber.geometry.tets.tet_mesh import TetMesh
+
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A mass that hangs on the branch (a fruit, a flower).
+
+    Attributes:
+        position: Where [m]; it is tied to the nearest node.
+        mass: [kg].
+    """
+
+    position: Place
+    mass: float
+
+    def heavier(self, factor: float) -> "PointMass":
+        """Return it ``factor`` times as heavy."""
+        return replace(self, mass=factor * self.mass)
+
+
+@dataclass(frozen=True)
+class HungTwig(PointMass):
+    """A twig that is not meshed: a stiff body that goes with the section it grows from.
+
+    Attributes:
+        position: Its centre of mass [m].
+        attached: Where it grows from [m].
+        inertia: About its centre of mass [kg m^2], three rows.
+    """
+
+    attached: Place
+    inertia: tuple[Place, Place, Place]
+
+    def heavier(self, factor: float) -> "HungTwig":
+        """Return it ``factor`` times as dense."""
+        x, y, z = (_scaled(row, factor) for row in self.inertia)
+        return replace(self, mass=factor * self.mass, inertia=(x, y, z))
+
+
+def _scaled(row: Place, factor: float) -> Place:
+    x, y, z = row
+    return factor * x, factor * y, factor * z
+
+
+@dataclass(frozen=True)
+class Tied:
+    """How an added mass goes with the nodes, over the t elements (or one node) that carry it.
+
+    Attributes:
+        added: What is tied.
+        nodes: Shape [t, a].
+        share: Of the mass, shape [t].
+        centre: Weights of the nodes' displacements in the centre of mass's, shape [t, a].
+        slopes: Weights of the nodes' displacements in their gradient [1/m], shape [t, 3, a].
+    """
+
+    added: PointMass
+    nodes: np.ndarray
+    share: np.ndarray
+    centre: np.ndarray
+    slopes: np.ndarray
+
+    def entries(self) -> np.ndarray:
+        """Its part of the mass matrix [kg] of each axis, over ``nodes``, shape [t, a, a]."""
+        blocks = self.added.mass * np.einsum("ta,tb->tab", self.centre, self.centre)
+        if isinstance(self.added, HungTwig):
+            inertia = np.array(self.added.inertia)
+            second = np.trace(inertia) / 2 * np.eye(3) - inertia
+            blocks += np.einsum("tia,ij,tjb->tab", self.slopes, second, self.slopes)
+        return self.share[:, None, None] * blocks
+
+    def moved(self, displacement: np.ndarray) -> PointMass:
+        """Return it where a displacement of the nodes [m], shape [node_count, 3], takes it."""
+        local = displacement[self.nodes]
+        way = np.einsum("t,ta,taj->j", self.share, self.centre, local)
+        position = np.array(self.added.position) + way
+        if not isinstance(self.added, HungTwig):
+            return replace(self.added, position=tuple(position))
+        turn = np.eye(3) + np.einsum("t,tia,taj->ji", self.share, self.slopes, local)
+        left, _, right = np.linalg.svd(turn)
+        turn = left @ right
+        arm = np.array(self.added.position) - np.array(self.added.attached)
+        x, y, z = map(tuple, turn @ np.array(self.added.inertia) @ turn.T)
+        return replace(self.added, position=tuple(position),
+                       attached=tuple(position - turn @ arm),
+                       inertia=(x, y, z))
+
+
+def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weights: np.ndarray,
+         volume_weights: np.ndarray) -> list[Tied]:
+    """Tie masses to the nodes of a mesh.
+
+    Args:
+        mesh: The branch.
+        added: What hangs on it.
+        gradients: Of the shape functions at rest [1/m], shape [tet_count, q, 3, a].
+        weights: Of the quadrature points [m^3], shape [tet_count, q].
+        volume_weights: Integrals of the shape functions [m^3], shape [tet_count, a].
+
+    Raises:
+        InputError: a mass is negative or not finite.
+    """
+    found = []
+    for one in added:
+        if not (np.isfinite(one.mass) and one.mass >= 0):
+            raise InputError(f"An added mass of {one.mass} kg.", "It must be 0 or more.",
+                             "Give the mass in kilograms.")
+        if not isinstance(one, HungTwig):
+            distance = np.linalg.norm(mesh.nodes - np.asarray(one.position), axis=1)
+            found.append(Tied(one, np.array([[distance.argmin()]]), np.ones(1), np.ones((1, 1)),
+                              np.zeros((1, 3, 1))))
+            continue
+        tets = _around(mesh, np.array(one.attached))
+        volume = weights[tets].sum(axis=1)
+        slopes = np.einsum("tq,tqia->tia", weights[tets], gradients[tets]) / volume[:, None, None]
+        mean = volume_weights[tets] / volume[:, None]
+        middle = np.einsum("ta,taj->tj", mean, mesh.nodes[mesh.tets[tets]])
+        centre = mean + np.einsum("ti,tia->ta", np.array(one.position) - middle, slopes)
+        found.append(Tied(one, mesh.tets[tets], volume / volume.sum(), centre, slopes))
+    return found
+
+
+def nodal_masses(ties: Iterable[Tied], count: int) -> np.ndarray:
+    """Return the mass that gravity acts on at each node [kg], shape [count].
+
+    With that of twigs goes the moment about their feet: some nodes have less than nothing.
+    """
+    total = np.zeros(count)
+    for one in ties:
+        np.add.at(total, one.nodes, one.added.mass * one.share[:, None] * one.centre)
+    return total
+
+
+def mass_entries(ties: Iterable[Tied], count: int) -> sp.csr_matrix:
+    """Return their part of the mass matrix [kg] of each axis, shape [count, count]."""
+    total = sp.csr_matrix((count, count))
+    for one in ties:
+        width = one.nodes.shape[1]
+        rows, columns = np.repeat(one.nodes, width, axis=1), np.tile(one.nodes, (1, width))
+        total = total + sp.csr_matrix(
+            (one.entries().ravel(), (rows.ravel(), columns.ravel())), (count, count))
+    return total
+
+
+def _around(mesh: TetMesh, foot: np.ndarray) -> np.ndarray:
+    """The elements of the section around a foot: within an edge's length, at least the nearest."""
+    distance = np.linalg.norm(mesh.centroids - foot, axis=1)
+    nearest = int(distance.argmin())
+    corners = mesh.nodes[mesh.tets[nearest, :4]]
+    edges = np.linalg.norm(corners[:, None] - corners, axis=2)[np.triu_indices(4, 1)]
+    near = distance <= edges.mean()
+    near[nearest] = True
+    return np.flatnonzero(near)

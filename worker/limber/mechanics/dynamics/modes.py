@@ -1,0 +1,75 @@
+"""Lowest natural frequencies and modes about an equilibrium."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from limber.core.errors import ConvergenceError
+from limber.mechanics.linear.equations import Tangent
+from limber.mechanics.model import BranchModel
+
+_SPARE = 4
+_ITERATIONS = 60
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Small free vibrations, undamped.
+
+    Attributes:
+        frequencies: [Hz], ascending, shape [k].
+        shapes: Of unit modal mass [kg^-1/2], shape [k, node_count, 3].
+    """
+
+    frequencies: np.ndarray
+    shapes: np.ndarray
+
+
+def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None = None) -> Modes:
+    """Return the lowest modes by subspace iteration (Bathe) on one factorisation.
+
+    Args:
+        model: Of the hanging branch, or one without weight.
+        count: Of modes.
+        displacement: Of the equilibrium about which it swings [m], shape [node_count, 3]; default
+            the mesh's own shape.
+
+    Raises:
+        NotPositiveDefiniteError: it is no stable equilibrium.
+        ConvergenceError: the iteration does not settle.
+    """
+    at = np.zeros_like(model.mesh.nodes) if displacement is None else displacement
+    tangent = model.equations(()).tangent(model, at)
+    vectors = np.random.default_rng(0).standard_normal((count + _SPARE, *model.mesh.nodes.shape))
+    vectors[:, model.fixed] = 0.0
+    before = np.zeros(count)
+    for _ in range(_ITERATIONS):
+        squares, vectors = subspace_round(model, tangent, vectors)
+        if np.abs(squares[:count] - before).max() <= _TOLERANCE * squares[:count].max():
+            return Modes(np.sqrt(squares[:count]) / (2 * np.pi), vectors[:count])
+        before = squares[:count]
+    raise ConvergenceError(f"The {count} lowest modes have not settled in {_ITERATIONS} rounds.",
+                           "They may lie very close together.", "Ask for fewer.")
+
+
+def subspace_round(model: BranchModel, tangent: Tangent, vectors: np.ndarray,
+                   ) -> tuple[np.ndarray, np.ndarray]:
+    """Do one round of subspace iteration (Bathe), with Rayleigh and Ritz.
+
+    Args:
+        tangent: Of the equilibrium.
+        vectors: Of the subspace, shape [k, node_count, 3].
+
+    Returns:
+        Squared angular frequencies [1/s^2], ascending, shape [k], and their modes, of unit modal
+        mass, of the subspace one round on.
+    """
+    pushed = np.array([model.mass_times(vector) for vector in vectors])
+    vectors = np.array([tangent.solve(force) for force in pushed])
+    flat = vectors.reshape(len(vectors), -1)
+    stiffness = flat @ pushed.reshape(len(vectors), -1).T
+    mass = flat @ np.array([model.mass_times(vector).ravel() for vector in vectors]).T
+    squares, mix = eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
+    return squares, np.tensordot(mix.T, vectors, axes=1)

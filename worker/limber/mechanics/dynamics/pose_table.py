@@ -1,0 +1,57 @@
+"""A gripper's way as a table of poses, from a recording or a plan."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class PoseTable:
+    """Poses of a gripper over time; what counts is how it moves from the first of them.
+
+    Attributes:
+        times: [s], ascending, shape [n].
+        poses: Position and rotation vector [m, rad], shape [n, 6].
+
+    Raises:
+        InputError: fewer than two poses, or values that are not finite.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.poses.shape != (len(self.times), 6) or len(self.times) < 2 or not (
+                np.isfinite(self.poses).all() and np.isfinite(self.times).all()
+                and np.all(np.diff(self.times) > 0)):
+            raise InputError(f"A table of {len(self.times)} poses, of shape {self.poses.shape}.",
+                             "A way needs two poses or more, finite, at ascending times.",
+                             "Give t_s, x_m, y_m, z_m, rx_rad, ry_rad, rz_rad in each row.")
+
+    @property
+    def duration(self) -> float:
+        """From the first pose to the last [s]."""
+        return float(self.times[-1] - self.times[0])
+
+    def changes(self, times: np.ndarray) -> np.ndarray:
+        """Return how the gripper has moved and turned since the first pose, shape [m, 6].
+
+        Args:
+            times: Since the first pose [s], shape [m]; after the last it stays.
+        """
+        from scipy.spatial.transform import Rotation, Slerp
+
+        since = self.times - self.times[0]
+        at = np.clip(times, 0.0, since[-1])
+        moved = np.column_stack([np.interp(at, since, column - column[0])
+                                 for column in self.poses[:, :3].T])
+        turns = Rotation.from_rotvec(self.poses[:, 3:].copy())
+        turned = Slerp(since, turns * turns[0].inv())(at).as_rotvec()
+        return np.hstack([moved, turned])
+
+    def digest(self) -> str:
+        """What tells one way from another."""
+        return hashlib.sha256(np.column_stack([self.times, self.poses]).tobytes()).hexdigest()

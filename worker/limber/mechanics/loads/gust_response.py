@@ -1,0 +1,162 @@
+"""Gusts: how far beyond its mean the wind's unevenness swings a branch.
+
+Turbulence is the same along the whole branch, which is shorter than a gust; across the wind it is
+left out. The branch answers by its lowest modes about where the mean wind holds it, and the rest
+of it at once, as if it were slow.
+
+Sources: A. G. Davenport, *Note on the distribution of the largest value of a random function with
+application to gust loading*, 1964; EN 1991-1-4:2005, annex B, for spectrum (B.1), peak factor
+(B.4), rate of crossings (B.5).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from limber.mechanics.dynamics.modes import lowest_modes
+from limber.mechanics.materials.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+
+_MODES = 6
+_LEAST_PEAK = 3.0
+_LEAST_CROSSING = 0.08
+_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class Swaying:
+    """How one displacement of a branch answers a force that grows and shrinks as a whole.
+
+    Attributes:
+        frequencies: Of the modes [Hz], shape [k].
+        damping: Shares of critical damping, the air's included, shape [k].
+        shares: Of each mode in the static answer; what is left to 1 follows at once, shape [k].
+    """
+
+    frequencies: np.ndarray
+    damping: np.ndarray
+    shares: np.ndarray
+
+    def transfer(self, frequency: np.ndarray) -> np.ndarray:
+        """Return the answer over the static one at frequencies [Hz], complex."""
+        ratio = np.asarray(frequency, float)[:, None] / self.frequencies
+        modes = self.shares / (1 - ratio**2 + 2j * self.damping * ratio)
+        return 1 - self.shares.sum() + modes.sum(axis=1)
+
+
+@dataclass(frozen=True)
+class GustResponse:
+    """What gusts make of a mean load.
+
+    Attributes:
+        factor: The load that, at rest, bends the branch as far as the peak of its swaying does,
+            over the mean load.
+        deviation: Standard deviation of the displacement over its mean.
+        peak_factor: Standard deviations from mean to peak.
+        crossing: How often the displacement crosses its mean upwards [Hz].
+        dynamic: Standard deviation over that of a branch that follows at once.
+    """
+
+    factor: float
+    deviation: float
+    peak_factor: float
+    crossing: float
+    dynamic: float
+
+
+def swaying(model: BranchModel, displacement: np.ndarray, force: np.ndarray, tip: int,
+            damping: RayleighDamping, air: np.ndarray | None = None) -> Swaying:
+    """Return how a node's displacement answers a force about an equilibrium.
+
+    Args:
+        model: The branch.
+        displacement: Of the equilibrium [m], shape [node_count, 3].
+        force: What grows and shrinks [N], shape [node_count, 3].
+        tip: The node; along the direction in which the force moves it.
+        damping: Of the wood.
+        air: Force of the air on a velocity [N s/m], shape [3 node_count, 3 node_count] or as a
+            product with it; None: none.
+    """
+    tangent = model.equations(()).tangent(model, displacement)
+    static = tangent.solve(force)[tip]
+    way = static / np.linalg.norm(static)
+    modes = lowest_modes(model, _MODES, displacement)
+    omega = 2 * np.pi * modes.frequencies
+    loads = np.einsum("kni,ni->k", modes.shapes, force)
+    shares = modes.shapes[:, tip] @ way * loads / omega**2 / float(static @ way)
+    share = (damping.mass / omega + damping.stiffness * omega) / 2
+    if air is not None:
+        flat = modes.shapes.reshape(len(omega), -1)
+        share = share + np.einsum("ki,ki->k", flat, (air @ flat.T).T) / (2 * omega)
+    return Swaying(modes.frequencies, share, shares)
+
+
+def wind_spectrum(frequency: np.ndarray, speed: float, length: float) -> np.ndarray:
+    """Return the spectrum of the speed along the wind over its variance [1/Hz], EN 1991-1-4 B.1.
+
+    Args:
+        frequency: [Hz].
+        speed: Mean [m/s].
+        length: Turbulent length scale [m].
+    """
+    slowness = length / speed
+    return 6.8 * slowness / (1 + 10.2 * slowness * np.asarray(frequency)) ** (5 / 3)
+
+
+def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seconds: float,
+              ) -> GustResponse:
+    """Return what turbulence of a spectrum does to a branch.
+
+    Args:
+        sway: Of the displacement that is asked for.
+        speed: Mean of the wind [m/s].
+        intensity: Standard deviation of the speed over its mean.
+        length: Turbulent length scale [m].
+        seconds: For which the peak is expected.
+    """
+    at = _frequencies(sway, speed / length)
+    # What resonance adds; without it the branch follows all of the turbulence.
+    added = np.abs(sway.transfer(at)) ** 2 - 1
+    resonance = float(scipy.integrate.trapezoid(added * wind_spectrum(at, speed, length), at))
+    power = max(1 + resonance, 0.0)
+    crossing = max(float(sway.frequencies[0]) * np.sqrt(max(resonance, 0.0) / max(power, 1e-12)),
+                   _LEAST_CROSSING)
+    rare = np.sqrt(2 * np.log(max(crossing * seconds, math.e)))
+    peak = max(rare + 0.6 / rare, _LEAST_PEAK)
+    deviation = 2 * intensity * np.sqrt(power)
+    return GustResponse(1 + peak * deviation, deviation, peak, crossing, float(np.sqrt(power)))
+
+
+def recorded(sway: Swaying, times: np.ndarray, speeds: np.ndarray) -> GustResponse:
+    """Return what a recorded wind does to a branch; the load goes with the square of its speed.
+
+    Args:
+        sway: Of the displacement that is asked for.
+        times: [s], ascending, shape [n].
+        speeds: Along the mean wind [m/s], shape [n].
+    """
+    step = float(np.median(np.diff(times)))
+    even = np.arange(times[0], times[-1] + step / 2, step)
+    load = np.interp(even, times, speeds)
+    load = load * np.abs(load)
+    load = load / load.mean() - 1
+    size = 2 * len(load)
+    answer = np.fft.irfft(np.fft.rfft(load, size) * sway.transfer(np.fft.rfftfreq(size, step)),
+                          size)[:len(load)]
+    deviation, quasi = float(answer.std()), float(load.std())
+    peak = float(answer.max())
+    upward = int(((answer[:-1] < 0) & (answer[1:] >= 0)).sum())
+    return GustResponse(1 + peak, deviation, peak / max(deviation, 1e-300),
+                        upward / (even[-1] - even[0]), deviation / max(quasi, 1e-300))
+
+
+def _frequencies(sway: Swaying, corner: float) -> np.ndarray:
+    """Frequencies [Hz] that are dense where the spectrum bends and where the branch resonates."""
+    top = 20 * max(float(sway.frequencies[-1]), corner)
+    wide = np.concatenate([[0.0], np.geomspace(1e-4 * min(corner, sway.frequencies[0]), top,
+                                               _POINTS)])
+    near = np.sinh(np.linspace(-8, 8, 801)) / np.sinh(8)
+    peaks = [one * (1 + 0.5 * near) for one in sway.frequencies]
+    return np.unique(np.concatenate([wide, *peaks]))

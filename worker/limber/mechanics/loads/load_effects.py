@@ -1,0 +1,146 @@
+"""What loads outdoors do to a branch, with what is not known of its moduli: sag, strain over
+strength, frequencies, and how many times these loads it bears."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import WorkError
+from limber.core.progress import SILENT, Progress
+from limber.mechanics.loads.outdoor import Bent, LoadedOutdoors
+from limber.mechanics.statics.result import StaticResult
+
+_NORMAL_95 = 1.96
+_BISECTIONS = 7
+_STEP = 1.3
+"""Factor by which a softer or stiffer branch is looked for around where it is thought to end."""
+_LEAST = 1e-3
+"""Share of the loads below which no limit is looked for more closely."""
+_NOT_KNOWN = {"sag_interval_m": None, "greatest_strain_interval": None,
+              "first_frequency_interval_hz": None, "bears_times_interval": None}
+
+
+def tip_node(outdoors: LoadedOutdoors) -> int:
+    """Return the mesh's node at the outermost place of the main path that is not cut off."""
+    skeleton, nodes = outdoors.skeleton, outdoors.hanging.mesh.nodes
+    path = [node for node in skeleton.main_path() if not outdoors.gone[node]]
+    return int(np.linalg.norm(nodes - skeleton.nodes[path[-1]], axis=1).argmin())
+
+
+def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
+    """Return where the branch comes to rest under all of its loads.
+
+    Raises:
+        WorkError: it finds none.
+    """
+    found = outdoors.rest()
+    if not found.converged:
+        raise WorkError(f"The branch finds no rest under these loads ({found.message}).",
+                        f"It followed {100 * found.reached:.0f} % of them.",
+                        "They may be more than it can carry: see --limit-load with smaller ones.")
+    return found
+
+
+def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: float | None,
+                 most: float | None = None, progress: Progress = SILENT,
+                 ) -> tuple[Bent, dict[str, Any]]:
+    """Return the branch at rest under its loads, and what is told of it.
+
+    Intervals (95 %) are those of a branch softer and stiffer throughout, which are the widest.
+
+    Args:
+        outdoors: The branch with its loads.
+        strain_limit: Strain at which the wood is taken to fail.
+        deviation: Standard deviation of log E, taken as one for all moduli; None leaves
+            intervals out.
+        most: Also find how many times these loads the branch bears, up to so many.
+        progress: Told how far it is.
+
+    Returns:
+        The state, and ``tip_displacement_m`` [3], ``sag_m`` (of the tip, along gravity),
+        ``greatest_strain``, ``strain_over_limit``, ``along``, ``frequencies_hz``,
+        ``wind_force_n``, ``added_mass_kg``, ``cut_mass_kg``, ``young_deviation``; with ``most``
+        ``bears_times`` and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``); and for sag,
+        greatest strain, first frequency and times borne their intervals or None.
+
+    Raises:
+        WorkError: it finds no rest under them.
+    """
+    gravity = outdoors.hanging.gravity
+    down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
+    tip = tip_node(outdoors)
+
+    def told(bent: Bent) -> dict[str, float]:
+        return {"sag_m": float(bent.displacement[tip] @ down),
+                "greatest_strain": float(bent.strains.max()),
+                "first_frequency_hz": float(bent.frequencies[0])}
+    progress(0.0, "rest under the loads")
+    bent = outdoors.bent(required_rest(outdoors))
+    own = told(bent)
+    result: dict[str, Any] = _NOT_KNOWN | {
+        "tip_displacement_m": bent.displacement[tip], "sag_m": own["sag_m"],
+        "greatest_strain": own["greatest_strain"],
+        "strain_over_limit": own["greatest_strain"] / strain_limit,
+        "along": outdoors.along(bent.strains), "frequencies_hz": bent.frequencies,
+        "wind_force_n": outdoors.wind_force, "cut_mass_kg": outdoors.cut_mass,
+        "added_mass_kg": outdoors.added_mass, "young_deviation": deviation}
+    others = {} if deviation is None else {
+        factor: outdoors.with_young(factor)
+        for factor in np.exp(np.array([-_NORMAL_95, _NORMAL_95]) * deviation).tolist()}
+    progress(0.3, "interval")
+    rests = [(other, other.rest()) for other in others.values()]
+    if rests and all(found.converged for _, found in rests):
+        ends = [told(other.bent(found)) for other, found in rests]
+        result |= {name: sorted(end[key] for end in ends) for name, key in (
+            ("sag_interval_m", "sag_m"), ("greatest_strain_interval", "greatest_strain"),
+            ("first_frequency_interval_hz", "first_frequency_hz"))}
+    if most is not None:
+        result |= _limits(outdoors, others, strain_limit, most, progress.part(0.5, 1.0))
+    return bent, result
+
+
+def _limits(outdoors: LoadedOutdoors, others: dict[float, LoadedOutdoors], strain_limit: float,
+            most: float, progress: Progress) -> dict[str, Any]:
+    """How many times the loads the branch bears, and a softer and a stiffer one would."""
+    def trouble_of(loaded: LoadedOutdoors) -> Callable[[float], str]:
+        def trouble(share: float) -> str:
+            progress(0.5, "limit load")
+            found = loaded.rest(share)
+            if not found.converged:
+                return "equilibrium"
+            return "strain" if loaded.greatest_strain(found) > strain_limit else ""
+        return trouble
+    times, why = _limit(trouble_of(outdoors), 1.0, 2.0, most)
+    result: dict[str, Any] = {"bears_times": times, "held_by": why or "nothing"}
+    if others:
+        # Under the same share strain goes about with 1/E.
+        result["bears_times_interval"] = sorted(
+            _limit(trouble_of(other), min(times * factor, most), _STEP, most)[0]
+            for factor, other in others.items())
+    return result
+
+
+def _limit(trouble: Callable[[float], str], guess: float, step: float, most: float,
+           ) -> tuple[float, str]:
+    """Bisect the share of the loads from which on there is trouble, and say which; up to ``most``
+    there may be none."""
+    low = high = guess
+    why = trouble(guess)
+    if why:
+        low = guess / step
+        while low > _LEAST and (found := trouble(low)):
+            low, high, why = low / step, low, found
+        low = low if low > _LEAST else 0.0
+    while not why and high < most:
+        low, high = high, min(step * high, most)
+        why = trouble(high)
+    if not why:
+        return most, ""
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        if found := trouble(middle):
+            high, why = middle, found
+        else:
+            low = middle
+    return low, why

@@ -1,0 +1,249 @@
+"""What wind, snow, fruit and pruning do to a branch: forces, masses, and where it comes to rest."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from limber.core.errors import InputError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.dynamics.modes import lowest_modes
+from limber.mechanics.loads.gust_response import Swaying, swaying
+from limber.mechanics.materials.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.statics.solve import solve_static
+from limber.mechanics.strain import carried_strain
+
+AIR_DENSITY = 1.225
+"""At sea level and 15 degrees [kg/m^3]."""
+_MODES = 3
+_REMAINS = 1e-3
+"""Share of its density that cut-off wood keeps: none of its own would have no modes."""
+
+
+@dataclass(frozen=True)
+class Outdoors:
+    """What acts on a branch beside its weight as scanned.
+
+    Attributes:
+        wind: Velocity of the air, even along the branch [m/s], shape [3].
+        drag: Coefficient of a cylinder across the wind.
+        snow: Mass on the shadow of the branch, as seen from above [kg/m^2].
+        fruit: Places [m] and masses [kg].
+        cuts: Places on the branch [m]; what lies beyond them is cut off.
+    """
+
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    drag: float = 1.1
+    snow: float = 0.0
+    fruit: tuple[PointMass, ...] = ()
+    cuts: tuple[tuple[float, float, float], ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Bent:
+    """A branch at rest under a load.
+
+    Attributes:
+        displacement: From the hanging state [m], shape [node_count, 3].
+        strains: Largest principal strain of each tetrahedron, that of its weight included, [t].
+        frequencies: The lowest, about this state [Hz], shape [3].
+    """
+
+    displacement: np.ndarray
+    strains: np.ndarray
+    frequencies: np.ndarray
+
+
+class LoadedOutdoors:
+    """A branch with its loads; each is taken up by a share of all of them."""
+
+    def __init__(self, model: BranchModel, skeleton: Skeleton, loads: Outdoors):
+        """Work out forces and masses.
+
+        Args:
+            model: The branch as it hangs.
+            skeleton: Its axes.
+            loads: What acts.
+
+        Raises:
+            InputError: a cut leaves nothing, or lies at the base.
+        """
+        self.skeleton = skeleton
+        self.gone = _beyond(skeleton, loads.cuts)
+        self.is_gone = _tets_of(model.mesh, skeleton, self.gone)
+        self._plain = model
+        start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
+        kept = ~self.gone[1:]
+        start, end, radius = start[kept], end[kept], skeleton.radius[1:][kept]
+        middle = (start + end) / 2
+        self._masses = (*loads.fruit, *_snow(model, middle, end - start, radius, loads.snow))
+        self.added_mass = sum(one.mass for one in self._masses)
+        self._wind = np.zeros_like(model.mesh.nodes)
+        self._loads, self._cylinders = loads, (middle, end - start, radius)
+        if np.any(loads.wind):
+            pushes = wind_forces(end - start, radius, np.array(loads.wind), loads.drag)
+            self._wind += (point_operator(model.mesh, middle).T @ pushes.ravel()).reshape(-1, 3)
+        self._forces = self._wind.copy()
+        self.wind_force = self._wind.sum(axis=0)
+        self._model = self._cut(model)
+        # The scan's shape carries the weight of what is cut off: without it, it springs up.
+        lost = model.mass_load - self._model.mass_load
+        if model.hanging is not None:
+            self._forces -= lost[:, None] * model.gravity
+        self.cut_mass = float(lost.sum())
+
+    @property
+    def hanging(self) -> BranchModel:
+        """The branch as it hangs, without these loads."""
+        return self._plain
+
+    @property
+    def wind(self) -> tuple[float, float, float]:
+        """Velocity of the even wind [m/s]."""
+        return self._loads.wind
+
+    @property
+    def dead_forces(self) -> np.ndarray:
+        """All of it as forces on the nodes that keep their direction [N], shape [node_count, 3]."""
+        added = self._model_under(1.0).mass_load - self._model.mass_load
+        return self._forces + added[:, None] * self._plain.gravity
+
+    def with_young(self, factor: float) -> "LoadedOutdoors":
+        """Return the same loads on a branch whose moduli are ``factor`` times as large."""
+        other = copy.copy(self)
+        other._model = self._model.with_young(self._model.young * factor)
+        other._plain = self._plain.with_young(self._plain.young * factor)
+        return other
+
+    def with_gusts(self, factor: float) -> "LoadedOutdoors":
+        """Return the same loads with a wind that pushes ``factor`` times as hard."""
+        other = copy.copy(self)
+        other._forces = self._forces + (factor - 1) * self._wind
+        other._wind = factor * self._wind
+        other.wind_force = factor * self.wind_force
+        return other
+
+    def sways(self, result: StaticResult, tip: int, damping: RayleighDamping) -> Swaying:
+        """Return how node ``tip`` answers when the wind grows and shrinks about a state."""
+        middle, ways, radius = self._cylinders
+        at = point_operator(self._plain.mesh, middle)
+        air = at.T @ _air_damping(ways, radius, np.array(self._loads.wind), self._loads.drag) @ at
+        return swaying(self._model_under(1.0), result.displacement, self._wind, tip, damping, air)
+
+    def rest(self, share: float = 1.0, start: np.ndarray | None = None) -> StaticResult:
+        """Return where it comes to rest under ``share`` of all loads."""
+        return solve_static(self._model_under(share), nodal_forces=share * self._forces,
+                            start=start)
+
+    def bent(self, result: StaticResult, share: float = 1.0) -> Bent:
+        """Return what a state does to the wood, and how it swings about it."""
+        model = self._model_under(share)
+        strains = model.largest_principal_strains(result.displacement, carried_strain(self._plain))
+        modes = lowest_modes(model, _MODES, result.displacement)
+        return Bent(result.displacement, np.where(self.is_gone, 0.0, strains), modes.frequencies)
+
+    def greatest_strain(self, result: StaticResult) -> float:
+        """Return the largest principal strain of what is left of the branch."""
+        strains = self._plain.largest_principal_strains(result.displacement,
+                                                        carried_strain(self._plain))
+        return float(strains[~self.is_gone].max())
+
+    def along(self, strains: np.ndarray, count: int = 10) -> list[dict[str, float]]:
+        """Return the greatest strain in equal parts of the main path, from the root."""
+        path = self.skeleton.main_path()
+        length = self.skeleton.arc_length[path]
+        nearest = cKDTree(self.skeleton.nodes).query(self._plain.mesh.centroids)[1]
+        place = np.full(self.skeleton.node_count, -1.0)
+        place[path] = length
+        at = place[nearest]
+        cuts = np.linspace(0.0, length[-1], count + 1)
+        found = []
+        for low, high in pairwise(cuts):
+            own = (at >= low) & (at <= high) & ~self.is_gone
+            if own.any():
+                found.append({"from_m": float(low), "to_m": float(high),
+                              "strain": float(strains[own].max())})
+        return found
+
+    def _cut(self, model: BranchModel) -> BranchModel:
+        if not self.is_gone.any():
+            return model
+        return model.with_parameters(
+            density=np.where(self.is_gone, _REMAINS * model.density, model.density))
+
+    def _model_under(self, share: float) -> BranchModel:
+        if not self._masses:
+            return self._model
+        return self._model.with_point_masses(
+            PointMass(one.position, share * one.mass) for one in self._masses)
+
+
+def wind_forces(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
+                ) -> np.ndarray:
+    """Return the drag on cylinders [N], shape [n, 3]: by the flow across each, as in Morison's.
+
+    Args:
+        ways: From start to end [m], shape [n, 3].
+        radius: [m], shape [n].
+        wind: [m/s], shape [3].
+        drag: Coefficient of a cylinder across the flow.
+    """
+    length = np.linalg.norm(ways, axis=1)
+    tangent = ways / np.maximum(length, 1e-300)[:, None]
+    across = wind - (tangent @ wind)[:, None] * tangent
+    speed = np.linalg.norm(across, axis=1)
+    return (0.5 * AIR_DENSITY * drag * 2 * radius * length * speed)[:, None] * across
+
+
+def _air_damping(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
+                 ) -> sp.spmatrix:
+    """Return by how much the drag on cylinders changes with the wind [N s/m], block diagonal."""
+    length = np.linalg.norm(ways, axis=1)
+    tangent = ways / np.maximum(length, 1e-300)[:, None]
+    across = wind - (tangent @ wind)[:, None] * tangent
+    speed = np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None, None]
+    plane = np.eye(3) - tangent[:, :, None] * tangent[:, None, :]
+    blocks = (0.5 * AIR_DENSITY * drag * 2 * radius * length)[:, None, None] * (
+        speed * plane + across[:, :, None] * across[:, None, :] / speed)
+    return sp.block_diag(list(blocks), format="csr")
+
+
+def _snow(model: BranchModel, middle: np.ndarray, ways: np.ndarray, radius: np.ndarray,
+          load: float) -> list[PointMass]:
+    if load <= 0 or not model.gravity.any():
+        return []
+    down = model.gravity / np.linalg.norm(model.gravity)
+    flat = np.linalg.norm(ways - (ways @ down)[:, None] * down, axis=1)
+    return [PointMass((float(x), float(y), float(z)), float(mass))
+            for (x, y, z), mass in zip(middle, load * 2 * radius * flat, strict=True) if mass > 0]
+
+
+def _beyond(skeleton: Skeleton, cuts: Sequence[tuple[float, float, float]]) -> np.ndarray:
+    """Which nodes of the axes are cut off, shape [n] of bool."""
+    gone = np.zeros(skeleton.node_count, bool)
+    for place in cuts:
+        node = int(np.linalg.norm(skeleton.nodes - np.array(place), axis=1).argmin())
+        distance = float(np.linalg.norm(skeleton.nodes[node] - np.array(place)))
+        if node == 0 or distance > max(3 * skeleton.radius[node], 0.02):
+            raise InputError(f"A cut at {place} m is no cut.",
+                             "It lies at the base." if node == 0 else
+                             f"It is {1e3 * distance:.0f} mm off the branch.",
+                             "Give a place on the branch, in its frame [m].")
+        gone[node] = True
+    for node in range(1, skeleton.node_count):
+        gone[node] |= gone[skeleton.parent[node]]
+    return gone
+
+
+def _tets_of(mesh: TetMesh, skeleton: Skeleton, gone: np.ndarray) -> np.ndarray:
+    nearest = cKDTree(skeleton.nodes).query(mesh.centroids)[1]
+    return gone[nearest]

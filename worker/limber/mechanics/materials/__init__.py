@@ -1,0 +1,1 @@
+"""Material laws, Young's modulus along the branch, strength of wood."""

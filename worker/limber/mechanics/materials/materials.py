@@ -1,0 +1,150 @@
+"""Materials: Lamé coefficients, what is allowed, damping.
+
+All three materials are linear in both Lamé coefficients, hence in Young's modulus; sensitivities
+and the reduced model rest on that.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import overload
+
+import numpy as np
+
+from limber.core.errors import InputError
+
+MAX_POISSON = 0.495
+"""Above this the tetrahedra lock; at 0.5 the Lamé coefficients are infinite."""
+
+
+class Material(IntEnum):
+    """What the kernels tell apart.
+
+    st_venant_kirchhoff: the paper's, eq. (5): quadratic in the Green-Lagrange strain.
+    stable_neo_hookean: Smith, de Goes and Kim (2018) without the logarithmic barrier,
+        mu/2 (I_C - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2; bears strong compression.
+    linear: small strains, for checks.
+    """
+
+    st_venant_kirchhoff = 0
+    stable_neo_hookean = 1
+    linear = 2
+
+    @classmethod
+    def named(cls, name: "str | Material") -> "Material":
+        """Return the material called ``name``.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        try:
+            return name if isinstance(name, Material) else cls[name]
+        except KeyError:
+            raise InputError(f"There is no material {name!r}.", "It must be one of those known: "
+                             + ", ".join(cls.__members__) + ".", "Choose one.") from None
+
+
+@dataclass(frozen=True)
+class RayleighDamping:
+    """Damping: ``mass`` [1/s] times the mass matrix, ``stiffness`` [s] times the stiffness.
+
+    The stiffness part acts on the rate of the Green-Lagrange strain (Kelvin-Voigt), so that a
+    turning branch is not braked; at small strain it is the usual Rayleigh term.
+    """
+
+    mass: float = 0.5
+    stiffness: float = 0.002
+
+    def __post_init__(self) -> None:
+        if not (self.mass >= 0 and self.stiffness >= 0):
+            raise InputError(f"Damping {self.mass}, {self.stiffness} is negative.",
+                             "It would feed energy into the motion.", "Use 0 or more.")
+
+
+@overload
+def lame(young: float, poisson: float) -> tuple[float, float]: ...
+@overload
+def lame(young: np.ndarray, poisson: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+@overload
+def lame(young: float, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+def lame(young: float | np.ndarray, poisson: float | np.ndarray,
+         ) -> tuple[float | np.ndarray, float | np.ndarray]:
+    """Return Lamé's lambda and mu [Pa] of Young's modulus [Pa] and Poisson's ratio."""
+    return (young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson)))
+
+
+def lame_by_poisson(young: np.ndarray, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of lambda and mu [Pa] to Poisson's ratio."""
+    by_lambda = (1 + 2 * poisson**2) / ((1 + poisson) * (1 - 2 * poisson)) ** 2
+    return young * by_lambda, -young / (2 * (1 + poisson) ** 2)
+
+
+def per_tet(name: str, value: float | np.ndarray, tet_count: int) -> np.ndarray:
+    """Return ``value`` for each tetrahedron, shape [tet_count].
+
+    Raises:
+        InputError: neither a number nor one number a tetrahedron, or not finite.
+    """
+    array = np.asarray(value, float)
+    if array.ndim > 1 or (array.ndim == 1 and len(array) != tet_count):
+        raise InputError(f"{name} has shape {array.shape}; the mesh has {tet_count} tetrahedra.",
+                         "One number, or one for each tetrahedron, is needed.",
+                         "Map control points to tetrahedra with young_weights.")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} is not finite everywhere.", "A value is missing.", "Give it.")
+    return np.ascontiguousarray(np.broadcast_to(array, (tet_count,)))
+
+
+def check_young(young: np.ndarray) -> None:
+    """Raise InputError unless Young's modulus [Pa] is positive."""
+    if young.min() <= 0:
+        raise InputError(f"Young's modulus is {young.min():g} Pa in tetrahedron {young.argmin()}.",
+                         "A modulus must be positive.", "Green wood has 1e8 to 1e10 Pa.")
+
+
+def check_poisson(poisson: np.ndarray) -> None:
+    """Raise InputError unless Poisson's ratio is in (-1, MAX_POISSON]."""
+    worst = poisson[np.argmax(np.abs(poisson))]
+    if poisson.min() <= -1 or poisson.max() > MAX_POISSON:
+        raise InputError(f"Poisson's ratio is {worst:g}.",
+                         f"It must lie above -1 and not above {MAX_POISSON}: at 0.5 the material"
+                         " is incompressible and these elements lock.",
+                         "Wood has 0.3 to 0.45.")
+
+
+def neo_hookean_energy(strain: np.ndarray, lame_lambda: np.ndarray,
+                       lame_mu: np.ndarray) -> np.ndarray:
+    """Return the energy density [J/m^3] of the stable neo-Hookean at a Green-Lagrange strain.
+
+    Args:
+        strain: Shape [..., 6] (00 11 22 01 02 12).
+        lame_lambda, lame_mu: [Pa], shapes that go with [...].
+    """
+    change = np.sqrt(_determinant(_right_cauchy_green(strain))) - 1
+    return (lame_mu * (strain[..., :3].sum(axis=-1) - change)
+            + 0.5 * (lame_lambda + lame_mu) * change**2)
+
+
+def neo_hookean_stress(strain: np.ndarray, lame_lambda: np.ndarray,
+                       lame_mu: np.ndarray) -> np.ndarray:
+    """Return its second Piola-Kirchhoff stress [Pa], shape [..., 6]; arguments as its energy."""
+    c = _right_cauchy_green(strain)
+    det = np.sqrt(_determinant(c))
+    pressure = ((lame_lambda + lame_mu) * (det - 1) - lame_mu) / det
+    stress = pressure[..., None] * _cofactor(c)
+    stress[..., :3] += lame_mu[..., None]
+    return stress
+
+
+def _right_cauchy_green(strain: np.ndarray) -> np.ndarray:
+    return 2 * strain + np.array([1.0, 1, 1, 0, 0, 0])
+
+
+def _cofactor(c: np.ndarray) -> np.ndarray:
+    """Return the cofactors of symmetric tensors [..., 6]: determinant times inverse."""
+    c00, c11, c22, c01, c02, c12 = np.moveaxis(c, -1, 0)
+    return np.stack([c11 * c22 - c12**2, c00 * c22 - c02**2, c00 * c11 - c01**2,
+                     c02 * c12 - c01 * c22, c01 * c12 - c02 * c11, c01 * c02 - c12 * c00], axis=-1)
+
+
+def _determinant(c: np.ndarray) -> np.ndarray:
+    return (c[..., [0, 3, 4]] * _cofactor(c)[..., [0, 3, 4]]).sum(axis=-1)

@@ -1,0 +1,132 @@
+"""A branch that was scanned while it hung: how its weight acts from then on.
+
+The scanned shape x is an equilibrium: some stress S0 in it carries the weight,
+
+    integral S0 : sym grad v = weight . v      for every displacement v from x.
+
+Taken as the reference, x needs no rest shape. With the Green-Lagrange strain E(u) of what a
+gripper does to it, E = sym grad u + (grad u)^T grad u / 2, the stress is S0 + C : E, and the
+potential energy above the hanging state is
+
+    integral C : E : E / 2  +  integral S0 : E  -  weight . u
+        = strain energy of E  +  u . G u / 2,       G = integral (grad N)^T S0 grad N,
+
+since the part of S0 that is linear in u balances the weight. All that weight does is the geometric
+stiffness G: a constant, symmetric matrix, the same in each of the three axes. It stiffens what
+hangs and softens what stands. Young's modulus is not in it: whatever the modulus, the branch
+hangs as it was scanned, so estimates need no rest shape either, and no derivative of one.
+
+S0 is that of linear elasticity in a branch of one material. In a branch (a tree of beams)
+equilibrium alone gives the forces and moments of each section, so Young's modulus along it does not
+change them. What is left out is of the order of the strain that the weight causes (0.1 to 1 %):
+against the stress-free shape by inverse statics, which limber.mechanics.statics.rest_shape finds,
+tests hold pulls of a sagging branch to that. Wood that grew while it hung has no stress-free shape
+at all, only S0.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse as sp
+
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.mechanics.materials.materials import lame
+
+if TYPE_CHECKING:
+    from limber.mechanics.model import BranchModel
+
+_YOUNG, _POISSON = 1e9, 0.35
+"""Of the branch of one material; the modulus cancels, the ratio hardly shows."""
+
+
+@dataclass(frozen=True)
+class CarriedWeight:
+    """What carries a load in the scanned shape; linear in the load.
+
+    Attributes:
+        stress: S0 [Pa] at the quadrature points, shape [tet_count, q, 6] (00 11 22 01 02 12).
+        stiffness: G [N/m] of each axis, sparse, shape [node_count, node_count].
+        base: What the base exerts on its nodes while the branch hangs [N], [node_count, 3].
+    """
+
+    stress: np.ndarray
+    stiffness: sp.csr_matrix
+    base: np.ndarray
+
+    def scaled(self, factor: float) -> "CarriedWeight":
+        """Return what carries ``factor`` times the load."""
+        return CarriedWeight(factor * self.stress, factor * self.stiffness, factor * self.base)
+
+    def __add__(self, other: "CarriedWeight") -> "CarriedWeight":
+        return CarriedWeight(self.stress + other.stress,
+                             (self.stiffness + other.stiffness).tocsr(), self.base + other.base)
+
+
+@dataclass(frozen=True)
+class Hanging:
+    """How the weight of a hanging branch is carried.
+
+    Attributes:
+        own: For the branch's own mass.
+        added: For what hung on it when it was scanned, None for nothing.
+        mass_count: How many of the model's added masses that were.
+    """
+
+    own: CarriedWeight
+    added: CarriedWeight | None
+    mass_count: int
+
+    @cached_property
+    def total(self) -> CarriedWeight:
+        return self.own if self.added is None else self.own + self.added
+
+    def with_density(self, factor: float) -> "Hanging":
+        """Return the same of a branch ``factor`` times as dense."""
+        return replace(self, own=self.own.scaled(factor))
+
+
+def carried(model: "BranchModel") -> Hanging:
+    """Return how a model that is taken to hang in its mesh's shape carries its weight.
+
+    Raises:
+        NotPositiveDefiniteError: the mesh cannot bear anything.
+    """
+    mesh = model.mesh
+    plain = model.linear(_YOUNG, _POISSON)
+    equations = plain.equations()
+    tangent = equations.tangent(plain, np.zeros_like(mesh.nodes))
+    if not tangent.is_positive_definite:
+        raise NotPositiveDefiniteError("the stiffness of the scanned shape has no positive pivots")
+    own, added = model.nodal_masses
+
+    def carrying(load: np.ndarray) -> CarriedWeight:
+        return _carried(plain, load, tangent.solve(equations.free_part(load)))
+
+    own_load, added_load = (mass[:, None] * model.gravity for mass in (own, added))
+    return Hanging(carrying(own_load), carrying(added_load) if added_load.any() else None,
+                   len(model.point_masses))
+
+
+def _carried(model: "BranchModel", load: np.ndarray, moved: np.ndarray) -> CarriedWeight:
+    strain = model.strains(moved)
+    lam, mu = lame(_YOUNG, _POISSON)
+    stress = 2 * mu * strain
+    stress[..., :3] += lam * strain[..., :3].sum(axis=2, keepdims=True)
+    force = model.tangent_times(np.zeros_like(moved), moved)
+    base = np.where(model.fixed[:, None], force - load, 0.0)
+    return CarriedWeight(stress, geometric_stiffness(model, stress), base)
+
+
+def geometric_stiffness(model: "BranchModel", stress: np.ndarray) -> sp.csr_matrix:
+    """Return the integral of grad N_a . S grad N_b [N/m], shape [node_count, node_count]."""
+    tets, count = model.mesh.tets, model.mesh.node_count
+    full = stress[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]] * model.weights[..., None, None]
+    gradients = model.gradients
+    blocks = np.einsum("eqia,eqij,eqjb->eab", gradients, full, gradients, optimize=True)
+    width = tets.shape[1]
+    rows, columns = np.repeat(tets, width, axis=1).ravel(), np.tile(tets, (1, width)).ravel()
+    matrix = sp.csr_matrix((blocks.ravel(), (rows, columns)), (count, count))
+    matrix.sum_duplicates()
+    return matrix

@@ -1,0 +1,140 @@
+"""A pull as settings describe it: the loaded branch, the grasp and where it goes."""
+
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.mechanics.added_masses import PointMass
+from limber.mechanics.dynamics.load_case import (
+    LoadCase,
+    SimulatedMotion,
+    dynamic_motion,
+    static_motion,
+)
+from limber.mechanics.dynamics.motion import (
+    EnergyMomentumSettings,
+    MotionSettings,
+    NewmarkSettings,
+)
+from limber.mechanics.dynamics.pose_table import PoseTable
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.model import BranchModel
+from limber.mechanics.settings import Point, SimulateSettings
+from limber.mechanics.statics.solve import solve_static
+
+_PROBE = 1e-6
+"""[N], so little that the branch answers linearly."""
+_DEFAULT_BEND = 0.2
+"""Of the way from base to grasp: how far a branch is bent when nothing is asked for; chosen."""
+
+
+def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
+    """Return the force across the branch that would bend it by a fifth of its reach [N], shape [3].
+
+    By the stiffness at rest. A motion along a line invented in space would buckle or stretch a
+    branch, whose length is fixed; under a force it goes where it can.
+    """
+    axis = grasp.centre - model.mesh.nodes[model.fixed].mean(axis=0)
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    weightless = model.with_parameters(gravity=(0.0, 0.0, 0.0))
+    probe = solve_static(weightless, grasp=grasp, grasp_force=_PROBE * across).require()
+    moved = np.linalg.norm(grasp.weights @ probe.displacement[grasp.nodes])
+    return _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
+
+
+def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTable | None = None,
+                 grasp_point: np.ndarray | Sequence[float] | None = None) -> LoadCase:
+    """Return the load case that settings ask for.
+
+    Args:
+        model: Of the scan, on which places are given.
+        settings: How to pull.
+        along: The grasp's way instead of a motion of the settings.
+        grasp_point: The place of the marked grasp [m]; None: the patch's own centre.
+
+    Raises:
+        InputError: options that do not fit. ConvergenceError: the branch finds no rest.
+    """
+    def patch(point: Point, mode: Literal["clamped", "pinned"]) -> Grasp:
+        if mode == "clamped" and settings.grasp_radius > 0:
+            return Grasp.gripping(model.mesh, np.array(point), settings.grasp_radius)
+        return Grasp.at(model.mesh, np.array(point), settings.grasp_radius, mode)
+
+    grasp = (Grasp.from_mesh(model.mesh, settings.grasp_mode, grasp_point)
+             if settings.grasp_point is None else patch(settings.grasp_point, settings.grasp_mode))
+    holds = tuple(patch(point, settings.grasp_mode) for point in settings.hold_at)
+    model = model.gripped(grasp, *holds)
+    loads = np.zeros_like(model.mesh.nodes)
+    for place in settings.load_at:
+        loaded = patch(place[:3], "pinned")
+        loads[loaded.nodes] += loaded.weights[:, None] * np.array(place[3:])
+    follows_pose = along is not None or settings.move is not None or settings.turn is not None
+    force = np.array(settings.grasp_force or (0.0, 0.0, 0.0))
+    if not (follows_pose or settings.grasp_force is not None or settings.load_at):
+        force = bending_force(model, grasp)
+    start = solve_static(model, grasp=[grasp, *holds],
+                         grasp_force=np.zeros((1 + len(holds), 3))).require()
+    times, part = _ramp(settings, along.duration if along else settings.duration)
+    changes = along.changes(times) if along else part[:, None] * np.concatenate(
+        [settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
+    first = present(start.pose, "pose of the grasps")[0]
+    return LoadCase(model, start, grasp, follows_pose, holds,
+                    _way(first, changes, settings.grasp_mode), force, loads, times, part)
+
+
+def with_masses(model: BranchModel, settings: SimulateSettings) -> BranchModel:
+    """Return the model with what the settings hang on it."""
+    return model.with_point_masses([PointMass(place[:3], place[3]) for place in settings.mass_at])
+
+
+def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> None:
+    """Refuse more than one of a motion, a way and a force.
+
+    Raises:
+        InputError: there are more.
+    """
+    moves = settings.move is not None or settings.turn is not None
+    if (settings.grasp_force is not None) + moves + (along is not None) > 1:
+        raise InputError("More than one of a motion, a way and a force were given.",
+                         "A grasp follows poses or takes a force.",
+                         "Give --move and --turn, --along, or --grasp-force.")
+
+
+def motion_of(case: LoadCase, settings: SimulateSettings,
+              progress: Progress = SILENT) -> SimulatedMotion:
+    """Pull, along equilibria or in time."""
+    if settings.kind == "static":
+        return static_motion(case, progress)
+    scheme: MotionSettings = EnergyMomentumSettings(max_step=settings.step)
+    if settings.scheme == "newmark":
+        scheme = NewmarkSettings(max_step=settings.step, beta=settings.newmark_beta,
+                                 gamma=settings.newmark_gamma)
+    return dynamic_motion(case, scheme, progress)
+
+
+def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and the part of the pull at each.
+
+    In motion it starts and ends at rest, and the end is held.
+    """
+    hold = settings.hold if settings.kind == "dynamic" else 0.0
+    count = max(2, round((duration + hold) * settings.frame_rate) + 1)
+    times = np.arange(count) / settings.frame_rate
+    part = np.clip(times / duration, 0, 1)
+    return times, part**2 * (3 - 2 * part) if settings.kind == "dynamic" else part
+
+
+def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
+    """Return the grasp's poses [frames, 6], from where the loaded branch holds it."""
+    from scipy.spatial.transform import Rotation
+
+    if mode == "pinned":
+        pose = np.concatenate([pose[:3], np.zeros(3)])
+    turned = Rotation.from_rotvec(changes[:, 3:]) * Rotation.from_rotvec(pose[3:])
+    return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])

@@ -1,0 +1,39 @@
+"""Whether a branch that snapped on its way would come back: the same way, walked backwards.
+
+A straight part that buckles straightens again. A bow that turned over stays turned over: the start
+and what it snapped to are two stable states of one and the same hold, and which one is real depends
+on what was done to the branch before.
+"""
+
+import numpy as np
+
+from limber.core.progress import SILENT
+from limber.mechanics.statics.path import Path
+from limber.mechanics.statics.problem import Target
+from limber.mechanics.statics.result import StaticResult
+
+_SAME = 1e-3
+"""How near to the start, as part of the branch's extent, is the start."""
+
+
+def doubt_of(path: Path, result: StaticResult) -> str:
+    """Return why a converged result may not be the only state of its hold, or an empty string.
+
+    Costs nothing unless the branch snapped; else as much as the way there.
+    """
+    if not path.snaps:
+        return ""
+    where = f"the branch snapped at {100 * path.snaps[0][0]:.0f} % of the way"
+    begin, grasps = path.begin, path.problem.grasps
+    pose = None if path.pose is None else np.array(
+        [grasp.pose_of(path.model.mesh.nodes, begin) for grasp in grasps])
+    goal = Target(np.where(path.equations.held[:, None], begin, 0.0), path.begin_pins,
+                  path.goal.load - path.imbalance)
+    back = Path(path.problem, result.displacement, goal, pose).run(SILENT)
+    if not back.converged:
+        return f"{where}, and no way back was found ({back.message})"
+    away = float(np.linalg.norm(back.displacement - begin, axis=1).max())
+    if away <= _SAME * path.model.extent:
+        return ""
+    return (f"{where}, and led back it ends {1e3 * away:.0f} mm from where it began: another stable"
+            " state of the same hold exists")

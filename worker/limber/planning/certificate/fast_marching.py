@@ -1,0 +1,161 @@
+"""Fast marching on a masked grid: arrival costs from a set of nodes, second order where it can be.
+
+Solves |grad u| = rate on the nodes of a regular grid (Sethian 1999, "Fast marching methods",
+SIAM Review 41, sections 5 and 6). The result is a candidate only: what a proof needs is checked
+by :mod:`limber.planning.certificate.subsolution`, however the candidate was found.
+"""
+
+import numpy as np
+
+from limber.core.numerics.compiled import compiled
+
+
+@compiled
+def neighbours(active):
+    """Return numbers of the nodes ``active`` [nx, ny, nz], -1 elsewhere, their places in the flat
+    grid [n], and the numbers of their neighbours below and above along each axis [n, 6]."""
+    shape = np.array(active.shape)
+    steps = np.array([shape[1] * shape[2], shape[2], 1])
+    flat = active.ravel()
+    numbers = np.full(flat.size, -1, np.int32)
+    places = np.flatnonzero(flat)
+    for k in range(len(places)):
+        numbers[places[k]] = k
+    near = np.full((len(places), 6), -1, np.int32)
+    for k in range(len(places)):
+        for axis in range(3):
+            at = places[k] // steps[axis] % shape[axis]
+            if at > 0:
+                near[k, 2 * axis] = numbers[places[k] - steps[axis]]
+            if at + 1 < shape[axis]:
+                near[k, 2 * axis + 1] = numbers[places[k] + steps[axis]]
+    return numbers.reshape(active.shape), places, near
+
+
+@compiled
+def march(rate, near, known, values, spacing):
+    """Return arrival costs ``u`` [n]; infinite where no node leads.
+
+    Args:
+        rate: Cost per metre at the nodes [1/m], shape [n].
+        near: As :func:`neighbours` gives them, shape [n, 6].
+        known: Nodes whose value is given, bool [n].
+        values: Their values, shape [n].
+        spacing: Distance between nodes [m].
+    """
+    count = len(rate)
+    u = np.full(count, np.inf)
+    done = np.zeros(count, np.bool_)
+    heap = np.empty(count, np.int32)
+    place = np.full(count, -1, np.int32)
+    used = np.empty((3, 3))
+    size = 0
+    for node in range(count):
+        if known[node]:
+            u[node] = values[node]
+            size = _push(heap, place, u, size, node)
+    while size > 0:
+        node = heap[0]
+        size = _pop(heap, place, u, size)
+        done[node] = True
+        for side in range(6):
+            other = near[node, side]
+            if other < 0 or done[other] or known[other]:
+                continue
+            cost = _arrival(other, u, done, rate[other] * spacing, near, used)
+            if cost < u[other]:
+                u[other] = cost
+                if place[other] < 0:
+                    size = _push(heap, place, u, size, other)
+                else:
+                    _rise(heap, place, u, place[other])
+    return u
+
+
+@compiled
+def _arrival(node, u, done, step, near, used):
+    """Solve sum_i w_i (u - t_i)^2 = step^2 over the axes whose upwind neighbour is done.
+
+    ``used`` [3, 3] is room for t, w and the neighbour's value of each axis.
+    """
+    count = 0
+    for axis in range(3):
+        best, value = -1, np.inf
+        for side in (2 * axis, 2 * axis + 1):
+            other = near[node, side]
+            if other >= 0 and done[other] and u[other] < value:
+                best, value = side, u[other]
+        if best < 0:
+            continue
+        used[0, count], used[1, count], used[2, count] = value, 1.0, value
+        far = near[near[node, best], best]
+        if far >= 0 and done[far] and u[far] <= value:
+            used[0, count], used[1, count] = (4.0 * value - u[far]) / 3.0, 2.25
+        count += 1
+    # Drop the axis whose neighbour lies highest until the solution lies above all that are used.
+    while count > 0:
+        a, b, c, top = 0.0, 0.0, -step * step, -np.inf
+        last = 0
+        for i in range(count):
+            t, w = used[0, i], used[1, i]
+            a += w
+            b += w * t
+            c += w * t * t
+            if used[2, i] > top:
+                top, last = used[2, i], i
+        root = b * b - a * c
+        if root >= 0.0:
+            solution = (b + np.sqrt(root)) / a
+            if solution >= top:
+                return solution
+        if count == 1:
+            return used[2, 0] + step
+        count -= 1
+        for k in range(3):
+            used[k, last] = used[k, count]
+    return np.inf
+
+
+@compiled
+def _push(heap, place, u, size, node):
+    heap[size] = node
+    place[node] = size
+    _rise(heap, place, u, size)
+    return size + 1
+
+
+@compiled
+def _rise(heap, place, u, index):
+    node = heap[index]
+    while index > 0:
+        parent = (index - 1) // 2
+        if u[heap[parent]] <= u[node]:
+            break
+        heap[index] = heap[parent]
+        place[heap[index]] = index
+        index = parent
+    heap[index] = node
+    place[node] = index
+
+
+@compiled
+def _pop(heap, place, u, size):
+    size -= 1
+    place[heap[0]] = -2
+    node = heap[size]
+    index = 0
+    while True:
+        child = 2 * index + 1
+        if child >= size:
+            break
+        if child + 1 < size and u[heap[child + 1]] < u[heap[child]]:
+            child += 1
+        if u[node] <= u[heap[child]]:
+            break
+        heap[index] = heap[child]
+        place[heap[index]] = index
+        index = child
+    if size > 0:
+        heap[index] = node
+        place[node] = index
+    return size

@@ -1,0 +1,281 @@
+"""Whether a path exists, by cells along the shell that the samples follow.
+
+Off the shell a force grows a hundred times as fast as along it, so cells as long as they are wide
+must be tiny before they tell that a limit is broken in all of them. Here they are cut in the
+chart's coordinates (:mod:`limber.planning.field.chart`), along those axes by which there is doubt,
+and only where they are open. If what is open does not lead from the start's cell to one that may
+hold a point of the goal, no path does. If cells that keep all limits at their corners do, there
+mostly is one.
+
+What a limit is on is at least in a cell what its values and slopes at the corners say
+(:mod:`limber.planning.certificate.cell_bounds`). That is said of the field. The branch itself may
+keep a limit where the field does not: for a proof a cell is closed only where the field is over
+the limit
+by more than its error, and may hold a point of the goal where a target is as near as its error.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, off_zero
+from limber.planning.cost import resample
+from limber.planning.field.chart import Chart
+from limber.planning.field.energy_field import LOADS, FieldArrays
+from limber.planning.field.trust import nearest_of
+from limber.planning.goals.goal import allowed_points
+from limber.planning.problem import GentleProblem
+
+_ALONG, _ACROSS = 20, 40  # cells along the shell, each way, and off it
+_EVEN = 26  # each way where there is no shell
+_MOST_CELLS = 100_000  # that are asked at once
+_DOUBTED = 0.5  # of the axis with the most doubt, from which on another is cut with it
+_FINE = 0.001  # [m] between points of a way
+_WIDE = 1 << 20  # more cells than there are along any axis
+_CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+_STENCIL = np.unique(np.concatenate([_CORNERS + side * step for step in np.eye(3, dtype=int)
+                                     for side in (-1, 0, 1)]), axis=0)
+_AHEAD = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)
+                   if (i, j, k) > (0, 0, 0)])
+
+
+def _column(offset: np.ndarray) -> int:
+    return int(np.flatnonzero((offset == _STENCIL).all(axis=1))[0])
+
+
+_AT = np.array([_column(corner) for corner in _CORNERS])
+_BESIDE = np.array([[[_column(corner - step), _column(corner + step)] for corner in _CORNERS]
+                    for step in np.eye(3, dtype=int)])
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells ``numbers`` [n, 3]; corner ``k`` [3] lies at ``low + k * edges`` in the plain chart."""
+
+    problem: GentleProblem
+    low: np.ndarray
+    edges: np.ndarray
+    numbers: np.ndarray
+
+    def take(self, which: np.ndarray) -> "_Cells":
+        return _Cells(self.problem, self.low, self.edges, self.numbers[which])
+
+    def cut(self, parts: np.ndarray) -> "_Cells":
+        """Return the cells cut into so many ``parts`` [3] along each axis."""
+        inner = np.stack(np.meshgrid(*map(np.arange, parts), indexing="ij"), -1).reshape(-1, 3)
+        return _Cells(self.problem, self.low, self.edges / parts,
+                      (self.numbers[:, None] * parts + inner).reshape(-1, 3))
+
+    def middles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the middles in the chart's coordinates and in space [m], [n, 3] each."""
+        flat = self.low + (self.numbers + 0.5) * self.edges
+        return flat, self.chart.curved(flat)
+
+    def nodes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions [m, 3] of all corners and of those next to them along an axis, and
+        the numbers of each cell's in ``_STENCIL``, [n, 32]."""
+        keys, where = np.unique(_keys(self.numbers[:, None] + _STENCIL), return_inverse=True)
+        places = np.stack([keys // _WIDE**2, keys // _WIDE % _WIDE, keys % _WIDE], axis=1) - 1
+        return (self.chart.curved(self.low + places * self.edges),
+                where.reshape(len(self.numbers), -1))
+
+    def holding(self, place: np.ndarray) -> np.ndarray:
+        """Return which cells touch the one that ``place`` [3] lies in, or are it, bool [n]."""
+        number = np.floor((self.chart.map(place)[0] - self.low) / self.edges)
+        return (np.abs(self.numbers - number) <= 1).all(axis=1)
+
+    def hanging(self, some: np.ndarray) -> np.ndarray:
+        """Return which cells hang together with any of ``some``, bool [n]."""
+        together = connected_components(self._neighbours(), directed=False)[1]
+        return np.isin(together, together[some])
+
+    def way(self, begin: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
+        """Return the cells [k] of the shortest way from any of ``begin`` to any of ``ends``; None
+        where they do not hang together."""
+        if not begin.any() or not ends.any():
+            return None
+        away, before, _ = dijkstra(self._neighbours(), directed=False, min_only=True,
+                                   indices=np.flatnonzero(begin), return_predecessors=True)
+        last = np.flatnonzero(ends)[np.argmin(away[ends])]
+        if not np.isfinite(away[last]):
+            return None
+        numbers = [last]
+        while before[numbers[-1]] >= 0:
+            numbers.append(before[numbers[-1]])
+        return np.array(numbers[::-1])
+
+    def _neighbours(self) -> coo_matrix:
+        """Return the distances [m] in the chart of cells that touch, [n, n], each once."""
+        keys = _keys(self.numbers)
+        order = np.argsort(keys)
+        rows, columns, lengths = [], [], []
+        for step in _AHEAD:
+            wanted = _keys(self.numbers + step)
+            found = order[np.searchsorted(keys, wanted, sorter=order).clip(max=len(keys) - 1)]
+            beside = np.flatnonzero(keys[found] == wanted)
+            rows.append(beside)
+            columns.append(found[beside])
+            lengths.append(np.full(len(beside), np.linalg.norm(step * self.edges)))
+        places = np.concatenate(rows), np.concatenate(columns)
+        return coo_matrix((np.concatenate(lengths), places), shape=2 * (len(keys),)).tocsr()
+
+    @property
+    def chart(self) -> Chart:
+        """The plain one of the field's region."""
+        return self.problem.energy_field.region.chart.plain
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
+    there is no path; and a ``way`` [k, 3] by cells that keep all limits at their corners, if any.
+    """
+
+    edges: np.ndarray
+    proven: bool = False
+    way: np.ndarray | None = None
+
+
+def judge(problem: GentleProblem) -> Verdict:
+    """Return a way on the field, or whether it is proven that the branch has none."""
+    on_field = _judged(problem, problem.limits, 0.0)
+    if not on_field.proven:
+        return on_field
+    return _judged(problem, problem.sure_limits, problem.goal.doubt(problem.energy_field))
+
+
+def _judged(problem: GentleProblem, limits: FieldArrays, goal_doubt: float) -> Verdict:
+    """Cut cells until they prove that no path keeps ``limits`` and comes as near as ``goal_doubt``
+    [m] to the goal, or a way leads by them, or there are too many."""
+    cells = _first(problem)
+    while True:
+        cells = cells.take(~_surely_outside(cells))
+        positions, nodes = cells.nodes()
+        over, doubt = _surely_over(cells, limits, positions, nodes)
+        begin = cells.holding(problem.start)
+        away = problem.goal.distance(problem.energy_field, positions)[nodes]
+        least, bends = _least(away)
+        tolerance = problem.goal.tolerance
+        ends = ~over & (least <= tolerance + goal_doubt)
+        kept = allowed_points(positions, problem.limits)[nodes]
+        open_cells = np.flatnonzero(~over | begin)
+        cells, begin, ends = cells.take(open_cells), begin[open_cells], ends[open_cells]
+        if not begin.any() or not ends.any():
+            return Verdict(cells.edges, proven=True)
+        hanging = cells.hanging(begin)
+        if not (hanging & ends).any():
+            return Verdict(cells.edges, proven=True)
+        free = kept[open_cells][:, _AT].all(axis=1)
+        reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
+        inner = cells.take(free)
+        way = inner.way(begin[free], reached[free])
+        if way is not None:
+            last = open_cells[free][way[-1]]
+            end = nodes[last, _AT[np.argmin(away[last, _AT])]]
+            chart = inner.chart
+            flat = np.concatenate([chart.map(problem.start), inner.middles()[0][way],
+                                   chart.map(positions[end])])
+            # Along the shell: the chord of a curved cell may lie well off it.
+            return Verdict(cells.edges, way=chart.curved(resample(flat, _FINE)))
+        doubt = np.maximum(doubt[open_cells][~free].sum(axis=0),
+                           (bends / tolerance)[open_cells][ends].sum(axis=0))
+        parts = np.where(doubt >= _DOUBTED * doubt.max(), 2, 1)
+        if hanging.sum() * parts.prod() > _MOST_CELLS:
+            return Verdict(cells.edges)
+        cells = cells.take(hanging).cut(parts)
+
+
+def _first(problem: GentleProblem) -> _Cells:
+    region = problem.energy_field.region
+    chart = region.chart.plain
+    flat = chart.map(region.accepted)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    counts = np.array([_ALONG, _ALONG, _ACROSS] if chart.radius > 0.0 else 3 * [_EVEN])
+    whole = _Cells(problem, low, np.maximum(high - low, 1e-9), np.zeros((1, 3), int))
+    return whole.cut(counts)
+
+
+def _surely_outside(cells: _Cells) -> np.ndarray:
+    """Return which cells have no trusted point that is in the workspace, bool [n]."""
+    region, limits = cells.problem.energy_field.region, cells.problem.limits
+    middles, points = cells.middles()
+    outside = region.plane_least(middles, 0.5 * cells.edges) > 0.0
+    # Bent back a length grows by (R + w) / R at most.
+    radius = region.chart.radius
+    grown = 1.0 if radius == 0.0 else np.maximum(
+        1.0, 1.0 + (middles[:, 2] + 0.5 * cells.edges[2]) / radius)
+    reach = grown * 0.5 * float(np.linalg.norm(cells.edges))
+    outside |= np.maximum(limits.low - points, points - limits.high).max(axis=1) > reach
+    if len(region.rejected):
+        nearer = (nearest_of(points, region.accepted)[0]
+                  - nearest_of(points, region.rejected)[0])
+        outside |= nearer > 2.0 * reach
+    return outside
+
+
+def _surely_over(cells: _Cells, limits: FieldArrays, positions: np.ndarray, nodes: np.ndarray,
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return in which cells no point keeps ``limits``, bool [n], and how much in doubt each axis
+    leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3]."""
+    over, doubt = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
+    for values, slopes, limit in _limited(cells.problem, limits, positions):
+        along = cells.chart.push_forward(positions, slopes) * cells.edges
+        least, bends = _least(values[nodes], along[nodes])
+        over |= least > limit
+        doubt = np.maximum(doubt, bends / limit)
+    limit = limits.max_force
+    if limit < np.inf:
+        force = cells.problem.energy_field.force(positions)[nodes]
+        bends = _bends(force)
+        over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit
+        # Between corners it may be anything that lies between theirs.
+        apart = force[:, _AT].reshape(-1, 2, 2, 2, 3)
+        apart = np.stack([np.linalg.norm(np.diff(apart, axis=axis), axis=-1).max(axis=(1, 2, 3))
+                          for axis in (1, 2, 3)], axis=1)
+        doubt = np.maximum(doubt, (bends + apart) / limit)
+    return over, doubt
+
+
+def _limited(problem: GentleProblem, limits: FieldArrays, positions: np.ndarray,
+             ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """Yield what is limited at ``positions`` [m, 3] besides the force, smooth, shape [m], its slope
+    to the position, [m, 3], and its limit."""
+    field = problem.energy_field
+    if limits.max_energy < np.inf:
+        yield (field.energy(positions), field.force(positions),
+               limits.max_energy + problem.field_error)
+    for name, limit in zip(LOADS, limits.max_loads, strict=True):
+        if limit < np.inf:
+            load = field.load(positions, name)
+            yield load**2, 2.0 * load[:, None] * field.load_gradient(positions, name), limit**2
+
+
+def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a function with ``values`` [n, 32] at ``_STENCIL``, and ``slopes`` [n, 32, 3]
+    there along the edges, times their lengths, is at least in each cell, [n], and by how much less
+    for what it bends along each axis, [n, 3]."""
+    corners = values[:, _AT]
+    bends = _bends(values[..., None])
+    if slopes is not None:
+        ends = slopes[:, _AT].reshape(-1, 2, 2, 2, 3)
+        turns = np.stack([np.diff(ends[..., axis], axis=axis + 1).max(axis=(1, 2, 3))
+                          for axis in range(3)], axis=1)
+        bends = np.maximum(bends, 0.25 * turns)
+    return corners.min(axis=1) - bends.sum(axis=1), bends
+
+
+def _bends(values: np.ndarray) -> np.ndarray:
+    """Return how far a function with ``values`` [n, 32, c] at ``_STENCIL`` may leave the trilinear
+    interpolation of the corners for its second differences along each axis, [n, 3]."""
+    beside = values[:, _BESIDE]
+    second = beside[..., 0, :] - 2.0 * values[:, None, _AT] + beside[..., 1, :]
+    return CURVATURE_FACTOR / 8.0 * np.linalg.norm(second, axis=-1).max(axis=2)
+
+
+def _keys(numbers: np.ndarray) -> np.ndarray:
+    """Return one number for each of ``numbers`` [..., 3], of which none is below -1."""
+    x, y, z = np.moveaxis(numbers + 1, -1, 0)
+    return (x * _WIDE + y) * _WIDE + z

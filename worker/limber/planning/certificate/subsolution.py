@@ -1,0 +1,399 @@
+"""A function on a grid that no path can beat: the proof of a lower bound.
+
+A path's cost is the integral of c over its length. If |grad u| <= c wherever the path runs, its
+cost is at least u(start) - u(end): integrate grad u along it. So any u that keeps the inequality
+proves a bound; how u was found does not matter.
+
+Here u is a quadratic B-spline (its gradient is continuous, so that the loss is of second order in
+the edge h of a cell; with trilinear u it was of first order, 8 % instead of 2 % on one grid), one
+coefficient a cell. In a cell
+
+- each component of grad u is a polynomial in Bernstein form of degree 2 along each axis. At any
+  point grad u is a mean of the 27 Bernstein coefficients with the basis as weights, so |grad u| is
+  at most the same mean of their magnitudes;
+- c is at least the trilinear interpolation of its values at the corners, less
+  ``sum_i M_i x_i (h - x_i) / 2`` with ``M_i`` the most that d^2 c / dx_i^2 is there. The Bernstein
+  coefficients of the one are its values at the 27 points, those of the other ``M_i h^2 / 4`` where
+  the point lies half-way along axis i, else 0.
+
+So |g_m| at most the difference of the two at the 27 points of an open cell is enough; or at most
+the first less all that the second ever is, ``sum_i M_i h^2 / 8``; or at most the least that c is
+anywhere, the cost of length alone. (With the squares of both the slope of c would count as well:
+four times as much about a narrow valley.) The second derivatives are the one thing that is not
+proven: they are taken as at most the largest second difference of c at the cell's corners and the
+next ones along the axis, and as much more as these differ; or as ``CURVATURE_FACTOR`` times the
+largest size of those at its corners, if that is less; never as less than 0, nor than the change of
+slope between the corners says (:mod:`limber.planning.certificate.cell_bounds`): the floor of a
+valley may lie between them. Where c has a kink of the other kind inside a cell (the energy is cut
+off at zero) the cost of length counts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from limber.core.numerics.compiled import compiled
+from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, turns
+from limber.planning.certificate.fast_marching import march, neighbours
+
+RIM = 2
+"""Closed cells about the open ones that have coefficients as well."""
+
+_ROUNDS = 8  # of local reweighting; ends when nothing is over by more than _CLOSE
+_CLOSE = 1.0005
+_IDLE = 2  # rounds one after the other in which nothing is over by less end it as well,
+_LARGE = 100_000  # one alone where so many cells are asked: it takes a third of a second there
+
+
+class Terrain(NamedTuple):
+    """A grid of cells, which of them are open, and what a metre costs there.
+
+    Attributes:
+        spacing: Edge of a cell [m].
+        open_cells: Cells that a path may enter, bool [nx, ny, nz]; none at the grid's border.
+        rate: c at the corners [1/m], shape [nx + 1, ny + 1, nz + 1].
+        bends: What is subtracted from it half-way along each axis, [3, *shape of open_cells].
+        level: Cells where the floor alone counts, shape of ``open_cells``.
+        floor: What c never falls below [1/m].
+    """
+
+    spacing: float
+    open_cells: np.ndarray
+    rate: np.ndarray
+    bends: np.ndarray
+    level: np.ndarray
+    floor: float
+
+    @property
+    def active(self) -> np.ndarray:
+        """Cells that have coefficients: open cells and those about them, ``RIM`` deep.
+
+        Open cells need those of their neighbours. The others let a cost arrive along a slanting
+        border as if there were none: about each of its steps it would bend, and be too steep.
+        """
+        return widened(self.open_cells, RIM)
+
+
+def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
+    """Return ``cells`` and all that touch them, ``times`` deep."""
+    out = cells.copy()
+    for _ in range(times):
+        for axis in range(3):
+            before = out.copy()
+            here, after = out.swapaxes(0, axis), before.swapaxes(0, axis)
+            here[1:] |= after[:-1]
+            here[:-1] |= after[1:]
+    return out
+
+
+def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cells: np.ndarray,
+            spacing: float, floor: float) -> Terrain:
+    """Return the terrain of ``rate`` at the corners, nowhere below ``floor`` [1/m].
+
+    ``slopes`` [..., 3] are what it grows by a cell's edge there, along each; ``positive`` says at
+    which corners the energy is not cut off; corners that were not evaluated hold nan in ``rate``
+    and are no neighbours of an open cell's.
+    """
+    bends = np.maximum(_bends(rate, open_cells), 0.25 * turns(slopes, open_cells))
+    level = with_corner(positive) & with_corner(~positive)
+    return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
+
+
+@compiled
+def _bends(values, cells):
+    """Return ``M_i h^2 / 4`` of the module's text in ``cells``, shape [3, *shape of cells].
+
+    ``values`` at the corners; a second difference with one that is not known (nan) counts as 0.
+    """
+    out = np.zeros((3,) + cells.shape)
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    at, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    for i in range(cells.shape[0]):
+        for j in range(cells.shape[1]):
+            for k in range(cells.shape[2]):
+                if not cells[i, j, k]:
+                    continue
+                for axis in range(3):
+                    first[0], first[1], first[2] = i, j, k
+                    last[:] = first + 1
+                    step[:] = 0
+                    step[axis] = 1
+                    most, least, size = -np.inf, np.inf, 0.0
+                    first[axis] = max(first[axis] - 1, 1)
+                    last[axis] = min(last[axis] + 1, values.shape[axis] - 2)
+                    for p in range(first[0], last[0] + 1):
+                        for q in range(first[1], last[1] + 1):
+                            for r in range(first[2], last[2] + 1):
+                                at[0], at[1], at[2] = p, q, r
+                                second = (values[p - step[0], q - step[1], r - step[2]]
+                                          - 2.0 * values[p, q, r]
+                                          + values[p + step[0], q + step[1], r + step[2]])
+                                if np.isnan(second):
+                                    second = 0.0
+                                most, least = max(most, second), min(least, second)
+                                place = i if axis == 0 else (j if axis == 1 else k)
+                                if place <= at[axis] <= place + 1:
+                                    size = max(size, abs(second))
+                    bend = min(2.0 * most - least, CURVATURE_FACTOR * size)
+                    out[axis, i, j, k] = 0.25 * max(bend, 0.0)
+    return out
+
+
+def second_differences(values: np.ndarray) -> list[np.ndarray]:
+    """Return |second differences| along each axis, of the shape of ``values``; nan counts as 0."""
+    found = []
+    for axis in range(3):
+        second = np.nan_to_num(np.abs(np.diff(values, 2, axis=axis)))
+        pad = [(1, 1) if k == axis else (0, 0) for k in range(3)]
+        found.append(np.pad(second, pad, mode="edge"))
+    return found
+
+
+def corner_values(values: np.ndarray) -> np.ndarray:
+    """Return the values at each cell's corners: [nx + 1, ...] to [8, nx, ny, nz]."""
+    nx, ny, nz = (n - 1 for n in values.shape)
+    return np.stack([values[i:nx + i, j:ny + j, k:nz + k]
+                     for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+def corners_of(cells: np.ndarray) -> np.ndarray:
+    """Return the nodes [nx + 1, ny + 1, nz + 1] that are corners of any of ``cells``."""
+    nodes = np.zeros(tuple(n + 1 for n in cells.shape), bool)
+    nx, ny, nz = cells.shape
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                nodes[i:nx + i, j:ny + j, k:nz + k] |= cells
+    return nodes
+
+
+def with_corner(nodes: np.ndarray) -> np.ndarray:
+    """Return the cells of which a corner is one of ``nodes`` [nx + 1, ny + 1, nz + 1]."""
+    cells = np.zeros(tuple(n - 1 for n in nodes.shape), bool)
+    nx, ny, nz = cells.shape
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                cells |= nodes[i:nx + i, j:ny + j, k:nz + k]
+    return cells
+
+
+def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
+                rounds: int = _ROUNDS) -> tuple[np.ndarray, float]:
+    """Return coefficients of a ``u`` with |grad u| <= c in every open cell, and a factor.
+
+    Args:
+        ground: The terrain.
+        known: Cells on and about the source, bool [nx, ny, nz].
+        shape: A length [m] there that grows by about a metre a metre: a signed distance.
+        free_cells: Cells where nothing is asked: those wholly inside the source.
+        rounds: Of local reweighting; fewer give a lower ``u``, never a wrong one.
+
+    The coefficients are ``factor * shape`` on ``known``; infinite where nothing leads from there.
+    """
+    active = ground.active
+    around = known & active
+    u = np.full(active.shape, np.inf)
+    if not around.any():
+        return u, 0.0
+    numbers, places, near = neighbours(active)
+    bound = _middles(ground.rate, places, active.shape)
+    u[around] = shape[around]
+    steep = float(_excess(u, *ground, np.argwhere(around & ground.open_cells)).max(initial=0.0))
+    asked = np.argwhere(ground.open_cells & ~free_cells)
+    own = numbers[tuple(asked.T)]
+    held, about = around.ravel()[places], widened(around).ravel()[places]
+    lengths = shape.ravel()[places]
+    factor = 1.0 / steep if steep > 0.0 else float(bound[held].min())
+    rate, beside = bound, held
+    least, best, of_best, idle = np.inf, bound, factor, 0
+    patience = _IDLE if len(asked) < _LARGE else 1
+    for _ in range(rounds):
+        values = march(rate, near, held, factor * lengths, ground.spacing)
+        u.ravel()[places] = values
+        over = np.ones(len(places))
+        over[own] = np.maximum(_excess(u, *ground, asked), 1.0)
+        worst = float(over.max())
+        idle += 1
+        if worst < least:
+            least, best, of_best, idle = worst, values, factor, 0
+        if worst <= _CLOSE or idle == patience:
+            break
+        factor /= float(over[beside].max())
+        beside = about
+        # The largest of the neighbours: reweighting cell by cell stirs up a chequerboard.
+        over[held] = 1.0
+        rate = rate / _most_about(over, numbers, places)
+    # The rescaling is what makes it a proof; the rounds before only keep it small.
+    u.ravel()[places] = best / least
+    return u, of_best / least
+
+
+@compiled
+def _middles(values, places, shape):
+    """Return the mean of the values at the corners of the cells at ``places`` [n] of a grid."""
+    out = np.empty(len(places))
+    for n in range(len(places)):
+        i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
+            places[n] % shape[2])
+        out[n] = values[i:i + 2, j:j + 2, k:k + 2].sum() / 8.0
+    return out
+
+
+@compiled
+def _most_about(values, numbers, places):
+    """Return the largest of each cell's value [n] and those of the cells that touch it."""
+    out = np.empty(len(places))
+    shape = numbers.shape
+    for n in range(len(places)):
+        i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
+            places[n] % shape[2])
+        most = values[n]
+        for p in range(max(i - 1, 0), min(i + 2, shape[0])):
+            for q in range(max(j - 1, 0), min(j + 2, shape[1])):
+                for r in range(max(k - 1, 0), min(k + 2, shape[2])):
+                    other = numbers[p, q, r]
+                    if other >= 0 and values[other] > most:
+                        most = values[other]
+        out[n] = most
+    return out
+
+
+def spline_value(u: np.ndarray, cell: np.ndarray) -> float:
+    """Return the spline at the centre of ``cell`` [3] from its coefficients ``u``."""
+    weights = np.array([0.125, 0.75, 0.125])
+    block = u[tuple(slice(k - 1, k + 2) for k in cell)]
+    return float(np.einsum("ijk,i,j,k", block, weights, weights, weights))
+
+
+@compiled
+def least_in_cells(u, cells):
+    """Return a lower bound of the spline in each of ``cells``: its least Bernstein coefficient."""
+    out = np.full(u.shape, np.inf)
+    one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    places = np.argwhere(cells)
+    for n in range(len(places)):
+        i, j, k = places[n, 0], places[n, 1], places[n, 2]
+        _along_last(u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2], one)
+        _along_middle(one, two)
+        _along_first(two, three)
+        out[i, j, k] = three.min()
+    return out
+
+
+# Bernstein coefficients along one axis of a spline from 3 of its own, in all 9 lines along it.
+
+
+@compiled
+def _along_last(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
+            out[p, q, 0], out[p, q, 1], out[p, q, 2] = 0.5 * (a + b), b, 0.5 * (b + c)
+
+
+@compiled
+def _along_middle(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
+            out[p, 0, q], out[p, 1, q], out[p, 2, q] = 0.5 * (a + b), b, 0.5 * (b + c)
+
+
+@compiled
+def _along_first(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
+            out[0, p, q], out[1, p, q], out[2, p, q] = 0.5 * (a + b), b, 0.5 * (b + c)
+
+
+# Those of its slope along the axis.
+
+
+@compiled
+def _slope_last(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
+            out[p, q, 0], out[p, q, 1], out[p, q, 2] = b - a, 0.5 * (c - a), c - b
+
+
+@compiled
+def _slope_middle(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
+            out[p, 0, q], out[p, 1, q], out[p, 2, q] = b - a, 0.5 * (c - a), c - b
+
+
+@compiled
+def _slope_first(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
+            out[0, p, q], out[1, p, q], out[2, p, q] = b - a, 0.5 * (c - a), c - b
+
+
+@compiled
+def _excess(u, spacing, open_cells, rate, bends, level, floor, asked):
+    """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| over what is allowed
+    there, else 0."""
+    over = np.zeros(len(asked))
+    along, down = np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    allowed = np.empty((3, 3, 3))
+    for n in range(len(asked)):
+        i, j, k = asked[n, 0], asked[n, 1], asked[n, 2]
+        block = u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2]
+        if not (open_cells[i, j, k] and block.max() < np.inf):
+            continue
+        _along_last(block, along)
+        _slope_last(block, down)
+        _along_middle(along, one)
+        _slope_first(one, two)
+        _slope_middle(along, one)
+        _along_first(one, three)
+        _along_middle(down, one)
+        _along_first(one, along)
+        for p in range(3):
+            for q in range(3):
+                for r in range(3):
+                    one[p, q, r] = np.sqrt(two[p, q, r]**2 + three[p, q, r]**2
+                                           + along[p, q, r]**2) / spacing
+        worst = one.max() / floor
+        if level[i, j, k]:
+            over[n] = worst
+            continue
+        _between(rate, i, j, k, allowed)
+        x, y, z = bends[0, i, j, k], bends[1, i, j, k], bends[2, i, j, k]
+        uneven, even, whole = 0.0, 0.0, 0.5 * (x + y + z)
+        for p in range(3):
+            for q in range(3):
+                for r in range(3):
+                    most = allowed[p, q, r]
+                    even = max(even, _over(one[p, q, r], most - whole))
+                    most -= (x if p == 1 else 0.0) + (y if q == 1 else 0.0) + (
+                        z if r == 1 else 0.0)
+                    uneven = max(uneven, _over(one[p, q, r], most))
+        over[n] = min(worst, even, uneven)
+    return over
+
+
+@compiled
+def _over(steep, allowed):
+    return steep / allowed if allowed > 0.0 else np.inf
+
+
+@compiled
+def _between(values, i, j, k, out):
+    """Write the trilinear interpolation at the 27 points ``(p, q, r) / 2`` in a cell."""
+    for p in range(0, 3, 2):
+        for q in range(0, 3, 2):
+            first, last = values[i + p // 2, j + q // 2, k], values[i + p // 2, j + q // 2, k + 1]
+            out[p, q, 0], out[p, q, 1], out[p, q, 2] = first, 0.5 * (first + last), last
+        for r in range(3):
+            out[p, 1, r] = 0.5 * (out[p, 0, r] + out[p, 2, r])
+    for q in range(3):
+        for r in range(3):
+            out[1, q, r] = 0.5 * (out[0, q, r] + out[2, q, r])

@@ -1,0 +1,273 @@
+"""What an uncertain Young's modulus does to the limits of a plan.
+
+A pose of the gripper is kept whatever the modulus is; energy, force and stress there are not. The
+moduli are log-normal. Of what a limit is on, with its sign or its direction, a quadratic response
+surface in the logs is laid through the full model's values at two standard deviations along each
+axis of the posterior and between the axes (Box and Wilson 1951; for reliability Bucher and Bourgund
+1990). Not of a magnitude or its log: a force is a difference of what bends the branch and what it
+weighs, may be small or turn, and its log bends without end. Forces, energies and stresses grow
+with the moduli if all grow and weight is little: the surface is of what they are over the mean
+growth. What the values of all poses are together is drawn from the surfaces: other poses break
+their limit under other moduli, and the motion is to keep it at each. Several limits share the
+probability that is left (Bonferroni).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from limber.core.errors import ConvergenceError
+from limber.core.progress import SILENT, Progress
+from limber.planning.constraints.limits import Limits, sizes
+from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
+
+_POSES = 10  # along the motion where a limit is near, besides those where one is nearest
+_NEAR = 0.3  # of a limit: what is farther below is taken to keep it
+_HIGH = 0.6  # of the peak of what a limit is on: poses of less are not the first to break it
+_FAR = (2.0, 1.0)  # standard deviations off, where the branch is solved; the next if it is not
+_CROSSED = 6  # axes of the posterior, those of most variance, whose products count
+_DEGREES = {"strain": 0.0}  # how a value grows with all moduli; 1 where not told
+_DRAWS_LOG2 = 14  # quasi-random draws: the chance of 0.95 is off by some 0.0005
+
+
+@dataclass(frozen=True)
+class Risk:
+    """How limits fare under uncertain moduli.
+
+    Attributes:
+        kept: Probability that all are kept along the motion, at least.
+        factors: By limit: how many times its peak on the estimate it may be, with the confidence.
+        excess: By limit: that over what is allowed.
+    """
+
+    kept: float
+    factors: dict[str, float]
+    excess: dict[str, float]
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether every limit is kept with the confidence."""
+        return not self.told()
+
+    def left(self, limits: Limits, path: ResolvedPath) -> Limits:
+        """Return what the estimate's branch may reach in motion where the motion keeps limits.
+
+        As far below them as standing still, at the pose where each is nearest.
+        """
+        standing = sizes(path.ahead)
+        return limits.tightened({
+            name: share * getattr(limits, name) / float(np.abs(standing[name]).max())
+            for name, share in self.excess.items()})
+
+    def told(self) -> list[str]:
+        """Return in words which limits are not kept with the confidence."""
+        return [f"with the confidence asked for, {name.replace('_', ' ')} may be {100 * share:.0f} "
+                "% of what is allowed" for name, share in self.excess.items() if share > 1.0]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A value at poses over changes of log E: quadratic, times the mean growth of the moduli.
+
+    Attributes:
+        whitening: From changes of log E [K] to standard deviations along the axes, shape [r, K].
+        pairs: Axes whose products count, shape [p, 2].
+        weights: Of 1, the axes and the products, shape [1 + r + p, n, parts]; a size is that of
+            the parts together.
+        degree: Power of the mean growth.
+    """
+
+    whitening: np.ndarray
+    pairs: np.ndarray
+    weights: np.ndarray
+    degree: float
+
+    @classmethod
+    def through(cls, axes: np.ndarray, pairs: np.ndarray, places: np.ndarray, values: np.ndarray,
+                degree: float) -> "Surface":
+        """Lay it through ``values`` [m, n, parts] at ``places`` [m, r] in standard deviations along
+        ``axes`` [K, r]; as many places as there are weights."""
+        grown = _growth(places @ axes.T, degree)
+        right = (values / grown[:, None, None]).reshape(len(places), -1)
+        weights = np.linalg.solve(_features(places, pairs), right)
+        return cls(np.linalg.pinv(axes), pairs, weights.reshape(values.shape), degree)
+
+    def sizes(self, logs: np.ndarray) -> np.ndarray:
+        """Return sizes under changes of log E [m, K], shape [m, n]."""
+        features = _features(logs @ self.whitening.T, self.pairs)
+        parts = np.tensordot(features, self.weights, axes=1)
+        return _growth(logs, self.degree)[:, None] * np.linalg.norm(parts, axis=2)
+
+
+def _growth(logs: np.ndarray, degree: float) -> np.ndarray:
+    return np.exp(degree * logs.mean(axis=1))
+
+
+def _features(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.ones(len(places)), places,
+                            places[:, pairs[:, 0]] * places[:, pairs[:, 1]]])
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What limits are on, at poses of a motion that come near to them.
+
+    Attributes:
+        asked: The limits, by name.
+        surfaces: What each is on; none where no pose comes near.
+    """
+
+    asked: dict[str, float]
+    surfaces: dict[str, Surface]
+
+    def risk(self, covariance: np.ndarray, confidence: float) -> Risk:
+        """Return how the motion keeps its limits where log E has this covariance [K, K]."""
+        logs = _draws(covariance)
+        kept, factors, excess = np.ones(len(logs), bool), {}, {}
+        share = 1.0 - (1.0 - confidence) / max(len(self.asked), 1)
+        for name, surface in self.surfaces.items():
+            peaks, limit = surface.sizes(logs).max(axis=1), self.asked[name]
+            kept &= peaks <= limit
+            likely = float(np.quantile(peaks, share))
+            factors[name] = likely / float(surface.sizes(np.zeros((1, logs.shape[1]))).max())
+            excess[name] = likely / limit
+        return Risk(float(kept.mean()), factors, excess)
+
+
+def _draws(covariance: np.ndarray) -> np.ndarray:
+    """Return changes of log E with this covariance [K, K], the same each time, shape [m, K]."""
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    even = scipy.stats.qmc.Sobol(len(variances), seed=0).random_base2(_DRAWS_LOG2)
+    white = scipy.special.ndtri(np.clip(even, 1e-12, 1.0 - 1e-12))
+    return white * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
+
+
+@dataclass(frozen=True)
+class YoungDoubt:
+    """Moduli at control points, log-normal about the estimate.
+
+    Attributes:
+        shares: Of each control point in each tetrahedron's modulus, rows sum to 1, [tets, K].
+        deviations: Of log E at the control points, shape [K].
+        correlation: Shape [K, K].
+    """
+
+    shares: np.ndarray
+    deviations: np.ndarray
+    correlation: np.ndarray
+
+    def scaled(self, grasp_model: GraspModel, logs: np.ndarray) -> GraspModel:
+        """Return the branch with log E at the control points changed by ``logs`` [K]."""
+        branch = grasp_model.branch
+        young = branch.model.young * (self.shares @ np.exp(logs))
+        return replace(grasp_model, branch=branch.with_young(young))
+
+    def draw(self, generator: np.random.Generator) -> np.ndarray:
+        """Return one draw of the changes of log E, shape [K]."""
+        white = generator.multivariate_normal(np.zeros(len(self.deviations)), self.correlation)
+        return self.deviations * white
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of log E at the control points, shape [K, K]."""
+        return self.correlation * np.outer(self.deviations, self.deviations)
+
+    def risk(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits, confidence: float,
+             progress: Progress = SILENT) -> Risk:
+        """Return how a motion keeps limits with a confidence between 0.5 and 1.
+
+        Raises:
+            ConvergenceError: the branch with other moduli cannot be solved at a pose.
+        """
+        return self.exposure(grasp_model, path, limits, progress).risk(self.covariance, confidence)
+
+    def exposure(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
+                 progress: Progress = SILENT) -> "Exposure":
+        """Return how what limits are on changes with the moduli along a motion.
+
+        Raises:
+            ConvergenceError: the branch with other moduli cannot be solved at a pose.
+        """
+        # How close the branch comes to obstacles hardly depends on its modulus.
+        asked = {name: limit for name, limit in limits.asked().items() if name != "closeness"}
+        whole = path.approach.joined(path.solved)
+        chosen = whole.take(_chosen(whole, asked))
+        axes = _axes(self.covariance)
+        for number, far in enumerate(_FAR):
+            places, pairs = _design(axes.shape[1], far)
+            try:
+                found = [chosen]
+                for place in places[1:]:
+                    progress(len(found) / len(places), "limits under other moduli")
+                    found.append(self.solved(grasp_model, axes @ place, chosen))
+                break
+            except ConvergenceError:
+                if number == len(_FAR) - 1:
+                    raise
+        known, surfaces = sizes(chosen), {}
+        for name, limit in asked.items():
+            near = np.flatnonzero(known[name] > _NEAR * limit)
+            if len(near):
+                values = np.array([_parts(states, name)[near] for states in found])
+                surfaces[name] = Surface.through(axes, pairs, places, values,
+                                                 _DEGREES.get(name, 1.0))
+        return Exposure(asked, surfaces)
+
+    def solved(self, grasp_model: GraspModel, logs: np.ndarray, states: SolvedPoses,
+               ) -> SolvedPoses:
+        """Return the same poses with changed moduli, each solved from its state.
+
+        Raises:
+            ConvergenceError: one cannot be solved.
+        """
+        other, results = self.scaled(grasp_model, logs), []
+        for pose, displacement in zip(states.poses, states.displacements, strict=True):
+            result = other.follow(pose[None, :3], displacement)[0]
+            if reason := refusal(result):
+                place = ", ".join(f"{x:.3f}" for x in pose[:3])
+                raise ConvergenceError(
+                    f"With another Young's modulus the branch has no acceptable solution "
+                    f"({reason}) at ({place}) m.",
+                    "Then it cannot be told whether the limits are kept.",
+                    "Choose a gentler goal, or leave --confidence away.")
+            results.append(result)
+        return SolvedPoses.of(other, results)
+
+
+def _axes(covariance: np.ndarray) -> np.ndarray:
+    """Return changes of log E by one standard deviation along the axes of the posterior that is
+    open at all, that of most variance first, shape [K, r]."""
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    order = np.argsort(-variances, kind="stable")
+    order = order[variances[order] > 1e-12 * max(float(variances.max()), 1e-300)]
+    return axes[:, order] * np.sqrt(variances[order])
+
+
+def _design(count: int, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return places [m, r] along and between axes, the middle first, and the axes [p, 2] whose
+    products can be told from them."""
+    crossed = [(k, other) for k in range(min(count, _CROSSED)) for other in range(k)]
+    unit = far * np.eye(count)
+    between = [(unit[k] + unit[other]) / np.sqrt(2.0) for k, other in crossed]
+    pairs = np.array([*((k, k) for k in range(count)), *crossed], int).reshape(-1, 2)
+    return np.vstack([np.zeros((1, count)), unit, -unit, *between]), pairs
+
+
+def _parts(states: SolvedPoses, name: str) -> np.ndarray:
+    """Return what a limit is on with its sign or direction, shape [n, parts]."""
+    vectors = {"force": states.forces, "torque": states.torques}
+    if name in vectors:
+        return vectors[name]
+    return (states.energies if name == "energy" else states.loads[name])[:, None]
+
+
+def _chosen(states: SolvedPoses, asked: dict[str, float]) -> np.ndarray:
+    """Return the poses to ask: some of those that may break a limit under some moduli, evenly along
+    the motion, and where each limit is nearest."""
+    known = sizes(states)
+    high = np.flatnonzero(np.any([known[name] > max(_HIGH * known[name].max(), _NEAR * limit)
+                                  for name, limit in asked.items()], axis=0))
+    some = np.linspace(0, len(high) - 1, min(_POSES, len(high))).round().astype(int)
+    return np.unique([*high[some], *(int(known[name].argmax()) for name in asked)]).astype(int)

@@ -1,0 +1,91 @@
+"""Whether a planned motion holds on the full model, and what is learnt where it does not."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.planning.constraints.limits import Limits
+from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.goals.goal import Goal, TargetGoal
+from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
+
+_APART = 0.01  # [m] between states of a path that become samples
+_MOST_LEARNT = 12  # of them a round
+_ROUND_OFF = 1e-12  # of the samples' largest energy
+_SLACK = 1e-3  # share of the goal's tolerance that is round-off
+
+
+def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: np.ndarray,
+                         ) -> list[str]:
+    """Return what is wrong with a motion, each with its place; nothing if it may be used.
+
+    Every pose of approach and path must have an acceptable solution within the limits, clear of
+    obstacles, and its end must be in the goal region. The way back takes the same states.
+
+    Args:
+        path: Solved on the full model.
+        limits: As asked, without margins.
+        goal: Where it must end.
+        nodes: Of the mesh at rest [m], shape [n, 3].
+    """
+    told = []
+    for position, reason in zip(path.unsolved, path.reasons, strict=True):
+        place = ", ".join(f"{x:.3f}" for x in position)
+        told.append(f"no acceptable solution ({reason}) at ({place}) m")
+    told = told[:1] + ([f"and at {len(told) - 1} more poses"] if len(told) > 1 else [])
+    whole = path.approach.joined(path.solved)
+    told += [str(broken) for broken in limits.broken(whole)]
+    if path.is_whole and isinstance(goal, TargetGoal):
+        off = goal.missed_by(path.solved)
+        if off > goal.tolerance * _SLACK:
+            told.append(f"the {goal.name} ends {1e3 * off:.1f} mm outside its goal")
+    if met := limits.met(whole, nodes):
+        told.append(met)
+    return told
+
+
+def field_error(field: EnergyField, states: SolvedPoses) -> float:
+    """Return how far the field's energy is from that of states, root mean square over theirs."""
+    size = float(np.sqrt(np.mean(states.energies**2)))
+    off = field.energy(states.poses[:, :3]) - np.maximum(states.energies, 0.0)
+    # At rest there is nothing but round-off.
+    felt = size > _ROUND_OFF * field.samples.energies.max()
+    return float(np.sqrt(np.mean(off**2))) / size if felt else 0.0
+
+
+def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
+           ) -> GraspSamples:
+    """Return states of a path that is not passed on as samples: its end, where limits are broken,
+    and where the field is off most; and poses that have no solution as rejected ones."""
+    whole = path.approach.joined(path.solved)
+    off = np.abs(field.energy(whole.poses[:, :3]) - whole.energies)
+    close = None
+    if limits.obstacles:
+        close = limits.closeness_of(grasp_model.mesh.nodes, whole.displacements)
+    broken = np.flatnonzero(~limits.kept(whole) | (False if close is None else close > 1.0))
+    order = np.concatenate([[len(off) - 1], broken[:: max(1, 2 * len(broken) // _MOST_LEARNT)],
+                            np.argsort(-off)])
+    chosen: list[int] = []
+    known = field.samples.positions
+    for index in order:
+        place = whole.poses[index, :3]
+        others = np.concatenate([known, whole.poses[chosen, :3]])
+        if len(chosen) < _MOST_LEARNT and (
+                np.linalg.norm(others - place, axis=1).min() > 0.5 * _APART):
+            chosen.append(int(index))
+    found = _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved,
+                        field.samples)
+    return found if close is None else replace(found, closeness=close[chosen])
+
+
+def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarray,
+                like: GraspSamples) -> GraspSamples:
+    names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
+    optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
+    if like.shape_slopes is not None:
+        slopes = [grasp_model.shape_slopes(moved) for moved in states.displacements]
+        optional["shape_slopes"] = np.reshape(slopes, (-1, *like.shape_slopes.shape[1:]))
+    return GraspSamples(states.poses, states.energies, states.forces, states.tips,
+                        states.min_det_f, np.hstack([unsolved, np.zeros_like(unsolved)]),
+                        states.strains, **optional)

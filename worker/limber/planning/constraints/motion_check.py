@@ -1,0 +1,179 @@
+"""Whether a timed motion keeps its limits with inertia, and how slow it has to be for that.
+
+The full model is driven along approach and path as fast as the pace allows, by implicit Newmark
+steps, and back again from where the branch has come to rest at the path's end. Steps are short
+while the gripper gains or loses speed and until what that stirs up has passed its first peak; in
+between, where the branch merely follows, a step is as long as the way between the poses that the
+static check solves.
+"""
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from limber.core.processes import run_tasks
+from limber.core.progress import SILENT, Progress
+from limber.mechanics import simulate_dynamics
+from limber.mechanics.dynamics.motion import DynamicResult, NewmarkSettings
+from limber.planning.constraints.limits import UNITS, Broken, Limits, sizes, with_unit
+from limber.planning.constraints.obstacles import closest
+from limber.planning.cost import STEP
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.path_on_full_model import ResolvedPath
+from limber.planning.timing import Pace, poses_at, time_law
+
+_FINE = 1 / 60  # [s] a step while speed changes, at most
+_RAMP_STEPS = 8  # in the time from rest to full speed, at least
+_SETTLE = 0.3  # [s] after speed has changed, and at the end: lowest vibrations peak within it
+_CHANGES = 0.02  # share of the largest acceleration that counts as a change of speed
+_LEAST_SLOWING, _MOST_SLOWING = 1.25, 4.0
+_TOWARDS = 0.8  # of what a limit leaves to inertia that the next pace shall take
+
+
+@dataclass(frozen=True)
+class MotionCheck:
+    """A motion on the full model in time.
+
+    Attributes:
+        pace: The last that was tried; the one to go by if nothing is broken.
+        broken: What it breaks, each with its place; empty if it may be gone.
+        peaks, static_peaks: Largest values by limit that was asked for, with inertia and without.
+        slowings: How often it was slowed down.
+        excess: By limit: its peak over what is allowed.
+        step_count, seconds: Of all simulations.
+    """
+
+    pace: Pace
+    broken: list[str]
+    peaks: dict[str, float]
+    static_peaks: dict[str, float]
+    slowings: int
+    excess: dict[str, float]
+    step_count: int
+    seconds: float
+
+    def describe(self) -> dict:
+        """Return it as plain data."""
+        return {"speed_m_s": self.pace.speed, "acceleration_m_s2": self.pace.acceleration,
+                "slowings": self.slowings, "step_count": self.step_count, "seconds": self.seconds,
+                "peaks": {with_unit(name): {"moving": peak, "standing": self.static_peaks[name]}
+                          for name, peak in self.peaks.items()}}
+
+
+def check_motion(grasp_model: GraspModel, path: ResolvedPath, limits: Limits, pace: Pace, *,
+                 slowings: int, workers: int | None = None, progress: Progress = SILENT,
+                 ) -> MotionCheck:
+    """Move the branch along approach and path and back; slow the motion until ``limits`` hold.
+
+    Args:
+        path: That keeps the limits standing still at every pose.
+        slowings: How often at most to slow down and try again.
+    """
+    there = path.ahead
+    standing = {name: float(np.abs(size).max()) for name, size in sizes(there).items()}
+    ways = [(there.poses, there.displacements[0]),
+            (there.poses[::-1], there.displacements[-1])]
+    steps, began = 0, perf_counter()
+    for attempt in range(slowings + 1):
+        part = progress.part(attempt / (slowings + 1), (attempt + 1) / (slowings + 1))
+        moved = run_tasks(_moved, [(grasp_model, poses, start, pace, limits)
+                                   for poses, start in ways],
+                          workers=workers, progress=part, message="the motion in time")
+        steps += sum(one.step_count for one in moved)
+        peaks = {name: max(one.peaks.get(name, 0.0) for one in moved) for name in limits.asked()
+                 if name in standing}
+        broken = [words for one in moved for words in one.broken]
+        if not broken or attempt == slowings:
+            break
+        slower = _slower(peaks, standing, limits, not all(one.is_whole for one in moved))
+        if slower is None:
+            break
+        pace = pace.slower(slower)
+    excess = {name: peak / getattr(limits, name) for name, peak in peaks.items()}
+    return MotionCheck(pace, broken, peaks, standing, attempt, excess, steps,
+                       perf_counter() - began)
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """One way in time: largest values, what was broken, and whether the branch came along."""
+
+    peaks: dict[str, float]
+    broken: list[str]
+    is_whole: bool
+    step_count: int
+
+
+def _moved(grasp_model: GraspModel, poses: np.ndarray, start: np.ndarray, pace: Pace,
+           limits: Limits, progress: Progress = SILENT) -> _Moved:
+    times, places = _drive(poses, pace)
+    found = simulate_dynamics(
+        grasp_model.model, grasp=grasp_model.grasp, times=times, start=start,
+        poses=np.hstack([places, np.zeros_like(places)]),
+        settings=NewmarkSettings(max_step=float(np.diff(times).max())), progress=progress)
+    values = _sizes(grasp_model, found, limits)
+    broken = [str(Broken(f"{name.replace('_', ' ')} in motion [{UNITS[name]}]".replace(" []", ""),
+                         float(size.max()), getattr(limits, name), places[size.argmax()]))
+              for name, size in values.items() if size.max() > getattr(limits, name)]
+    nodes = (grasp_model.mesh.nodes + found.displacement).reshape(-1, 3)
+    if limits.obstacles and (hit := closest(limits.obstacles, nodes)):
+        where = ", ".join(f"{x:.3f}" for x in hit[2])
+        broken.append(f"in motion the branch is {1e3 * hit[1]:.1f} mm inside {hit[0]} at "
+                      f"({where}) m")
+    if not found.converged:
+        where = ", ".join(f"{x:.3f}" for x in places[len(found.times) - 1])
+        broken.append(f"in motion the branch does not come along ({found.message}) at ({where}) m")
+    return _Moved({name: float(size.max()) for name, size in values.items()}, broken,
+                  found.converged, found.step_count)
+
+
+def _drive(poses: np.ndarray, pace: Pace) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of the steps [s], [k], and where the grasp is then [m], [k, 3]."""
+    law = time_law(poses[:, :3], pace)
+    coarse = STEP / pace.speed
+    fine = min(_FINE, pace.speed / pace.acceleration / _RAMP_STEPS, coarse)
+    end = law.duration + _SETTLE
+    changing = np.abs(law.accelerations) > _CHANGES * pace.acceleration
+    cells = np.zeros(int(np.ceil(end / fine)) + 1, bool)
+    for first, last in zip(law.times[:-1][changing], law.times[1:][changing], strict=True):
+        cells[int(first / fine):int((last + _SETTLE) / fine) + 1] = True
+    cells[int(law.duration / fine):] = True
+    short = np.flatnonzero(cells) * fine
+    times = np.unique(np.concatenate([np.arange(0.0, law.duration, coarse), short, [end]]))
+    times = times[times <= end]
+    # Two instants of the two grids that nearly fall together would make a needlessly short step.
+    times = times[np.concatenate([[True], np.diff(times) > 0.3 * fine])]
+    return times, poses_at(poses, law, times)[:, :3]
+
+
+def _sizes(grasp_model: GraspModel, found: DynamicResult, limits: Limits) -> dict[str, np.ndarray]:
+    """Return at each instant what limits were asked on, by the names of ``UNITS``."""
+    asked = limits.asked()
+    values = {"energy": found.energy, "force": np.linalg.norm(found.reaction_force, axis=1),
+              "torque": np.linalg.norm(found.reaction_torque, axis=1)}
+    if "axial_force" in asked:
+        values["axial_force"] = np.abs([
+            grasp_model.axial_force(u, force)
+            for u, force in zip(found.displacement, found.reaction_force, strict=True)])
+    if {"strain", "stress"} & set(asked):
+        loads = [grasp_model.peak_load(u) for u in found.displacement]
+        values["strain"], values["stress"] = (np.array([load[k] for load in loads])
+                                              for k in (0, 2))
+    return {name: size for name, size in values.items() if name in asked}
+
+
+def _slower(peaks: dict[str, float], standing: dict[str, float], limits: Limits,
+            has_failed: bool) -> float | None:
+    """Return how many times slower to try; None where no pace keeps a limit.
+
+    What inertia adds falls with the square of the pace.
+    """
+    needed = [_LEAST_SLOWING] if not has_failed else [2.0]
+    for name, peak in peaks.items():
+        limit = getattr(limits, name)
+        if standing[name] >= limit:
+            return None
+        if peak > limit:
+            needed.append(np.sqrt((peak - standing[name]) / (limit - standing[name]) / _TOWARDS))
+    return float(min(max(needed), _MOST_SLOWING))

@@ -1,0 +1,120 @@
+"""The shell on which a grasp moves by itself.
+
+A branch yields easily across and hardly along. Under forces across, its grasp stays within a tenth
+of a millimetre on a sphere about a pivot a fifth to a quarter of the way up (the pseudo-rigid body
+of a cantilever: Howell, Compliant Mechanisms, 2001, 5.1; measured on four branches, 40 %
+deflection). Inside it the branch is pushed together and bends; beyond it is drawn taut, and the
+force grows a hundred times as fast. Gentle paths run along the shell. So samples follow it, and
+some are drawn a little beyond: no path is best at the limit of what was sampled.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from limber.core.progress import SILENT, Progress
+from limber.mechanics import StaticResult
+from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.solved import Solved, taken
+from limber.planning.field.solver_pool import Crew
+
+_STEP = 1e-4  # [m] of the moves that measure the stiffness at rest
+_RIM = 1.1  # times the force that linear bending needs for the largest deflection
+_GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+_WORST = 0.02  # share of the radius that the sphere may miss the states by, root mean square
+_SHARE_DIRECTIONS = 3
+"""Directions of one task; must not depend on how many processes there are."""
+
+
+@dataclass(frozen=True)
+class Valley:
+    """A sphere: ``pivot`` [m] of shape [3] and ``radius`` [m]."""
+
+    pivot: np.ndarray
+    radius: float
+
+
+def walk_valley(crew: Crew, count: int, *, deflection: float, seed: int = 0,
+                progress: Progress = SILENT) -> tuple[Valley, list[Solved]]:
+    """Return the shell, and states of the branch on it and a little beyond.
+
+    Args:
+        count: Directions to go; each gives two states, one under a force across and one drawn
+            outward besides, as strongly as the branch is bent at the largest deflection.
+        deflection: Largest distance from rest, as a share of the arc length.
+        seed: Turns the directions.
+
+    A branch that is no cantilever (its states lie on no sphere) gets the sphere about its base.
+    """
+    grasp_model = crew.grasp_model
+    reach = grasp_model.reach
+    stiffness, axes = _stiffness(grasp_model)
+    force = float(np.sqrt(max(stiffness[0] * stiffness[1], 0.0))) * deflection * reach.arc_length
+    turn = float(np.random.default_rng([seed, 11]).uniform(0.0, 2.0 * np.pi))
+    angles = turn + _GOLDEN * np.arange(count)
+    across = _RIM * force * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * (
+        np.cos(angles)[:, None] * axes[:, 0] + np.sin(angles)[:, None] * axes[:, 1])
+    across = np.concatenate([np.zeros((1, 3)), across])
+    # In turn: the farther from rest, the longer it takes.
+    shares = max(2, -(-len(across) // _SHARE_DIRECTIONS))
+    found = crew.run(_walk, [(across[k::shares], force) for k in range(shares)],
+                     progress=progress, message="how the grasp moves by itself")
+    pairs = [found[k % shares][k // shares] for k in range(len(across))]
+    slack = [pair[0] for pair in pairs[1:] if pair[0] is not None]
+    places = np.array([grasp_model.rest_position, *(state.pose[:3] for state in slack)])
+    return _sphere(places, reach.base, grasp_model.rest_position), [
+        *slack, *(pair[1] for pair in pairs if pair[1] is not None)]
+
+
+def _walk(grasp_model: GraspModel, across: np.ndarray, outward: float,
+          progress: Progress = SILENT) -> list[tuple[Solved | None, Solved | None]]:
+    """Return the states under each force [n, 3], and drawn ``outward`` [N] besides."""
+    pairs = []
+    for number, force in enumerate(across):
+        progress(number / len(across), "how the grasp moves by itself")
+        slack = _under(grasp_model, force, grasp_model.rest) if force.any() else grasp_model.rest
+        if slack is None:
+            pairs.append((None, None))
+            continue
+        kept = taken(grasp_model, slack)
+        drawn = _under(grasp_model, force + outward * _unit(kept.pose[:3] - grasp_model.reach.base),
+                       slack)
+        pairs.append((kept, None if drawn is None else taken(grasp_model, drawn)))
+    return pairs
+
+
+def _stiffness(grasp_model: GraspModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return stiffnesses of the grasp at rest [N/m], ascending, and their axes as columns."""
+    moved = [grasp_model.follow((grasp_model.rest_position + _STEP * axis)[None],
+                                grasp_model.rest.displacement)[0].require().reaction_force / _STEP
+             for axis in np.eye(3)]
+    whole = np.array(moved)
+    return np.linalg.eigh(0.5 * (whole + whole.T))
+
+
+def _under(grasp_model: GraspModel, force: np.ndarray, start: StaticResult) -> StaticResult | None:
+    """Return the state under a force [3] on the grasp, held there; None if there is none."""
+    held = grasp_model.pulled(force, start.displacement)
+    return None if refusal(held) else held
+
+
+def _sphere(places: np.ndarray, base: np.ndarray, rest: np.ndarray) -> Valley:
+    arm = rest - base
+    chord = float(np.linalg.norm(arm))
+
+    def missed(unknown: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(places - unknown[:3], axis=1) - unknown[3]
+
+    if len(places) >= 8:
+        start = np.r_[base + 0.2 * arm, 0.8 * chord]
+        found = scipy.optimize.least_squares(missed, start, x_scale=chord)
+        pivot, radius = found.x[:3], float(found.x[3])
+        close = np.sqrt(np.mean(found.fun**2)) < _WORST * radius
+        if close and 0.2 * chord < radius < 3.0 * chord and (rest - pivot) @ arm > 0.0:
+            return Valley(pivot, radius)
+    return Valley(np.asarray(base, float), chord)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)

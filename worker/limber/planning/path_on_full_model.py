@@ -1,0 +1,173 @@
+"""A planned path on the full model: what the branch really does along it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import ConvergenceError
+from limber.core.processes import run_tasks
+from limber.core.progress import SILENT, Progress
+from limber.mechanics import StaticResult
+from limber.planning.cost import PathMeasures, measure_path, resample
+from limber.planning.field.energy_field import LOADS
+from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.guess import straight_on
+
+_APPROACH_STEP = 0.02  # [m] between poses on the way from rest to the start
+_MOST_UNSOLVED = 0.1  # share of a path's poses
+
+
+@dataclass(frozen=True)
+class SolvedPoses:
+    """States of the branch at poses of the gripper.
+
+    Attributes:
+        poses: Positions [m] and natural rotations [rad], shape [n, 6].
+        energies: Potential of strain and weight above the hanging state [J], shape [n].
+        forces, torques: Of the gripper on the branch [N, Nm], shape [n, 3].
+        strains: Largest principal Green-Lagrange strain anywhere in the branch, shape [n].
+        strain_places: Where, in the rest shape [m], shape [n, 3].
+        stresses: Largest principal Cauchy stress by magnitude [Pa], shape [n].
+        min_det_f: Least determinant of the deformation gradient, shape [n].
+        tips: Position of the branch's tip [m], shape [n, 3].
+        targets: Positions of the named targets [m], shape [n, targets, 3].
+        axial_forces: Part of the forces along the branch, outward [N], shape [n].
+        displacements: Of all nodes [m], shape [n, node_count, 3].
+    """
+
+    poses: np.ndarray
+    energies: np.ndarray
+    forces: np.ndarray
+    torques: np.ndarray
+    strains: np.ndarray
+    strain_places: np.ndarray
+    stresses: np.ndarray
+    min_det_f: np.ndarray
+    tips: np.ndarray
+    targets: np.ndarray
+    axial_forces: np.ndarray
+    displacements: np.ndarray
+
+    @classmethod
+    def of(cls, grasp_model: GraspModel, results: list[StaticResult]) -> "SolvedPoses":
+        """Return what solutions say."""
+        moved = [result.displacement for result in results]
+        strains, places, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
+        return cls(
+            poses=np.array([grasp_model.pose(u) for u in moved]),
+            energies=np.array([grasp_model.energy(result) for result in results]),
+            forces=np.array([result.reaction_force for result in results]),
+            torques=np.array([result.reaction_torque for result in results]),
+            strains=np.array(strains), strain_places=np.array(places),
+            stresses=np.array(stresses),
+            min_det_f=np.array([float(result.min_det_f) for result in results]),
+            tips=np.array([grasp_model.tip(u) for u in moved]),
+            targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
+            axial_forces=np.array([grasp_model.axial_force(result.displacement,
+                                                           result.reaction_force)
+                                   for result in results]),
+            displacements=np.array(moved))
+
+    @property
+    def force_sizes(self) -> np.ndarray:
+        """Magnitude of the gripper's force [N], shape [n]."""
+        return np.linalg.norm(self.forces, axis=1)
+
+    @property
+    def loads(self) -> dict[str, np.ndarray]:
+        """Loads by their names but closeness to obstacles, shape [n] each."""
+        return dict(zip(LOADS[:-1], (self.strains, self.stresses, self.axial_forces,
+                                np.linalg.norm(self.torques, axis=1)), strict=True))
+
+    def take(self, index: np.ndarray) -> "SolvedPoses":
+        """Return the states of ``index``, in its order."""
+        return SolvedPoses(**{name: values[index] for name, values in vars(self).items()})
+
+    def joined(self, other: "SolvedPoses") -> "SolvedPoses":
+        """Return these states and those of ``other`` behind them."""
+        return SolvedPoses(**{name: np.concatenate([values, getattr(other, name)])
+                              for name, values in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class ResolvedPath:
+    """A path solved by finite elements.
+
+    Attributes:
+        solved: The states along it.
+        approach: Those on the way from rest, the hanging state first, to before the path.
+        unsolved: Positions on approach and path without an acceptable solution [m], shape [k, 3].
+        reasons: Why, k of them.
+        is_whole: Whether the end was reached; over a tenth unsolved ends the way early.
+    """
+
+    solved: SolvedPoses
+    approach: SolvedPoses
+    unsolved: np.ndarray
+    reasons: tuple[str, ...]
+    is_whole: bool
+
+    @property
+    def measures(self) -> PathMeasures:
+        return measure_path(self.solved.poses[:, :3], self.solved.energies,
+                            self.solved.force_sizes)
+
+    @property
+    def ahead(self) -> SolvedPoses:
+        """Approach and path, the pose where they join once."""
+        joined = np.linalg.norm(self.approach.poses[-1, :3] - self.solved.poses[0, :3]) < 1e-9
+        kept = np.arange(len(self.approach.poses) - joined)
+        return self.approach.take(kept).joined(self.solved)
+
+    @property
+    def unsolved_count(self) -> int:
+        return len(self.reasons)
+
+    def require(self) -> "ResolvedPath":
+        """Return this.
+
+        Raises:
+            ConvergenceError: over a tenth of the poses has no acceptable solution, or the last.
+        """
+        if self.is_whole:
+            return self
+        kinds = ", ".join(f"{self.reasons.count(kind)} {kind}"
+                          for kind in sorted(set(self.reasons)))
+        raise ConvergenceError(
+            f"Along a path {len(self.reasons)} poses have no acceptable solution ({kinds}).",
+            "The energy field promised more than the branch can do.",
+            "Sample more poses with `limber energy --samples`, or choose a gentler goal.")
+
+
+def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray,
+                 progress: Progress = SILENT) -> ResolvedPath:
+    """Solve the branch along ``path`` [n, 3], coming from rest by ``approach`` [k, 3]."""
+    before, unsolved, reasons = [grasp_model.rest], [], []
+    good, last, state = [], None, grasp_model.rest.displacement
+    ahead = resample(approach, _APPROACH_STEP)[1:-1]
+    is_whole = True
+    for number, point in enumerate(np.concatenate([ahead, path])):
+        progress(number / (len(ahead) + len(path)), "path on the full model")
+        guess = None if last is None else straight_on(grasp_model, last, state, point)
+        result = grasp_model.follow(point[None], state, guess)[0]
+        if reason := refusal(result):
+            unsolved.append(point)
+            reasons.append(str(reason))
+            is_whole = number < len(ahead) + len(path) - 1 and (
+                len(reasons) <= _MOST_UNSOLVED * len(path))
+            if not is_whole:
+                break
+            continue
+        (before if number < len(ahead) else good).append(result)
+        last, state = state, result.displacement
+    return ResolvedPath(
+        SolvedPoses.of(grasp_model, good or before[-1:]), SolvedPoses.of(grasp_model, before),
+        np.array(unsolved).reshape(-1, 3), tuple(reasons), is_whole)
+
+
+def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,
+                         workers: int | None = None, progress: Progress = SILENT,
+                         ) -> list[ResolvedPath]:
+    """Solve several paths with the same approach, each in a process where cores allow."""
+    return run_tasks(resolve_path, [(grasp_model, path, approach) for path in paths],
+                     workers=workers, progress=progress, message="both paths on the full model")

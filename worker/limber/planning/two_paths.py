@@ -1,0 +1,350 @@
+"""Two paths to the same goal region on one field: the shortest, and the gentle one."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError, NoPathError
+from limber.core.progress import SILENT, Progress
+from limber.planning.certificate.lower_bound import Certificate
+from limber.planning.constraints.limits import UNITS, Limits
+from limber.planning.cost import STEP, CostWeights
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.goals.goal import (
+    Goal,
+    GoalOverLimitsError,
+    GraspGoal,
+    allowed_points,
+    goal_points,
+    over_limits,
+    unit_doubt,
+)
+from limber.planning.planners.detour import DetourPath, plan_detour
+from limber.planning.planners.gentle import GentlePath, plan_gentle
+from limber.planning.planners.ompl_engine import ompl_missing
+from limber.planning.planners.refine import refine
+from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.trees import FoundPath, found_again, plan_path
+from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
+from limber.planning.settings import PlanSettings
+
+_SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
+_AT_START = 1e-4  # [m] the approach ends that near
+NOTHING_ASKED = "none"
+"""The engine of paths that stay where they are."""
+_ANY = 1e6  # gap: any path will do
+
+
+@dataclass(frozen=True)
+class PathPair:
+    """RRT* (length alone) and the gentle plan between the same start and goal region.
+
+    ``approach`` [k, 3] leads gently from the rest pose to the start: a branch that is pushed
+    there straight may buckle on the way and be another branch when it arrives. ``certificate``
+    says how close the plan is to the best possible path on the field; ``compared`` has the
+    polylines [n, 3] of all paths that were found, by name. ``margins`` is by how much the limits
+    were tighter than asked; ``detour`` what a limit on the length did. ``trees`` is what the
+    planners that grow one found, by the planner's name.
+    """
+
+    baseline: FoundPath
+    plan: FoundPath
+    approach: np.ndarray
+    cost: CostWeights
+    certificate: Certificate
+    compared: dict[str, np.ndarray]
+    margins: dict[str, float] = field(default_factory=dict)
+    detour: DetourPath | None = None
+    trees: dict[str, FoundPath] = field(default_factory=dict)
+
+    @property
+    def stays(self) -> bool:
+        """Whether the start lies in the goal, so that the paths have no length."""
+        return self.plan.engine == NOTHING_ASKED
+
+
+def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
+                limits: Limits, *, asked: Limits | None = None, before: PathPair | None = None,
+                progress: Progress = SILENT) -> PathPair:
+    """Plan both paths within ``limits``, tighter by what the field may be wrong by where it can be.
+
+    ``asked`` are the limits before they were tightened for what the field does not know, ``limits``
+    where not given: that no path exists is said of those. ``before`` is what was found until the
+    field learnt: its trees are not grown again where their paths still hold.
+
+    Where no path keeps the margins, one that keeps the limits on the field alone is planned; where
+    none does either, and that proves nothing, one that may keep them on the branch
+    (:meth:`~.limits.Limits.beyond`). The full model decides whether it holds.
+
+    Raises:
+        InputError: the start is not allowed.
+        NoPathError: the goal cannot be reached; says why, and whether that is proven.
+    """
+    margins = limits.margins(field)
+    _check_start(field, start, limits.on(field))
+    none = dict.fromkeys(margins, 0.0)
+    surely = (asked or limits).beyond(field)
+    # A start near its limit leaves room for a part of the margins only.
+    parts = [{name: share * value for name, value in margins.items()} for share in _SHARES]
+    parts = [part for part in parts if allowed_points(start[None], limits.on(field, part))[0]]
+    if any(margins.values()) and parts:
+        try:
+            found = plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
+                              beyond=surely, before=before, progress=progress.part(0.0, 0.5))
+            return replace(found, margins=parts[0])
+        except NoPathError:
+            progress.warn("No path keeps the limits with margins for the error of the energy "
+                          f"field ({_told(parts[0])}): planned without; the full model decides.")
+    try:
+        found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
+                          before=before, progress=progress.part(0.5, 1.0))
+    except NoWayError as error:
+        found = _in_doubt(error, field, start, goal, settings, limits, surely,
+                          before=before, progress=progress.part(0.5, 1.0))
+    return replace(found, margins=none)
+
+
+def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goal,
+              settings: PlanSettings, limits: Limits, surely: FieldArrays,
+              **options: Any) -> PathPair:
+    """Return what is planned with as much more than the limits as the field may be wrong by.
+
+    Raises:
+        NoWayError: ``none``, where it is proven, the field is not wrong, or that is of no use.
+    """
+    doubts = limits.doubts(field)
+    if UNPROVEN not in none.seen or not any(doubts.values()):
+        raise none
+    options["progress"].warn(
+        "No path keeps the limits on the energy field, and none is proven away: planned with as "
+        f"much more as its error allows ({_told(doubts)}); the full model decides.")
+    try:
+        return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
+                         **options)
+    except NoPathError:
+        raise none from None
+
+
+def _told(margins: dict[str, float]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} " + (
+        f"{value:.2g} {UNITS[name]}".rstrip() if value < np.inf else "not known")
+        for name, value in margins.items() if value)
+
+
+def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
+              limits: FieldArrays | None = None, *, beyond: FieldArrays | None = None,
+              before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
+    """Plan both paths under the same limits, and bound the cost of any path from below.
+
+    ``limits`` are those of the settings where not given; ``beyond`` what the bound counts on
+    (:class:`~.problem.GentleProblem`).
+
+    Raises:
+        InputError: the start is not allowed.
+        NoPathError: the goal cannot be reached; says why, and whether that is proven.
+    """
+    limits = limits or limits_of(field, settings)
+    _check_start(field, start, limits)
+    if goal.distance(field, start[None])[0] <= goal.tolerance:
+        return _staying(field, start, goal, settings, limits, beyond)
+    nobody: GoalOverLimitsError | None = None
+    try:
+        goals = goal_points(goal, field, limits, seed=settings.seed)
+    except GoalOverLimitsError as error:
+        # Drawn poses miss a narrow valley: cells find a way into it, or prove that there is none.
+        goals, nobody = np.empty((0, 3)), error
+    # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
+    weighed = CostWeights.between(field, start, goal.centre(field),
+                                  deformation=settings.deformation_weight,
+                                  distance=settings.distance_weight)
+    trees = _trees(limits, field, start, goal, goals, settings, weighed,
+                   {} if before is None else before.trees,
+                   progress.part(0.0, 0.5)) if nobody is None else {}
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
+    known = [path.points for path in trees.values()]
+    try:
+        gentle, detour = _gentle(problem, known, settings, progress.part(0.5, 1.0))
+    except NoWayError as error:
+        if nobody is None or UNPROVEN in error.seen:
+            raise
+        raise NoWayError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix) from error
+    if detour is not None:
+        weighed = replace(weighed, distance=detour.weight * weighed.distance)
+        problem = replace(problem, weights=weighed.weights)
+    if settings.planner == "d-rrt-star":
+        if "D-RRT*" not in trees:
+            raise NoPathError(
+                f"D-RRT* found no path in {settings.iterations} iterations, but there is one.",
+                "The eikonal planner found it.",
+                "Allow more --iterations, or leave --planner away.")
+        plan = trees["D-RRT*"]
+        certificate = replace(gentle.certificate, upper=problem.cost(plan.points))
+    else:
+        certificate = gentle.certificate
+        plan = FoundPath(gentle.points, gentle.cost, gentle.cost, [
+            {"iteration": number + 1, "cost": level["upper"]}
+            for number, level in enumerate(certificate.levels)], engine="eikonal")
+    baseline = trees.get("RRT*") or _shortest(problem, gentle.points)
+    compared = {"straight line": np.stack([start, goal.centre(field)]),
+                "eikonal": gentle.points}
+    for name, path in trees.items():
+        compared[name] = path.points
+        compared[f"{name}, not smoothed"] = path.raw
+    return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
+                    detour=detour, trees=trees)
+
+
+def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
+             limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
+    """Return what is planned where the start lies in the goal: both paths stay there."""
+    weighed = CostWeights.between(field, start, goal.centre(field),
+                                  deformation=settings.deformation_weight,
+                                  distance=settings.distance_weight)
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
+    path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
+    return PathPair(path, path, _approach(problem, settings), weighed, Certificate(0.0, 0.0),
+                    {"straight line": path.points, "eikonal": path.points})
+
+
+def _gentle(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
+            progress: Progress) -> tuple[GentlePath, DetourPath | None]:
+    """Return the gentlest path, and what a limit on its length did."""
+    if settings.max_detour is None:
+        return plan_gentle(problem, known, progress=progress), None
+    detour = _detour(problem, known, settings, progress)
+    return detour.found, detour
+
+
+def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
+            progress: Progress) -> DetourPath:
+    """Return the gentlest path within the length that the settings allow."""
+    if settings.planner != "eikonal":
+        raise InputError("--max-detour is given with --planner d-rrt-star.",
+                         "A tree keeps no limit on the length of its path.",
+                         "Leave --planner away.")
+    if settings.deformation_weight == 0.0:
+        raise InputError("--max-detour is given with a --deformation-weight of 0.",
+                         "Without a weight on energy the shortest path is asked for.",
+                         "Leave one of them away.")
+    rough = known or [plan_gentle(problem, progress=progress.part(0.0, 0.3)).points]
+    paths = [_shortest(problem, path) for path in rough]
+    shortest = min((path for path in paths if np.isfinite(path.cost)),
+                   key=lambda path: path.cost).points
+    return plan_detour(problem, shortest, settings.max_detour / 100.0, rough,
+                       progress=progress.part(0.3, 1.0))
+
+
+def _trees(limits: FieldArrays, field: EnergyField, start: np.ndarray, goal: Goal,
+           goals: np.ndarray, settings: PlanSettings, weighed: CostWeights,
+           before: dict[str, FoundPath], progress: Progress) -> dict[str, FoundPath]:
+    """Return what RRT* and D-RRT* find, or had found before: either, both or nothing."""
+    def in_goal(points: np.ndarray) -> np.ndarray:
+        return goal.distance(field, points) <= goal.tolerance
+
+    engine = chosen_engine(settings.engine)
+    search = Search(iterations=settings.iterations, seed=settings.seed)
+    shortest = replace(weighed, deformation=0.0, distance=1.0)
+    found = {}
+    for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
+        part = progress.part(0.5 * number, 0.5 * (number + 1))
+        part(0.0, name)
+        problem = PathProblem(start, goals, in_goal, field, limits, cost.weights)
+        if name in before and (again := found_again(before[name], problem)):
+            found[name] = again
+            continue
+        try:
+            found[name] = plan_path(problem, search, engine=engine, progress=part)
+        except NoPathError as error:
+            # No verdict: the eikonal planner finds the path, or proves that there is none.
+            progress.warn(f"{name}: {error}")
+    return found
+
+
+def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
+    """Return the path made as short as it can be, where RRT* found none."""
+    weights = problem.weights._replace(energy=0.0)
+    points, cost = refine(path, replace(problem, weights=weights))
+    return FoundPath(points, cost, cost, engine="refined")
+
+
+def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
+    """Return a gentle way [k, 3] from rest to the start, within the same limits.
+
+    Raises:
+        NoPathError: there is none.
+    """
+    field, start = problem.energy_field, problem.start
+    if np.linalg.norm(start - field.rest) < STEP:
+        return field.rest[None]
+    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
+                               deformation=max(settings.deformation_weight, 1.0))
+    there = GraspGoal(tuple(map(float, start)), _AT_START)
+    way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there,
+                        beyond=problem.beyond)
+    line = np.linspace(field.rest, start, 40)
+    points, least = refine(line, way)
+    if not np.isfinite(least):
+        try:
+            rough = plan_path(PathProblem(
+                field.rest, start[None],
+                lambda points: np.linalg.norm(points - start, axis=1) < 1e-9, field,
+                problem.limits, cost.weights), Search(iterations=1500, seed=settings.seed)).points
+            points, _ = refine(rough, way)
+        except NoPathError:
+            # A tree that misses a narrow way is no verdict: the grid finds it, or says why not.
+            points = plan_gentle(way, enough=_ANY).points
+    return np.concatenate([points, start[None]])
+
+
+def limits_of(field: EnergyField, settings: PlanSettings) -> FieldArrays:
+    """Return the field's arrays with the settings' limits; none given means no limit."""
+    return Limits.of(settings).on(field)
+
+
+def chosen_engine(engine: str) -> str:
+    """Return ``ompl`` or ``own`` for the setting.
+
+    Both find equally good paths in about the same time (scripts/bench planning); OMPL's is the
+    planner that others know, ours runs where OMPL has no wheel.
+    """
+    if engine == "auto":
+        return "own" if ompl_missing() else "ompl"
+    return engine
+
+
+def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: int) -> np.ndarray:
+    """Return a random deformed configuration far from rest and from the goal, shape [3].
+
+    The paper's trials start from "randomized initial configurations"; it does not say how they
+    were drawn. Here: uniform over the allowed region, at least half the largest deflection away
+    from rest, and outside the goal by as much.
+
+    Raises:
+        NoPathError: no such configuration was found.
+    """
+    generator = np.random.default_rng([seed, 7])
+    points = field.region.draw(4000, generator)
+    half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
+    fit = np.linalg.norm(points - field.rest, axis=1) >= half
+    fit &= goal.distance(field, points) >= half
+    fit &= allowed_points(points, limits_of(field, settings))
+    if not fit.any():
+        raise NoPathError("No deformed start lies far from rest, far from the goal and allowed.",
+                          f"Far is {half:.3f} m.", "Give a --start, or relax the limits.")
+    return points[np.flatnonzero(fit)[0]]
+
+
+def _check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> None:
+    if allowed_points(start[None], limits)[0]:
+        return
+    place = ", ".join(f"{value:.3f}" for value in start)
+    if not field.region.contains(start)[0]:
+        away = float(np.linalg.norm(start - field.rest))
+        raise InputError(f"The start ({place}) m lies outside the sampled region"
+                         f"{unit_doubt(away, field)}.",
+                         "The branch's energy is not known there.",
+                         "Choose a start nearer to rest, or sample farther (`limber energy "
+                         "--deflection`).")
+    raise InputError(f"At the start {over_limits(field, start[None], limits)}.",
+                     "A start must keep the limits.", "Raise the limit, or choose another start.")

@@ -1,0 +1,68 @@
+"""Poses sampled where the field's error keeps a path and the proof that there is none apart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.progress import SILENT, Progress
+from limber.planning.constraints.full_model_check import learnt
+from limber.planning.constraints.limits import UNITS, Limits, sizes
+from limber.planning.cost import STEP, resample
+from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.goals.goal import Goal, GraspGoal
+from limber.planning.path_on_full_model import ResolvedPath, resolve_path
+from limber.planning.planners.easiest import easiest_way
+from limber.planning.problem import NoWayError
+
+
+@dataclass(frozen=True)
+class Narrows:
+    """The easiest way to the goal on the full model: what was ``learnt`` there, and in words
+    ``told`` what it takes."""
+
+    learnt: GraspSamples
+    told: str
+
+
+def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarray, goal: Goal,
+                   limits: Limits, progress: Progress = SILENT) -> Narrows | None:
+    """Solve the branch along the way that goes least over the limits; None where the field's error
+    does not leave in doubt that it goes over them, or nothing new is to be learnt there."""
+    way = easiest_way(field, limits.on(field), start, goal)
+    asked, margins = limits.asked(), limits.margins(field)
+    reserve = max((margins[name] / limit for name, limit in asked.items()), default=0.0)
+    if way is None or way.worst > 1.0 + reserve:
+        return None
+    approach = field.rest[None]
+    if np.linalg.norm(start - field.rest) >= STEP:
+        there = easiest_way(field, limits.on(field), field.rest.copy(),
+                            GraspGoal(tuple(map(float, start)), STEP))
+        approach = approach if there is None else np.concatenate([there.points, start[None]])
+    solved = resolve_path(grasp_model, resample(way.points, STEP), approach, progress)
+    found = learnt(field, grasp_model, solved, limits)
+    if not len(found.poses) and not len(found.rejected_poses):
+        return None
+    return Narrows(found, _told(solved, limits))
+
+
+def _told(solved: ResolvedPath, limits: Limits) -> str:
+    if not solved.is_whole:
+        return "the branch cannot follow the easiest way on the full model"
+    values = sizes(solved.solved)
+    shares = {name: float(values[name].max()) / limit for name, limit in limits.asked().items()
+              if name in values}
+    if not shares:
+        return "the easiest way was solved on the full model"
+    name = max(shares, key=shares.__getitem__)
+    peak = int(values[name].argmax())
+    place = ", ".join(f"{x:.3f}" for x in solved.solved.poses[peak, :3])
+    return (f"on the full model the easiest way takes a {name.replace('_', ' ')} of "
+            f"{values[name][peak]:.3g} {UNITS[name]}".rstrip() + f", at ({place}) m")
+
+
+def said_after(none: NoWayError, asked: int, told: str) -> NoWayError:
+    """Return the error with what was asked of the full model before it was said."""
+    times = "once" if asked == 1 else f"{asked} times"
+    return NoWayError(none.seen, f"{none.why} Poses were added {times} where the field's error "
+                      f"left that in doubt: {told}.", none.fix)

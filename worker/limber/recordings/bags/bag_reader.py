@@ -1,0 +1,266 @@
+"""What of a bag belongs to a pull, as arrays: wrenches, poses, frames, joints, points, images.
+
+Read by the `rosbags` package in a process of its own (:mod:`limber.geometry.io.isolated_readers`):
+bags come from strangers. A message that cannot be decoded is left out and counted; many are a
+refusal.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.optional import require_extra
+from limber.geometry.io.isolated_readers import read_apart
+
+SUFFIXES = (".mcap", ".db3", ".bag")
+LIMBER, PULL_TOML = "limber", "pull.toml"
+"""Name of the MCAP metadata record of an exported pull, and its entry with ``pull.toml``."""
+
+_MOST_TEXT = 1_000_000
+_MOST_BROKEN = 0.1
+_SEPARATOR = "|"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Messages of one topic, or one pair of frames of a transform.
+
+    Attributes:
+        name: The topic; for transforms ``topic parent>child``.
+        frame: ``header.frame_id`` of the first message.
+        stamps: ``header.stamp`` of each [s], shape [n].
+        logged: When each was recorded [s], shape [n].
+        values: What they hold, shape [n, ...]; see the readers.
+        labels: Names beside them: joints, an image's encoding, a transform's child.
+        counts: Points of each message, where their number differs.
+    """
+
+    name: str
+    frame: str
+    stamps: np.ndarray
+    logged: np.ndarray
+    values: np.ndarray
+    labels: tuple[str, ...] = ()
+    counts: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Bag:
+    """Content of a bag.
+
+    Attributes:
+        path: Of the file or folder.
+        kinds: ``wrench``, ``pose``, ``transform``, ``joints``, ``points``, ``image``, ``camera``
+            to the topics that hold such messages.
+        others: Topics with messages of other types, as ``topic (type)``.
+        broken: Messages that could not be decoded.
+        pull_toml: What Limber says of the pull, where it wrote the bag; else empty.
+    """
+
+    path: Path
+    kinds: dict[str, tuple[Topic, ...]]
+    others: tuple[str, ...]
+    broken: int
+    pull_toml: str = ""
+
+    def of(self, kind: str) -> tuple[Topic, ...]:
+        """Return the topics of a kind."""
+        return self.kinds.get(kind, ())
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path looks like a bag."""
+    return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
+
+
+def read_bag(path: Path) -> Bag:
+    """Read a bag.
+
+    Raises:
+        MissingDependencyError: the package is not installed.
+        InputError: it is damaged, or none of its messages can be decoded.
+    """
+    require_extra("bags", ("rosbags",), f"Reading {path.name}")
+    arrays = read_apart("limber.recordings.bags.bag_reader:bag_arrays", path)
+    kinds: dict[str, list[Topic]] = {}
+    for number in range(int(arrays["topic_count"])):
+        def part(name: str, number: int = number) -> np.ndarray:
+            return arrays[f"{number}_{name}"]
+
+        name, kind, frame, *labels = str(part("names")).split(_SEPARATOR)
+        kinds.setdefault(kind, []).append(Topic(
+            name, frame, part("stamps"), part("logged"), part("values"), tuple(labels),
+            arrays.get(f"{number}_counts")))
+    read, broken = int(arrays["read"]), int(arrays["broken"])
+    if broken > _MOST_BROKEN * (read + broken):
+        raise InputError(f"{path}: {broken} of {read + broken} messages cannot be decoded.",
+                         "What is left would be no recording.", "Record or export it again.")
+    others = tuple(str(entry) for entry in arrays["others"])
+    return Bag(path, {kind: tuple(topics) for kind, topics in kinds.items()}, others, broken,
+               str(arrays["pull_toml"]))
+
+
+@dataclass
+class _Growing:
+    """A topic while it is read."""
+
+    kind: str
+    frame: str
+    labels: tuple[str, ...] = ()
+    stamps: list[float] = field(default_factory=list)
+    logged: list[float] = field(default_factory=list)
+    values: list[np.ndarray] = field(default_factory=list)
+
+
+def bag_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return what a bag holds as flat arrays, for :func:`read_bag` on the other side."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    found: dict[str, _Growing] = {}
+    others: list[str] = []
+    read = broken = 0
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        wanted = []
+        for connection in reader.connections:
+            if connection.msgtype in _READERS:
+                wanted.append(connection)
+            else:
+                others.append(f"{connection.topic} ({connection.msgtype})")
+        for connection, logged, raw in reader.messages(connections=wanted):
+            try:
+                message = reader.deserialize(raw, connection.msgtype)
+                entries = _READERS[connection.msgtype](message)
+            except Exception:  # the decoder raises what it stumbles over; counted and told
+                broken += 1
+                continue
+            read += 1
+            for suffix, kind, header, values, labels in entries:
+                name = f"{connection.topic}{suffix}"
+                topic = found.setdefault(name, _Growing(kind, header.frame_id, labels))
+                topic.stamps.append(header.stamp.sec + 1e-9 * header.stamp.nanosec)
+                topic.logged.append(1e-9 * logged)
+                topic.values.append(values)
+    arrays: dict[str, np.ndarray] = {
+        "topic_count": np.array(len(found)), "read": np.array(read), "broken": np.array(broken),
+        "others": np.array(others, "U200"), "points": np.zeros((0, 3)),
+        "pull_toml": np.array(_pull_toml(path))}
+    for number, (name, topic) in enumerate(found.items()):
+        arrays[f"{number}_names"] = np.array(_SEPARATOR.join(
+            part.replace(_SEPARATOR, "/") for part in (name, topic.kind, topic.frame,
+                                                       *topic.labels)))
+        arrays[f"{number}_stamps"] = np.array(topic.stamps)
+        arrays[f"{number}_logged"] = np.array(topic.logged)
+        if len({values.shape for values in topic.values}) > 1:
+            if topic.kind != "points":
+                raise ValueError(f"messages of {name} differ in shape")
+            arrays[f"{number}_counts"] = np.array([len(values) for values in topic.values])
+            arrays[f"{number}_values"] = np.concatenate(topic.values)
+        else:
+            arrays[f"{number}_values"] = np.stack(topic.values)
+    return arrays
+
+
+def _pull_toml(path: Path) -> str:
+    """The description that `limber export-pull` writes beside the messages; empty without one."""
+    if path.suffix.lower() != ".mcap":
+        return ""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    try:
+        with open(path, "rb") as stream:
+            for record in make_reader(stream).iter_metadata():
+                if record.name == LIMBER:
+                    return record.metadata.get(PULL_TOML, "")[:_MOST_TEXT]
+    except (McapError, OSError, ValueError):
+        # Cut off before its end, where such records are listed; the messages were read.
+        return ""
+    return ""
+
+
+_Entry = tuple[str, str, Any, np.ndarray, tuple[str, ...]]
+
+
+def _wrench(message: Any) -> list[_Entry]:
+    force, torque = message.wrench.force, message.wrench.torque
+    return [("", "wrench", message.header, np.array(
+        [force.x, force.y, force.z, torque.x, torque.y, torque.z]), ())]
+
+
+def _pose(message: Any) -> list[_Entry]:
+    pose = message.pose
+    return [("", "pose", message.header, _seven(pose.position, pose.orientation), ())]
+
+
+def _transform(message: Any) -> list[_Entry]:
+    moved = message.transform
+    child = message.child_frame_id
+    return [(f" {message.header.frame_id}>{child}", "transform", message.header,
+             _seven(moved.translation, moved.rotation), (child,))]
+
+
+def _transforms(message: Any) -> list[_Entry]:
+    return [entry for each in message.transforms for entry in _transform(each)]
+
+
+def _joints(message: Any) -> list[_Entry]:
+    return [("", "joints", message.header, np.array(message.position, float),
+             tuple(message.name))]
+
+
+def _cloud(message: Any) -> list[_Entry]:
+    """Coordinates [m] of a PointCloud2, shape [n, 3]; NaN where a sensor saw nothing."""
+    kinds = {field.name: (field.offset, {7: "f4", 8: "f8"}[field.datatype])
+             for field in message.fields if field.name in ("x", "y", "z")}
+    order = ">" if message.is_bigendian else "<"
+    layout = np.dtype({"names": ["x", "y", "z"],
+                       "formats": [order + kinds[axis][1] for axis in "xyz"],
+                       "offsets": [kinds[axis][0] for axis in "xyz"],
+                       "itemsize": message.point_step})
+    rows = np.asarray(message.data, np.uint8).tobytes()
+    count = message.width * message.height
+    points = np.frombuffer(rows, layout, count)
+    return [("", "points", message.header,
+             np.column_stack([points[axis].astype(float) for axis in "xyz"]), ())]
+
+
+_PIXELS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+
+
+def _image(message: Any) -> list[_Entry]:
+    """Depths as they stand in the image; colours are passed by."""
+    if message.encoding not in _PIXELS:
+        return []
+    kind = np.dtype((">" if message.is_bigendian else "<") + _PIXELS[message.encoding])
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    pixels = np.ascontiguousarray(rows[:, :message.width * kind.itemsize]).view(kind)
+    return [("", "image", message.header, pixels.astype(kind.newbyteorder("=")),
+             (message.encoding,))]
+
+
+def _camera(message: Any) -> list[_Entry]:
+    matrix = getattr(message, "k", None)
+    matrix = np.asarray(message.K if matrix is None else matrix, float)
+    return [("", "camera", message.header, np.array(
+        [message.width, message.height, matrix[0], matrix[4], matrix[2], matrix[5]]), ())]
+
+
+def _seven(position: Any, turn: Any) -> np.ndarray:
+    return np.array([position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w])
+
+
+_READERS: dict[str, Callable[[Any], list[_Entry]]] = {
+    "geometry_msgs/msg/WrenchStamped": _wrench,
+    "geometry_msgs/msg/PoseStamped": _pose,
+    "geometry_msgs/msg/TransformStamped": _transform,
+    "tf2_msgs/msg/TFMessage": _transforms,
+    "sensor_msgs/msg/JointState": _joints,
+    "sensor_msgs/msg/PointCloud2": _cloud,
+    "sensor_msgs/msg/Image": _image,
+    "sensor_msgs/msg/CameraInfo": _camera,
+}

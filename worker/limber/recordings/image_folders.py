@@ -1,0 +1,319 @@
+"""Folders of images or clouds into a pull: PLY files, RGB-D frames in the layout of TUM."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.core.errors import InputError
+from limber.core.files.reading import checked_as, read_json, read_text
+from limber.core.files.safe_names import inside
+from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.camera import Camera, read_camera, write_camera
+from limber.geometry.cloud.pixels import read_pixels
+from limber.geometry.io.clouds import read_points
+from limber.recordings.tables import LENGTH_UNITS_M
+
+TUM_DEPTH_SCALE = 5000.0
+CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
+"""A camera that moves or turns more than that during a pull is not the fixed one expected."""
+
+
+def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses [n, 6] and wrenches about them [n, 6] in the frame that ``frame_pose`` is in.
+
+    Args:
+        frame_pose: Of the frame that they are given in [m] and rotation vector [rad], shape [6].
+    """
+    turn = Rotation.from_rotvec(np.array(frame_pose[3:]))
+    known = np.isfinite(poses[:, 3:]).all(axis=1)
+    turned = np.full((len(poses), 3), np.nan)
+    turned[known] = (turn * Rotation.from_rotvec(poses[known, 3:])).as_rotvec()
+    matrix = turn.as_matrix().T
+    return (np.hstack([np.array(frame_pose[:3]) + poses[:, :3] @ matrix, turned]),
+            np.hstack([wrenches[:, :3] @ matrix, wrenches[:, 3:] @ matrix]))
+
+
+def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
+                ) -> list[str]:
+    """Bring PLY files into ``clouds/``, in metres and named by their time stamps.
+
+    Returns:
+        Warnings.
+
+    Raises:
+        InputError: fewer than two files, or names without times and no rate.
+    """
+    from plyfile import PlyData, PlyElement
+
+    files = sorted(source.glob("*.ply"))
+    if len(files) < 2:
+        raise InputError(f"{source} has {len(files)} PLY files.",
+                         "A folder of frames was expected.", "Name the folder that holds them.")
+    scale, broken = LENGTH_UNITS_M[settings.unit or "m"], []
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    for index, file in enumerate(files):
+        progress(index / len(files), "copying clouds")
+        try:
+            read = read_points(file).points
+        except InputError:
+            # A frame that was being written when the recorder stopped.
+            broken.append(file.name)
+            continue
+        points = np.zeros(len(read), [("x", "f4"), ("y", "f4"), ("z", "f4")])
+        for axis, values in zip("xyz", read.T, strict=True):
+            points[axis] = values * scale
+        target = folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply"
+        PlyData([PlyElement.describe(points, "vertex")], byte_order="<").write(str(target))
+    if len(files) - len(broken) < 2:
+        raise InputError(f"{source}: {len(broken)} of {len(files)} PLY files cannot be read.",
+                         "Two frames are needed.", "Record it again.")
+    if (source / "camera.toml").exists():
+        write_camera(folder / "camera.toml", read_camera(source / "camera.toml"))
+    return [f"{len(broken)} PLY file(s) cannot be read, the first {broken[0]}; left out."
+            ] if broken else []
+
+
+def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
+              ) -> list[str]:
+    """Bring an RGB-D folder into ``depth/``, ``mask/`` and ``camera.toml``.
+
+    ``depth.txt``, ``rgb.txt``, ``mask.txt`` and ``groundtruth.txt`` are read as in TUM's data
+    (``timestamp file``, ``timestamp tx ty tz qx qy qz qw``); without the lists, file names are
+    time stamps. Intrinsics come from ``camera.toml``, else ``calibration.txt`` or
+    ``intrinsics.txt`` (fx fy cx cy), else ``camera_intrinsic.json`` (Open3D, RealSense).
+
+    Returns:
+        Warnings.
+
+    Raises:
+        InputError: no frames, no intrinsics, or a camera that moves.
+    """
+    listed = _listed(source, "depth", settings)
+    if len(listed) < 2:
+        raise InputError(f"{source} has {len(listed)} depth images.",
+                         "Two frames are needed.", "Copy the whole folder.")
+    present = [(stamp, file) for stamp, file in listed if file.is_file()]
+    warnings = []
+    if len(present) < len(listed):
+        lost = next(file for _, file in listed if not file.is_file())
+        if len(present) < 0.5 * len(listed):
+            raise InputError(f"{source / 'depth.txt'} names {lost.name}, which is not there.",
+                             f"{len(listed) - len(present)} of {len(listed)} depth images are "
+                             "missing: the recording is incomplete.", "Copy the whole folder.")
+        warnings.append(f"{len(listed) - len(present)} of {len(listed)} depth images are missing, "
+                        f"the first {lost.name}; left out.")
+    camera = _camera(source, present[0][1])
+    camera, told = _placed(camera, source, present[0][0], present[-1][0])
+    warnings += told
+    write_camera(folder / "camera.toml", camera)
+    masks = _masks(source, [stamp for stamp, _ in present], settings)
+    (folder / "depth").mkdir(parents=True, exist_ok=True)
+    for index, (stamp, file) in enumerate(present):
+        progress(index / len(present), "copying frames")
+        shutil.copyfile(file, folder / "depth" / f"{stamp:.6f}.png")
+        if masks[index] is not None:
+            _write_mask(masks[index], folder / "mask" / f"{stamp:.6f}.png")
+    if (source / "background.png").is_file():
+        shutil.copyfile(source / "background.png", folder / "background.png")
+    given = sum(mask is not None for mask in masks)
+    if 0 < given < len(present):
+        warnings.append(f"{len(present) - given} of {len(present)} frames have no mask; the "
+                        "branch is found there by depth alone.")
+    return warnings
+
+
+def tum_list(path: Path) -> list[tuple[float, str]]:
+    """Read TUM's ``timestamp value...`` lists; lines with # are comments.
+
+    An unfinished last line is left out.
+
+    Raises:
+        InputError: a line does not start with a time stamp.
+    """
+    if not path.is_file():
+        return []
+    lines = [line.split(None, 1) for line in read_text(path, "a list of time stamps").splitlines()
+             if line.strip() and not line.lstrip().startswith("#")]
+    if lines and len(lines[-1]) < 2:
+        lines = lines[:-1]
+    try:
+        entries = [(float(stamp), rest.strip()) for stamp, rest in lines]
+        if not np.isfinite([stamp for stamp, _ in entries]).all():
+            raise ValueError("a time stamp is not finite")
+        return entries
+    except ValueError as error:
+        raise InputError(f"{path} is not a list of time stamps ({error}).",
+                         "Each line is `timestamp file` or `timestamp tx ty tz qx qy qz qw`.",
+                         "Correct the file.") from error
+
+
+def _listed(source: Path, what: str, settings: Any) -> list[tuple[float, Path]]:
+    named = [(stamp, _inside(source, file)) for stamp, file in tum_list(source / f"{what}.txt")]
+    found = named or [(_stamp(file, index, settings), file) for index, file in enumerate(
+        sorted(path for path in (source / what).glob("*") if path.suffix.lower() in
+               (".png", ".jpg", ".jpeg")))]
+    return sorted(dict(found).items())
+
+
+def _inside(source: Path, name: str) -> Path:
+    """The file that a list names, which lies in the recording's folder.
+
+    Raises:
+        InputError: it lies elsewhere.
+    """
+    try:
+        return inside(source, name)
+    except InputError as error:
+        raise InputError(f"A list in {source} names {name[:100]!r}. {error.seen}",
+                         f"{error.why} It may lead out of the recording's folder.",
+                         f"Correct the list. {error.fix}") from error
+
+
+def _camera(source: Path, image: Path) -> Camera:
+    if (source / "camera.toml").is_file():
+        return read_camera(source / "camera.toml")
+    height, width = read_pixels(image, "a 16-bit PNG of depths").shape[:2]
+    for name in ("calibration.txt", "intrinsics.txt", "camera.txt"):
+        if (source / name).is_file():
+            fx, fy, cx, cy = _four_numbers(source / name)
+            return checked_as(source / name, Camera, {
+                "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy,
+                "depth_scale": TUM_DEPTH_SCALE}, "fx fy cx cy")
+    for name in ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json"):
+        if (source / name).is_file():
+            return _open3d_camera(source / name)
+    raise InputError(f"{source} has no intrinsics.",
+                     "Depth images mean nothing without focal length and principal point.",
+                     "Write camera.toml (width, height, fx, fy, cx, cy, depth_scale, pose) or "
+                     "calibration.txt (fx fy cx cy) beside the images.")
+
+
+def _four_numbers(path: Path) -> list[float]:
+    words = [word for line in read_text(path, "fx fy cx cy").splitlines()
+             if not line.lstrip().startswith("#") for word in line.replace(",", " ").split()]
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{path} has something else than numbers ({error}).",
+                         "fx fy cx cy were expected.", "Correct the file.") from error
+    if len(numbers) == 9:
+        return [numbers[0], numbers[4], numbers[2], numbers[5]]
+    if len(numbers) < 4:
+        raise InputError(f"{path} has {len(numbers)} numbers.",
+                         "fx fy cx cy, or a matrix of 3 x 3, were expected.", "Correct the file.")
+    return numbers[:4]
+
+
+def _open3d_camera(path: Path) -> Camera:
+    try:
+        content = read_json(path, "a camera intrinsic of Open3D")
+        matrix = [float(value) for value in content["intrinsic_matrix"]]
+        # Column by column.
+        return Camera(width=int(content["width"]), height=int(content["height"]), fx=matrix[0],
+                      fy=matrix[4], cx=matrix[6], cy=matrix[7],
+                      depth_scale=float(content.get("depth_scale", 1000.0)))
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
+        raise InputError(f"{path} is no camera intrinsic of Open3D ({error!r}).",
+                         "width, height and intrinsic_matrix (9 numbers) were expected.",
+                         "Write camera.toml instead.") from error
+
+
+def _placed(camera: Camera, source: Path, start: float, end: float) -> tuple[Camera, list[str]]:
+    """The camera at its pose of ``groundtruth.txt``, which must not change much."""
+    path = source / "groundtruth.txt"
+    listed = tum_list(path)
+    if not listed:
+        return camera, []
+    try:
+        rows = np.array([[stamp, *map(float, text.split()[:7])] for stamp, text in listed])
+        if rows.shape[1] != 8 or not np.isfinite(rows).all():
+            raise ValueError("tx ty tz qx qy qz qw are needed in every line")
+        turn = np.linalg.norm(rows[:, 4:], axis=1)
+        if not ((turn > 1e-6) & np.isfinite(turn)).all():
+            raise ValueError("a quaternion of length 0 is no turn")
+    except ValueError as error:
+        raise InputError(f"{path} is no trajectory ({error}).",
+                         "Each line is `timestamp tx ty tz qx qy qz qw`.",
+                         "Correct the file.") from error
+    nearest = rows[np.argmin(np.abs(rows[:, 0] - start))]
+    during = rows[(rows[:, 0] >= start) & (rows[:, 0] <= end)]
+    turns = Rotation.from_quat(during[:, 4:]) if len(during) else None
+    first = Rotation.from_quat(nearest[4:])
+    moved = np.linalg.norm(during[:, 1:4] - nearest[1:4], axis=1).max(initial=0.0)
+    turned = float((turns * first.inv()).magnitude().max()) if len(during) else 0.0
+    placed = camera.model_copy(update={
+        "pose": (*map(float, nearest[1:4]), *map(float, first.as_rotvec()))})
+    if moved > CAMERA_MOVES_M or turned > CAMERA_TURNS_RAD:
+        raise InputError(
+            f"{path}: the camera moves by {moved * 1e3:.0f} mm and {np.degrees(turned):.1f} "
+            "degrees during the pull.", "One pose is taken for all frames.",
+            "Fix the camera while the branch is pulled.")
+    return placed, []
+
+
+def _masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
+    """For each frame a mask's file, an array of bool, or None."""
+    if settings.yolo_weights:
+        return _yolo_masks(source, stamps, settings)
+    listed = [(stamp, _inside(source, file)) for stamp, file in tum_list(source / "mask.txt")]
+    if not listed:
+        # Without a list a mask has its depth image's name.
+        depth = dict(_listed(source, "depth", settings))
+        named = [source / "mask" / depth[stamp].name for stamp in stamps]
+        return [file if file.is_file() else None for file in named]
+    return [_nearest(listed, stamp, stamps) for stamp in stamps]
+
+
+def _nearest(listed: list[tuple[float, Path]], wanted: float, stamps: list[float],
+             ) -> Path | None:
+    """The file nearest in time, if it is nearer than half a frame."""
+    stamp, file = min(listed, key=lambda entry: abs(entry[0] - wanted))
+    reach = 0.5 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+    return file if abs(stamp - wanted) <= reach and file.is_file() else None
+
+
+def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
+    from limber.recordings.masks import YoloSegmenter
+
+    images = _listed(source, "rgb", settings)
+    if not images:
+        raise InputError(f"{source} has no colour images.", "YOLO finds the branch in them.",
+                         "Record rgb/ (and rgb.txt), or leave --yolo-weights out.")
+    segment = YoloSegmenter(Path(settings.yolo_weights), prompt=settings.yolo_prompt,
+                            class_name=settings.yolo_class)
+    masks: list[np.ndarray | None] = []
+    for stamp in stamps:
+        file = _nearest(images, stamp, stamps)
+        if file is None:
+            masks.append(None)
+            continue
+        pixels = read_pixels(file, "a colour image")
+        masks.append(segment(pixels[..., :3] if pixels.ndim == 3 else np.stack([pixels] * 3, -1)))
+    return masks
+
+
+def _write_mask(mask: Any, target: Path) -> None:
+    target.parent.mkdir(exist_ok=True)
+    if isinstance(mask, Path):
+        shutil.copyfile(mask, target)
+        return
+    from PIL import Image
+
+    Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(target)
+
+
+def _stamp(file: Path, index: int, settings: Any) -> float:
+    if settings.rate_hz is not None:
+        return index / settings.rate_hz
+    try:
+        stamp = float(file.stem)
+        if not np.isfinite(stamp):
+            raise ValueError("not finite")
+        return stamp
+    except ValueError as error:
+        raise InputError(f"The file name {file.name} is no time stamp.",
+                         "Frames need times.", "Give --rate-hz.") from error

@@ -1,0 +1,188 @@
+"""What a force sensor and a marker system do wrong, found before a fit believes it.
+
+Each check returns the pull with the trouble removed and a sentence about it in ``warnings``.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import scipy
+
+from limber.core.constants import FORCE_UNITS_N
+from limber.recordings.recording import Observations, Pull
+from limber.recordings.time_series import gaps, saturated, spikes
+
+PLAUSIBLE_YOUNG_PA = (2e4, 4e10)
+"""From soft silicone to the stiffest dry wood: outside, the force is taken to be mis-scaled."""
+
+
+def clean(pull: Pull) -> Pull:
+    """Apply every check that needs no model."""
+    pull = _without_bad_readings(pull)
+    pull = _tared(pull)
+    pull = _with_right_sign(pull)
+    pull = _with_gaps_named(pull)
+    if pull.observations is not None:
+        observations, swaps = unswapped(pull.observations)
+        pull = replace(pull, observations=observations)
+        if swaps:
+            frames = ", ".join(str(frame) for frame in swaps[:8])
+            pull = pull.warned(f"{pull.name}: markers swapped names at frame {frames}"
+                               f"{' ...' if len(swaps) > 8 else ''}; they were swapped back.")
+    return pull
+
+
+def work_done(pull: Pull) -> np.ndarray:
+    """Return the work [J] that the gripper has done on the branch since the start, shape [n].
+
+    Samples without a wrench count as those before them.
+    """
+    wrench = pull.wrenches.copy()
+    for column in range(6):
+        measured = np.isfinite(wrench[:, column])
+        wrench[:, column] = np.interp(pull.times, pull.times[measured], wrench[measured, column]
+                                      ) if measured.any() else 0.0
+    mean = (wrench[1:] + wrench[:-1]) / 2
+    # Rotation vectors add up only for small steps; between two samples they are small.
+    return np.r_[0.0, np.cumsum(np.sum(mean * np.diff(pull.poses, axis=0), axis=1))]
+
+
+def force_unit_suspicion(young_pa: float) -> str | None:
+    """Say which unit the force may be in if the modulus that it implies cannot be.
+
+    Args:
+        young_pa: Young's modulus [Pa] that the measured work implies, forces taken as newtons.
+    """
+    low, high = PLAUSIBLE_YOUNG_PA
+    if low <= young_pa <= high:
+        return None
+    fitting = [name for name, newtons in FORCE_UNITS_N.items()
+               if name != "N" and low <= young_pa * newtons <= high]
+    hint = f"Is it in {' or '.join(fitting)}? " if fitting else ""
+    return (f"The measured force implies a Young's modulus of {young_pa:.2g} Pa, outside "
+            f"{low:.0e}-{high:.0e} Pa for plants: the force may be in another unit than newtons. "
+            f"{hint}Import it with --force-unit.")
+
+
+def unswapped(observations: Observations) -> tuple[Observations, list[int]]:
+    """Give markers that exchanged names their own name back.
+
+    Each frame is compared with what constant velocity predicts from the two before; another
+    assignment is taken where it halves the distance or better. Returns the corrected
+    observations and the frames at which names changed.
+    """
+    positions = observations.positions.copy()
+    swaps: list[int] = []
+    if observations.point_count < 2:
+        return observations, swaps
+    order = np.arange(observations.point_count)
+    last, before = positions[0].copy(), positions[0].copy()
+    for frame in range(1, len(positions)):
+        now = observations.positions[frame][order]
+        predicted = 2 * last - before
+        change = _better_order(predicted, now)
+        if change is not None:
+            order = order[change]
+            now = now[change]
+            swaps.append(frame)
+        positions[frame] = now
+        seen = np.isfinite(now).all(axis=1)
+        before = np.where(seen[:, None], last, before)
+        last = np.where(seen[:, None], now, last)
+    return replace(observations, positions=positions), swaps
+
+
+def _better_order(predicted: np.ndarray, now: np.ndarray) -> np.ndarray | None:
+    seen = np.flatnonzero(np.isfinite(now).all(axis=1) & np.isfinite(predicted).all(axis=1))
+    if len(seen) < 2:
+        return None
+    cost = np.linalg.norm(predicted[seen, None] - now[None, seen], axis=2)
+    rows, columns = scipy.optimize.linear_sum_assignment(cost**2)
+    kept, best = np.trace(cost**2), np.sum(cost[rows, columns]**2)
+    separation = np.min(np.linalg.norm(
+        predicted[seen, None] - predicted[None, seen], axis=2) + np.diag(np.full(len(seen), 1e9)))
+    if best < 0.25 * kept and kept > (0.3 * separation)**2:
+        change = np.arange(len(now))
+        change[seen[rows]] = seen[columns]
+        return change
+    return None
+
+
+def _without_bad_readings(pull: Pull) -> Pull:
+    wrench = pull.wrenches.copy()
+    measured = np.isfinite(wrench[:, :3]).all(axis=1)
+    if measured.sum() < 5:
+        return pull
+    messages = []
+    rows = np.flatnonzero(measured)
+    limited = rows[saturated(wrench[rows, :3])]
+    if pull.entry.sensor.force_range_n is not None:
+        beyond = np.any(np.abs(wrench[:, :3]) >= pull.entry.sensor.force_range_n, axis=1)
+        limited = np.union1d(limited, np.flatnonzero(beyond))
+    if len(limited):
+        messages.append(f"{pull.name}: the force sensor is saturated in {len(limited)} samples "
+                        f"(at {np.nanmax(np.abs(wrench[limited, :3])):.3g} N); their force is not "
+                        "used. Pull less far, or use a sensor of wider range.")
+    kept = np.setdiff1d(rows, limited)
+    jumps = kept[spikes(wrench[kept, :3])] if len(kept) else kept
+    if len(jumps):
+        times = ", ".join(f"{pull.times[row]:.2f}" for row in jumps[:5])
+        messages.append(f"{pull.name}: {len(jumps)} force spike(s) at {times} s; not used.")
+    wrench[np.union1d(limited, jumps).astype(int)] = np.nan
+    return replace(pull, wrenches=wrench).warned(*messages)
+
+
+def _tared(pull: Pull) -> Pull:
+    travel = np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1)
+    travel += pull.entry.grasp.radius_m * np.linalg.norm(
+        pull.poses[:, 3:] - pull.poses[0, 3:], axis=1)
+    if pull.entry.gravity_m_s2 is not None or travel.max() <= 0:
+        # The hand carries weight at rest, or never moves: nothing says what zero force is.
+        return pull
+    at_rest = np.cumprod(travel <= 0.01 * travel.max()).astype(bool)
+    quiet = pull.wrenches[at_rest]
+    quiet = quiet[np.isfinite(quiet).all(axis=1)] if np.isfinite(pull.wrenches).any() else quiet[:0]
+    starts_at_rest = np.linalg.norm(pull.poses[0, :3] - pull.entry.grasp.point_m) <= 2e-3
+    if not len(quiet) or not starts_at_rest:
+        return pull
+    offset = np.median(quiet, axis=0)
+    sigma = pull.entry.sensor.force_sigma_n
+    peak = np.nanmax(np.linalg.norm(pull.wrenches[:, :3], axis=1))
+    bias = np.linalg.norm(offset[:3])
+    # Five standard deviations of the mean, and more than a few percent of what is measured.
+    if bias <= 5 * sigma / np.sqrt(len(quiet)) or bias <= 0.03 * peak:
+        return pull
+    return replace(pull, wrenches=pull.wrenches - offset).warned(
+        f"{pull.name}: the force sensor was not tared: it reads {bias:.3g} N with the branch at "
+        "rest. That reading was subtracted from the whole pull.")
+
+
+def _with_right_sign(pull: Pull) -> Pull:
+    if not np.isfinite(pull.wrenches).any():
+        return pull
+    work = work_done(pull)
+    most, least = work.max(), work.min()
+    noise = pull.entry.sensor.force_sigma_n * np.sqrt(
+        np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
+    if -least <= 3 * most or -least <= 3 * noise:
+        return pull
+    seen = (f"{pull.name}: by the measured force the branch did {-least:.3g} J of work on the "
+            "gripper, which a branch at rest cannot")
+    if pull.entry.gravity_m_s2 is not None:
+        return pull.warned(f"{seen} except by its weight. Check the sign of the force.")
+    return replace(pull, wrenches=-pull.wrenches).warned(
+        f"{seen}: the wrench is that of the branch on the gripper. Its sign was turned.")
+
+
+def _with_gaps_named(pull: Pull) -> Pull:
+    messages = []
+    clocks = {"robot": pull.times}
+    if pull.observations is not None:
+        clocks["observations"] = pull.observations.times
+    for name, times in clocks.items():
+        found = gaps(times)
+        if len(found):
+            longest = np.max(found[:, 1] - found[:, 0])
+            messages.append(f"{pull.name}: {len(found)} gap(s) in the {name}, the longest "
+                            f"{longest:.2f} s; nothing is interpolated across.")
+    return pull.warned(*messages)

@@ -1,0 +1,159 @@
+"""The robot's and the observer's streams on one clock: frames that an estimator compares.
+
+The observer's time stamps lead: each of them is a frame, at which the gripper's pose is
+interpolated and its wrench averaged over the time between two frames.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from scipy.spatial.transform import Rotation, Slerp
+
+from limber.core.errors import InputError
+from limber.recordings.recording import Pull
+from limber.recordings.time_series import gaps, inside_gap
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What was done and seen at the same instants.
+
+    Attributes:
+        times: [s] on the robot's clock, shape [f].
+        poses: [m, rad], shape [f, 6].
+        wrenches: Gripper on branch [N, N m], shape [f, 6]; NaN where not measured.
+        wrench_counts: Readings averaged in each wrench, shape [f].
+        positions: Observed points [m], shape [f, m, 3]; NaN where not seen.
+        covariance: [m^2], shape [f, m, 3, 3].
+        warnings: What could not be used.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    wrenches: np.ndarray
+    wrench_counts: np.ndarray
+    positions: np.ndarray
+    covariance: np.ndarray
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, chosen: np.ndarray | slice) -> "Frames":
+        return Frames(self.times[chosen], self.poses[chosen], self.wrenches[chosen],
+                      self.wrench_counts[chosen], self.positions[chosen],
+                      self.covariance[chosen], self.warnings)
+
+
+def frames_of(pull: Pull) -> Frames:
+    """Bring a pull's streams together at the observer's time stamps.
+
+    Raises:
+        InputError: the clocks do not overlap, or there is nothing to compare.
+    """
+    sigma = pull.entry.sensor.position_sigma_m
+    seen = pull.observations
+    if seen is None:
+        times, positions = pull.times, np.full((len(pull.times), 0, 3), np.nan)
+        covariance = np.zeros((len(times), 0, 3, 3))
+    else:
+        times, positions = seen.times + pull.entry.time_offset_s, seen.positions
+        isotropic = np.broadcast_to(sigma**2 * np.eye(3), (*positions.shape, 3))
+        covariance = isotropic if seen.covariance is None else seen.covariance
+    slack = 0.5 * np.median(np.diff(pull.times))
+    usable = (times >= pull.times[0] - slack) & (times <= pull.times[-1] + slack)
+    usable &= ~inside_gap(times, gaps(pull.times))
+    if usable.sum() < 2:
+        raise InputError(
+            f"{pull.name}: the robot's clock covers {pull.times[0]:.2f} to {pull.times[-1]:.2f} s, "
+            f"the observations {times[0]:.2f} to {times[-1]:.2f} s.",
+            "Fewer than two observations fall into the robot's time.",
+            "Set time_offset_s in pull.toml, or import with --time-offset auto.")
+    warnings = () if usable.all() else (
+        f"{pull.name}: {np.sum(~usable)} of {len(times)} observed frames lie outside the robot's "
+        "recording or in a gap of it; not used.",)
+    times = np.clip(times[usable], pull.times[0], pull.times[-1])
+    wrenches, counts = _mean_wrenches(pull, times)
+    return Frames(times, poses_at(pull.times, pull.poses, times), wrenches, counts,
+                  positions[usable], np.array(covariance[usable]), warnings)
+
+
+def poses_at(times: np.ndarray, poses: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Interpolate poses [m, rad]; rotations along the shortest turn. Returns shape [w, 6]."""
+    positions = np.column_stack([np.interp(wanted, times, axis) for axis in poses[:, :3].T])
+    turned = Slerp(times, Rotation.from_rotvec(poses[:, 3:]))(wanted)
+    return np.hstack([positions, turned.as_rotvec()])
+
+
+def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
+    """Find the offset [s] to add to the observations' stamps, and its standard deviation.
+
+    The observed motion is, without inertia, a smooth function of the gripper's pose: the offset
+    wanted is the one under which a quadratic function of the pose explains the observed points
+    best. A pull at constant speed, started and ended out of view, says nothing about it: the
+    standard deviation then is infinite.
+    """
+    seen = pull.observations
+    if seen is None or len(seen.times) < 12:
+        return pull.entry.time_offset_s, np.inf
+    whole = seen.visible.all(axis=0) if seen.visible.all(axis=0).any() else seen.visible.any(axis=0)
+    positions = seen.positions[:, whole]
+    rows = np.isfinite(positions).all(axis=(1, 2))
+    target = positions[rows].reshape(rows.sum(), -1)
+    target = target - target.mean(axis=0)
+
+    def unexplained(offset: float) -> float:
+        moments = np.clip(seen.times[rows] + offset, pull.times[0], pull.times[-1])
+        features = _quadratic_features(poses_at(pull.times, pull.poses, moments))
+        solved = np.linalg.lstsq(features, target, rcond=1e-9)[0]
+        return float(np.mean((target - features @ solved)**2))
+
+    start = pull.entry.time_offset_s
+    grid = start + np.linspace(-limit_s, limit_s, 81)
+    cost = np.array([unexplained(offset) for offset in grid])
+    best = int(np.argmin(cost))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, 80)]
+    found = scipy.optimize.minimize_scalar(unexplained, bounds=(low, high), method="bounded",
+                                           options={"xatol": 1e-5})
+    step = 2e-3
+    beside = unexplained(found.x + step) + unexplained(found.x - step)
+    curvature = (beside - 2 * found.fun) / step**2
+    noise = max(found.fun, 1e-16)
+    informative = curvature > 0 and np.ptp(cost) > 0.2 * noise + 1e-16
+    sigma = float(np.sqrt(2 * noise / (curvature * target.size))) if informative else np.inf
+    return (float(found.x), sigma) if np.isfinite(sigma) else (start, sigma)
+
+
+def _quadratic_features(poses: np.ndarray) -> np.ndarray:
+    centred = poses - poses.mean(axis=0)
+    _, size, axes = np.linalg.svd(centred, full_matrices=False)
+    along = centred @ axes[size > 1e-3 * size[0] + 1e-12].T
+    if along.shape[1]:
+        along = along / np.abs(along).max(axis=0)
+    pairs = [along[:, i] * along[:, j] for i in range(along.shape[1]) for j in range(i + 1)]
+    return np.column_stack([np.ones(len(poses)), along, *pairs])
+
+
+def _mean_wrenches(pull: Pull, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    measured = np.isfinite(pull.wrenches[:, :3]).all(axis=1)
+    wrenches = np.full((len(wanted), 6), np.nan)
+    counts = np.zeros(len(wanted), int)
+    if not measured.any():
+        return wrenches, counts
+    times, values = pull.times[measured], pull.wrenches[measured]
+    unknown = ~np.isfinite(values).all(axis=0)
+    values = np.nan_to_num(values)
+    half = 0.5 * np.median(np.diff(wanted)) if len(wanted) > 1 else 0.0
+    step = np.median(np.diff(pull.times))
+    for row, moment in enumerate(wanted):
+        near = np.flatnonzero(np.abs(times - moment) <= half)
+        if half > 2 * step and len(near) > 2:
+            # A mean over a window about the instant is unbiased for what varies linearly in it.
+            slope = np.polynomial.polynomial.polyfit(times[near] - moment, values[near], 1)
+            wrenches[row], counts[row] = slope[0], len(near)
+        elif np.abs(times - moment).min() <= step:
+            wrenches[row] = [np.interp(moment, times, column) for column in values.T]
+            counts[row] = 1
+    wrenches[:, unknown] = np.nan
+    return wrenches, counts

@@ -1,0 +1,203 @@
+"""Time-stamped tables of a recording, read from CSV and cleaned of what sensors do wrong.
+
+Nothing is repaired in silence: each repair leaves a sentence in ``warnings``.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal variable over its median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Samples over time.
+
+    Attributes:
+        times: Increasing time stamps [s], shape [n].
+        values: One row a sample, shape [n, columns]; NaN where nothing was measured.
+        columns: Names of the columns of ``values``.
+        warnings: What was wrong with the file and what was done about it.
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    columns: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
+@dataclass
+class _Rows:
+    header: list[str]
+    numbers: list[list[float]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_stream(path: str | Path, time_column: str = "t_s") -> Stream:
+    """Read a CSV file with a header and a column of time stamps [s].
+
+    An unfinished last line is dropped, rows are brought into the order of time, of rows with the
+    same stamp the first is kept; each with a warning. Empty fields and ``nan`` mean "not
+    measured".
+
+    Raises:
+        InputError: no such file, no time column, fewer than two rows, a field that is not a
+            number, or a tenth or more of the rows out of order (then the clock is not a clock).
+    """
+    path = Path(path)
+    rows = _read_rows(path)
+    if time_column not in rows.header:
+        raise InputError(f"{path} has the columns {', '.join(rows.header)}.",
+                         f"A column {time_column} with time stamps in seconds was expected.",
+                         "Rename the column, or bring the file in with `limber import-pull`.")
+    table = np.array(rows.numbers, float).reshape(-1, len(rows.header))
+    at = rows.header.index(time_column)
+    times, values = table[:, at], np.delete(table, at, axis=1)
+    columns = tuple(name for name in rows.header if name != time_column)
+    times, values = in_order(path, times, values, rows.warnings)
+    if len(times) < 2:
+        raise InputError(f"{path} has {len(times)} complete rows.",
+                         "A pull needs at least two samples.", "Record it again.")
+    return Stream(times, values, columns, tuple(rows.warnings))
+
+
+def write_stream(path: str | Path, stream: Stream) -> None:
+    """Write a CSV file that :func:`read_stream` reads; NaN becomes an empty field."""
+    lines = [",".join(("t_s", *stream.columns))]
+    for time, row in zip(stream.times, stream.values, strict=True):
+        fields = ["" if np.isnan(value) else f"{value:.9g}" for value in row]
+        lines.append(",".join([f"{time:.6f}", *fields]))
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def gaps(times: np.ndarray, factor: float = 5.0) -> np.ndarray:
+    """Return the intervals (start, end) [s] over ``factor`` median steps long, shape [g, 2]."""
+    steps = np.diff(times)
+    wide = steps > factor * np.median(steps)
+    return np.column_stack([times[:-1][wide], times[1:][wide]])
+
+
+def inside_gap(times: np.ndarray, intervals: np.ndarray) -> np.ndarray:
+    """Whether each time lies strictly within one of the intervals, shape [n] of bool."""
+    inside = np.zeros(len(times), bool)
+    for start, end in intervals:
+        inside |= (times > start) & (times < end)
+    return inside
+
+
+def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> np.ndarray:
+    """Find readings far from their neighbours, shape [n] of bool.
+
+    Each window's middle is compared with a robust line through the window (Theil and Sen), so
+    that a fast pull is not taken for a spike and up to three readings in a row are found. A spike
+    lies more than ``threshold`` robust standard deviations off.
+    """
+    width = 2 * half_window + 1
+    if len(values) < width:
+        return np.zeros(len(values), bool)
+    padded = np.pad(values, ((half_window, half_window), (0, 0)), mode="reflect",
+                    reflect_type="odd")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=0)
+    place = np.arange(width) - half_window
+    first, second = np.triu_indices(width, 1)
+    slope = np.median((windows[..., second] - windows[..., first])
+                      / (place[second] - place[first]), axis=2)
+    expected = np.median(windows - slope[..., None] * place, axis=2)
+    residual = np.abs(values - expected)
+    # One scale for all axes: the noise of a sensor is alike in them, and an axis that hardly
+    # moves has none to show.
+    typical = MAD_TO_SIGMA * np.median(residual[np.any(residual > 0, axis=1)]
+                                       if np.any(residual) else residual)
+    far = residual > threshold * typical + 1e-3 * np.abs(values).max()
+    # A spike bends the line of its neighbours, which then look off as well, by less.
+    around = np.pad(residual, ((half_window, half_window), (0, 0)))
+    largest = np.lib.stride_tricks.sliding_window_view(around, width, axis=0).max(axis=2)
+    return np.any(far & (residual > 0.5 * largest), axis=1)
+
+
+def saturated(values: np.ndarray, run_length: int = 4) -> np.ndarray:
+    """Find runs of ``run_length`` or more equal readings at a column's extreme, [n] of bool."""
+    flagged = np.zeros(len(values), bool)
+    for column in values.T:
+        magnitude = np.abs(column)
+        peak = np.nanmax(magnitude, initial=0.0)
+        at_peak = (magnitude >= peak * (1 - 1e-9)) & (peak > 0)
+        flagged |= _long_runs(at_peak, run_length)
+    return flagged
+
+
+def _long_runs(flags: np.ndarray, run_length: int) -> np.ndarray:
+    edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0]))
+    kept = np.zeros(len(flags), bool)
+    for start, end in edges.reshape(-1, 2):
+        kept[start:end] = end - start >= run_length
+    return kept
+
+
+def _read_rows(path: Path) -> _Rows:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
+                         "Check the path and the file.") from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise InputError(f"{path} is empty.", "A header and rows of numbers were expected.",
+                         "Record it again.")
+    complete = text.endswith(("\n", "\r"))
+    rows = _Rows([name.strip() for name in lines[0].split(",")])
+    for number, line in enumerate(lines[1:], start=2):
+        fields = line.split(",")
+        is_last = number == len(lines)
+        try:
+            numbers = [float(part) if part.strip() else np.nan for part in fields]
+            if np.isinf(numbers).any():
+                raise ValueError("a number that is not finite")
+        except ValueError:
+            numbers = []
+        # Without an end of line even a last line of full length may have lost digits.
+        unfinished = is_last and not complete
+        if len(numbers) != len(rows.header) or unfinished:
+            if is_last:
+                rows.warnings.append(f"{path.name}: the last line is unfinished; it was dropped.")
+                continue
+            raise InputError(f"{path}, line {number}: {line[:60]!r}.",
+                             f"{len(rows.header)} numbers were expected.",
+                             "Correct or delete the line.")
+        rows.numbers.append(numbers)
+    return rows
+
+
+def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str],
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Sort rows by time and drop those without a stamp or with one that was there before.
+
+    Each repair adds a sentence to ``warnings``.
+
+    Raises:
+        InputError: a tenth or more of the stamps run backwards.
+    """
+    finite = np.isfinite(times)
+    if not finite.all():
+        warnings.append(f"{path.name}: {np.sum(~finite)} rows without a time stamp were dropped.")
+        times, values = times[finite], values[finite]
+    backward = int(np.sum(np.diff(times) < 0))
+    if backward and backward >= 0.1 * len(times):
+        raise InputError(f"{path}: {backward} of {len(times)} time stamps run backwards.",
+                         "The rows cannot be put into order with confidence.",
+                         "Check the recorder's clock, or the column taken for time.")
+    if backward:
+        warnings.append(f"{path.name}: {backward} time stamps out of order; rows were sorted.")
+    times, first = np.unique(times, return_index=True)
+    doubled = len(values) - len(first)
+    if doubled:
+        warnings.append(f"{path.name}: {doubled} duplicate time stamps; the first row was kept.")
+    return times, values[first]

@@ -1,0 +1,183 @@
+"""Reduced models that were learnt once, kept for whoever needs the same one again.
+
+A model takes minutes to learn and depends on nothing but the branch, its material and weight, the
+patch that is held and what it was asked to learn: a digest of these names its file. One file holds
+the model and the full solutions it was made of, so that no reader sees two that do not belong
+together. ::
+
+    learnt = learnt_model(model, grasp, weights, control_young, settings,
+                          cache=ReducedCache(default_folder()))
+    learnt.reduced.solve_static(pose)
+
+A session, an energy field and an estimate may share the folder.
+"""
+
+import contextlib
+import hashlib
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+from filelock import FileLock, Timeout
+
+from limber.core.errors import InputError
+from limber.core.files.reading import read_arrays
+from limber.core.progress import SILENT, Progress
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.model import BranchModel
+from limber.reduced.reduced_model import FORMAT, ReducedModel, build_reduced
+from limber.reduced.state import ReducedSettings
+from limber.reduced.training import Snapshots, TrainingSettings
+
+LIMIT_BYTES = 2 << 30
+"""How much all models of a folder may take: a dozen of a branch of some thousand tetrahedra."""
+SHARED = ReducedSettings(size=80, vibration_count=1, field_count=130, training=TrainingSettings(
+    grasp_count=160, young_spread=1.0))
+"""What is learnt of a branch whose moduli are known, where nobody asks otherwise."""
+SNAPSHOT_PREFIX = "snapshot_"
+_LEFT_OVER_SECONDS = 24 * 3600.0
+_WAIT_SECONDS = 0.5
+
+
+def default_folder() -> Path:
+    """Return the folder in the user's cache that sessions and stages share."""
+    return platformdirs.user_cache_path("limber") / "reduced"
+
+
+def model_key(model: BranchModel, grasp: Grasp, weights: np.ndarray, control_young: np.ndarray,
+              settings: ReducedSettings) -> str:
+    """Return a digest of all that a reduced model depends on."""
+    digest = hashlib.sha256(
+        f"{FORMAT} {settings!r} {grasp.mode} {model.damping!r} {int(model.material)}"
+        f" {model.lumped_mass} {sorted(map(repr, model.point_masses))}".encode())
+    digest.update(model.mesh.geometry_digest().encode())
+    for array in (weights, control_young, model.poisson, model.density, model.gravity,
+                  grasp.nodes, grasp.weights, model.fixed):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    if model.hanging is not None:
+        digest.update(np.ascontiguousarray(model.hanging.total.stress).tobytes())
+    return digest.hexdigest()[:32]
+
+
+class ReducedCache:
+    """Reduced models in a folder, the least recently used removed where they take too much room.
+
+    Args:
+        folder: Where; made if it is not there.
+        limit_bytes: What all models may take; the one stored last always stays.
+        progress: Told of files that were damaged and are removed.
+    """
+
+    def __init__(self, folder: Path, *, limit_bytes: int = LIMIT_BYTES,
+                 progress: Progress = SILENT):
+        self.folder, self.limit_bytes, self._progress = Path(folder), limit_bytes, progress
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def path(self, key: str) -> Path:
+        """Return the file of a model; :meth:`ReducedModel.read` reads it."""
+        return self.folder / f"{key}.npz"
+
+    def load(self, key: str) -> tuple[ReducedModel, Snapshots] | None:
+        """Return a model and what it was made of, None where there is none.
+
+        A damaged file is removed, and said.
+        """
+        path = self.path(key)
+        if not path.is_file():
+            return None
+        try:
+            held = {name.removeprefix(SNAPSHOT_PREFIX): values
+                    for name, values in read_arrays(path, "a reduced model").items()
+                    if name.startswith(SNAPSHOT_PREFIX)}
+            found = ReducedModel.read(path), Snapshots.from_arrays(held)
+        except (InputError, OSError, ValueError, KeyError, TypeError) as error:
+            self._progress.warn(f"{path.name} in the cache of reduced models was damaged"
+                      f" ({type(error).__name__}); it is removed, and the model learnt again")
+            with contextlib.suppress(OSError):
+                path.unlink()
+            return None
+        with contextlib.suppress(OSError):
+            os.utime(path)  # used now: others go before it
+        return found
+
+    def store(self, key: str, reduced: ReducedModel, snapshots: Snapshots) -> Path:
+        """Keep a model; a reader sees the old or the new one, whole. Returns its file."""
+        path = self.path(key)
+        part = path.with_suffix(f".{os.getpid()}.part")
+        try:
+            reduced.write(part, {SNAPSHOT_PREFIX + name: array
+                                 for name, array in snapshots.arrays().items()})
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+        self._make_room(path)
+        return path
+
+    def learning(self, key: str) -> FileLock:
+        """Return the lock of whoever learns this model, so that nobody learns it beside."""
+        return FileLock(self.folder / f"{key}.lock")
+
+    def _make_room(self, newest: Path) -> None:
+        now, models = time.time(), []
+        for path in self.folder.iterdir():
+            with contextlib.suppress(OSError):  # another process may just have removed it
+                about = path.stat()
+                if path.suffix == ".npz" and path != newest:
+                    models.append((about.st_mtime, about.st_size, path))
+                elif path.suffix in (".part", ".lock") and (
+                        now - about.st_mtime > _LEFT_OVER_SECONDS):
+                    path.unlink()
+        room = self.limit_bytes - newest.stat().st_size
+        for _, size, path in sorted(models, reverse=True):
+            room -= size
+            if room < 0:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+
+
+@dataclass(frozen=True)
+class LearntModel:
+    """A reduced model and the full solutions that it was made of.
+
+    Attributes:
+        was_known: It came from the cache.
+    """
+
+    reduced: ReducedModel
+    snapshots: Snapshots
+    was_known: bool
+
+
+def learnt_model(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                 control_young: np.ndarray, settings: ReducedSettings, *,
+                 cache: ReducedCache | None, progress: Progress = SILENT) -> LearntModel:
+    """Return the reduced model of a branch, from the cache or learnt now and kept there.
+
+    Where another process is learning the same one, this waits for it. Arguments as for
+    :func:`limber.reduced.reduced_model.build_reduced`; without a ``cache`` nothing is kept.
+
+    Raises:
+        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
+    """
+    if cache is None:
+        return LearntModel(*build_reduced(model, grasp, weights, control_young, settings,
+                                          progress), was_known=False)
+    key = model_key(model, grasp, weights, control_young, settings)
+    lock = cache.learning(key)
+    while True:
+        known = cache.load(key)
+        if known is not None:
+            return LearntModel(*known, was_known=True)
+        try:
+            with lock.acquire(timeout=_WAIT_SECONDS):
+                known = cache.load(key)  # the one that was waited for
+                if known is not None:
+                    return LearntModel(*known, was_known=True)
+                made = build_reduced(model, grasp, weights, control_young, settings, progress)
+                cache.store(key, *made)
+                return LearntModel(*made, was_known=False)
+        except Timeout:
+            progress(0.0, "another process learns this model; waiting for it")

@@ -1,0 +1,573 @@
+"""Reduced model of a branch: static grasps and their sensitivities in about a millisecond.
+
+Full solutions span a subspace (limber.reduced.basis) in which the StVK force is a cubic
+polynomial (limber.reduced.strain_polynomial). ::
+
+    reduced = build_reduced(model, grasp, weights, control_young)
+    state = reduced.with_young(young).solve_static(pose)
+    state.strain_energy, state.reaction_force, reduced.displacement(state)
+
+How far to trust it: :mod:`limber.reduced.refresh`.
+"""
+
+import copy
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.files.reading import read_arrays
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.mechanics.grasp import Grasp, check_pose, pose_between
+from limber.mechanics.materials.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.reduced.basis import Basis, GraspCoordinates, make_basis
+from limber.reduced.state import (
+    ReducedSensitivities,
+    ReducedSettings,
+    ReducedState,
+    ReducedStaticSettings,
+)
+from limber.reduced.strain_polynomial import (
+    StrainPolynomial,
+    evaluate_strain,
+    make_polynomial,
+    reduced_mass,
+    strain_only,
+)
+from limber.reduced.training import Snapshots, Trainer, sample_poses, sample_young
+from limber.reduced.training_poses import TrainingPoses
+
+FORMAT = 4
+_STATIC = ReducedStaticSettings()
+_DEFAULT = ReducedSettings()
+_NO_INCREMENT = np.empty(0)
+_LOST = 0.25
+"""Part of the potential's change in a step that its work may leave open before the step is taken
+for a jump: as for the full model (limber.mechanics.statics.path)."""
+_LEADING = 20
+"""Modes that tell whether a state is like those of the training: chosen, not measured."""
+
+
+@dataclass
+class Workspace:
+    """Arrays that the kernel writes to."""
+
+    strain: np.ndarray
+    jacobian: np.ndarray
+    gradient: np.ndarray
+    tangent: np.ndarray
+
+    @classmethod
+    def of(cls, linear: np.ndarray) -> "Workspace":
+        count, size = linear.shape
+        return cls(np.empty(count), np.empty((count, size)), np.empty(size),
+                   np.empty((size, size)))
+
+
+@dataclass
+class ReducedModel:
+    """A branch held at one patch, in few coordinates.
+
+    Attributes:
+        grasp: The patch.
+        rest: Rest positions of all nodes [m], shape [node_count, 3].
+        basis: The subspace.
+        polynomial: Strain as a polynomial of the coordinates.
+        load: Weight that the mesh's shape does not carry, on the coordinates [N], shape [size].
+        weight_stiffness: Of the weight that it carries (limber.mechanics.prestress) [N/m], shape
+            [size, size].
+        mass: Mass matrix of the coordinates, shape [size, size].
+        damping: Rayleigh damping.
+        control_young: Young's modulus at the control points [Pa], shape [K].
+        poses, training_young, energies: Of the training states.
+        young_spread: Factor in Young's modulus within which the training sampled.
+        extent: Diagonal of the branch's bounding box [m].
+        error: Held-out errors measured when it was built (limber.reduced.refresh).
+        poisson: Poisson's ratio, where it is another than the training's.
+        strain_fields: What strain is made of, shape [tet_count, q, 6, m]; None where it was not
+            kept, and :meth:`strains` is not to be had.
+    """
+
+    grasp: Grasp
+    rest: np.ndarray
+    basis: Basis
+    polynomial: StrainPolynomial
+    load: np.ndarray
+    weight_stiffness: np.ndarray
+    mass: np.ndarray
+    damping: RayleighDamping
+    control_young: np.ndarray
+    poses: np.ndarray
+    training_young: np.ndarray
+    energies: np.ndarray
+    young_spread: float
+    extent: float
+    error: dict[str, float] = field(default_factory=dict)
+    poisson: float | None = None
+    strain_fields: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        self.held = GraspCoordinates(self.grasp)
+        self.young = self.control_young
+        self._largest = self.basis.reach
+        # The leading modes: those of vibrations are not in the states, the last are small.
+        modes = np.arange(self.size) >= self.basis.lift_count
+        self._known = np.flatnonzero(modes & (self._largest > 0))[:_LEADING]
+        self._table = TrainingPoses(self.poses, self.extent)
+        self._spacing = self._table.spacing()
+        self._weight_lower = np.tril(self.weight_stiffness)
+        self._set()
+
+    @property
+    def size(self) -> int:
+        return self.basis.size
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """Derivative of the whitened strain where the tangent was evaluated last, [m, size]."""
+        return self._work.jacobian
+
+    def with_young(self, young: np.ndarray, poisson: float | None = None) -> "ReducedModel":
+        """Return the model with other moduli [Pa] at the control points, shape [K].
+
+        Raises:
+            InputError: wrong number, or not positive.
+        """
+        young = np.asarray(young, float)
+        if young.shape != self.control_young.shape or not (young > 0).all():
+            raise InputError(f"Young's moduli {young}.",
+                             f"{len(self.control_young)} positive values are needed.", "")
+        other = copy.copy(self)
+        other.young = young
+        other.poisson = self.poisson if poisson is None else poisson
+        other._set()
+        return other
+
+    def with_density(self, factor: float) -> "ReducedModel":
+        """Return the model of a branch ``factor`` times as heavy, at rest."""
+        other = copy.copy(self)
+        other.load = factor * self.load
+        other.weight_stiffness = factor * self.weight_stiffness
+        other._weight_lower = factor * self._weight_lower
+        return other
+
+    def _set(self) -> None:
+        moduli = self.polynomial.moduli(self.young, self.poisson)
+        self.linear, self.quadratic, self.root = self.polynomial.whitened(moduli)
+        self._work = Workspace.of(self.linear)
+
+    def energy_force(self, q: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return energy [J], with that of a carried weight, and its derivative [size]."""
+        energy, gradient, _ = self.tangent(q)
+        return energy, gradient.copy()
+
+    def tangent(self, q: np.ndarray, increment: np.ndarray | None = None,
+                velocity: np.ndarray | None = None, by_rate: float = 0.0,
+                ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return energy, force and tangent (lower triangle); arrays are overwritten next time.
+
+        Energy and force with those of the weight that the mesh's shape carries. With ``increment``
+        the geometric stiffness is that of the mixed-integration-point Newton;
+        with ``velocity``, which changes by ``by_rate`` [1/s] with q, the stiffness damping acts.
+        """
+        work = self._work
+        dq = _NO_INCREMENT if increment is None else increment
+        moving = _NO_INCREMENT if velocity is None else velocity
+        energy = evaluate_strain(self.linear, self.quadratic, q, dq, moving,
+                                 self.damping.stiffness, by_rate, work.strain, work.jacobian,
+                                 work.gradient, work.tangent)
+        lifted = self.weight_stiffness @ q
+        work.gradient += lifted
+        work.tangent += self._weight_lower
+        return energy + 0.5 * float(lifted @ q), work.gradient, work.tangent
+
+    def strain_energy(self, q: np.ndarray) -> float:
+        """Return the energy of the strain since the model's mesh [J] at coordinates."""
+        return strain_only(self.linear, self.quadratic, q, self._work.strain)
+
+    def energy(self, q: np.ndarray) -> float:
+        """Return that energy with the carried weight's [J]."""
+        return self.strain_energy(q) + 0.5 * float(q @ self.weight_stiffness @ q)
+
+    def strains(self, q: np.ndarray) -> np.ndarray:
+        """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12).
+
+        As the model assumes it: a tenth as far off the full model's as that of the displacement.
+        """
+        self.strain_energy(q)
+        shares = np.linalg.solve(self.root.T, self._work.strain).astype(np.float32)
+        fields = present(self.strain_fields, "strain field of the reduced model")
+        return (fields @ shares).astype(float)
+
+    def displacement_of(self, q: np.ndarray) -> np.ndarray:
+        """Return the displacement of all nodes [m], shape [node_count, 3]."""
+        return np.tensordot(q, self.basis.columns, 1)
+
+    def displacement(self, state: ReducedState) -> np.ndarray:
+        """Return the displacement of all nodes [m] in a state, shape [node_count, 3]."""
+        return self.displacement_of(state.coordinates)
+
+    def load_of(self, nodal_forces: np.ndarray) -> np.ndarray:
+        """Return nodal forces [N], shape [node_count, 3], on the coordinates."""
+        return np.tensordot(self.basis.columns, nodal_forces, 2)
+
+    def solve_static(self, pose: np.ndarray, *, start: ReducedState | None = None,
+                     nodal_forces: np.ndarray | None = None,
+                     settings: ReducedStaticSettings = _STATIC,
+                     ) -> ReducedState:
+        """Return the equilibrium at a pose [m, rad]; look at ``converged`` and ``trusted``.
+
+        Starts from ``start`` or from the nearest training state. A state that fails, is not
+        stable or lies outside the training is sought again from others, on longer ways; the one
+        of the lowest energy counts.
+        """
+        began = time.perf_counter()
+        pose = check_pose(pose)
+        load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
+        best: _Found | None = None
+        iterations = 0
+        for at_pose, q in self._starts(pose, start)[:settings.start_count]:
+            found = self._follow(at_pose, q, pose, load, settings,
+                                 settings.iteration_limit - iterations)
+            iterations += found.iterations
+            if best is not None and found.agrees(best):
+                break  # the same from two starts: unusual, but no accident of the way there
+            if best is None or (found.ranking(settings) < best.ranking(settings)):
+                best = found
+            if ((best.converged and best.novelty < settings.novelty_limit)
+                    or iterations >= settings.iteration_limit):
+                break
+        return self._state(present(best, "start"), pose, load, iterations, began, settings)
+
+    def followed(self, start: np.ndarray, pose: np.ndarray,
+                 settings: ReducedStaticSettings = _STATIC) -> ReducedState:
+        """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size].
+
+        Unlike :meth:`solve_static` it looks for no other, and goes in steps so short that none
+        jumps to another; where one would, the state is not converged.
+        """
+        began, pose = time.perf_counter(), check_pose(pose)
+        at_pose = np.concatenate([self.grasp.centre + start[:self.basis.lift_count], pose[3:]])
+        found = self._follow(at_pose, start, pose, self.load, settings, settings.iteration_limit,
+                             steadily=True)
+        return self._state(found, pose, self.load, found.iterations, began, settings)
+
+    def pulled(self, start: np.ndarray, force: np.ndarray,
+               settings: ReducedStaticSettings = _STATIC) -> ReducedState | None:
+        """Return the equilibrium under a force [3] on a pinned grasp, from coordinates ``start``
+        [size], held there; None where the way ends before, as at a snap."""
+        count = self.basis.lift_count
+        begin = (self.energy_force(start)[1] - self.load)[:count]
+        q, reached, step = start, 0.0, 1.0
+        while reached < 1.0:
+            part = min(1.0, reached + step)
+            load = self.load.copy()
+            load[:count] += begin + part * (force - begin)
+            found = self._newton(q, None, load, settings, settings.max_iterations)
+            if found.converged and self._came_from(q, found):
+                q, reached = found.q, part
+                continue
+            step /= 2
+            if step < 0.5**settings.max_halvings:
+                return None
+        place = self.grasp.centre + q[:count]
+        return self.followed(q, np.concatenate([place, np.zeros(3)]), settings)
+
+    def sensitivities(self, state: ReducedState) -> ReducedSensitivities:
+        """Differentiate a converged state to log Young's modulus at each control point."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        q, free = state.coordinates, slice(self.basis.lift_count, None)
+        _, force, lower = self.tangent(q)
+        force, tangent = force.copy(), lower + np.tril(lower, -1).T
+        strain = np.linalg.solve(self.root.T, self._work.strain)
+        slope = np.linalg.solve(self.root.T, self._work.jacobian)
+        factor = cho_factor(tangent[free, free])
+        columns, forces, energies = [], [], []
+        for modulus, part in zip(self.young, self.polynomial.parts(self.poisson), strict=True):
+            explicit = modulus * slope.T @ (part @ strain)
+            change = np.zeros(self.size)
+            change[free] = -cho_solve(factor, explicit[free])
+            columns.append(change)
+            forces.append(np.concatenate(self.wrench(state.pose, explicit + tangent @ change)))
+            energies.append(0.5 * modulus * strain @ part @ strain + force @ change)
+        wrench = np.array(forces).T
+        return ReducedSensitivities(np.array(columns).T, wrench[:3], wrench[3:],
+                                    np.array(energies))
+
+    def nearest(self, pose: np.ndarray, count: int = 4) -> np.ndarray:
+        """Return the training states nearest to a pose at this Young's modulus."""
+        distance = self._table.distance(pose) + 0.1 * self.extent * np.abs(
+            np.log(self.training_young / self.young)).max(axis=1)
+        return np.argsort(distance)[:count]
+
+    def doubt(self, pose: np.ndarray, novelty: float, limit: float) -> str:
+        """Return why a state lies outside of what the basis knows, or an empty string."""
+        distance = self._table.distance(pose).min()
+        if distance > 3 * self._spacing:
+            return f"the pose is {distance:.3g} m from the nearest training grasp"
+        factor = np.exp(np.abs(np.log(self.young / self.control_young)).max())
+        if factor > 1.05 * self.young_spread:
+            return f"Young's modulus is {factor:.3g} times off what was sampled"
+        if novelty > limit:
+            return f"a coordinate is {novelty:.3g} times its largest in training"
+        return ""
+
+    def _starts(self, pose: np.ndarray, start: ReducedState | None,
+                ) -> list[tuple[np.ndarray, np.ndarray]]:
+        near = [(self.poses[k], self.basis.states[k]) for k in self.nearest(pose)]
+        if start is None:
+            return near
+        own = (start.pose, start.coordinates)
+        far = TrainingPoses(np.array([start.pose, near[0][0]]), self.extent).distance(pose)
+        return [own, *near] if far[0] <= 2 * far[1] else [near[0], own, *near[1:]]
+
+    def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
+                settings: ReducedStaticSettings, most: int, *, steadily: bool = False,
+                ) -> "_Found":
+        """Newton to the pose in ``most`` iterations; halves the way where that fails, ``steadily``
+        also where the branch may have jumped."""
+        iterations, reached, step = 0, 0.0, 1.0
+        while True:
+            part = min(1.0, reached + step)
+            goal = pose if part == 1.0 else pose_between(at_pose, pose, part)
+            found = self._newton(q, self.held.at(goal), load, settings,
+                                 min(settings.max_iterations, most - iterations))
+            iterations += found.iterations
+            sound = (found.converged and found.novelty < 4 * settings.novelty_limit
+                     and not (steadily and not self._came_from(q, found)))
+            if sound and part == 1.0:
+                return replace(found, iterations=iterations)
+            if iterations >= most:
+                return replace(found, converged=False, iterations=iterations)
+            if sound:
+                q, reached = found.q, part
+                continue
+            step /= 2
+            if step < 0.5**settings.max_halvings:
+                return replace(found, converged=False, iterations=iterations)
+
+    def _came_from(self, q: np.ndarray, found: "_Found") -> bool:
+        """Whether an equilibrium follows on the one at ``q``: every tangent on the way to it was
+        positive definite, or the potential changed by as much as the gripper worked."""
+        if found.steady:
+            return True
+        count, energies, forces = self.basis.lift_count, [], []
+        for end in (q, found.q):
+            energy, force = self.energy_force(end)
+            energies.append(energy - float(self.load @ end))
+            forces.append((force - self.load)[:count])
+        change = energies[1] - energies[0]
+        work = 0.5 * float((forces[0] + forces[1]) @ (found.q - q)[:count])
+        return work - change <= _LOST * (abs(work) + abs(change))
+
+    def _newton(self, q: np.ndarray, held: np.ndarray | None, load: np.ndarray,
+                settings: ReducedStaticSettings, most: int) -> "_Found":
+        """Iterate with the grasp's coordinates ``held``, or free where they are not."""
+        count, q = 0 if held is None else self.basis.lift_count, q.copy()
+        move, increment, steady = None if held is None else held - q[:count], None, True
+        for iteration in range(most):
+            energy, force, tangent = self.tangent(q, increment)
+            right = load[count:] - force[count:]
+            if move is not None:
+                right = right - tangent[count:, :count] @ move
+            step, stable = solved_raised(tangent[count:, count:], right)
+            steady = steady and stable
+            increment = np.concatenate([np.zeros(count) if move is None else move, step])
+            q = q + increment
+            gain = 0.5 * abs(right @ step)
+            if not np.isfinite(gain) or np.abs(q).max() > 1e3 * self._largest.max():
+                return _Found(q, False, np.inf, iteration + 1, np.inf)
+            if move is None and gain <= settings.tolerance * max(energy, 1e-12):
+                novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
+                return _Found(q, stable, novelty, iteration + 1,
+                              self.energy(q) - float(load @ q), steady)
+            move = None
+        return _Found(q, False, np.inf, most, np.inf)
+
+    def _state(self, found: "_Found", pose: np.ndarray, load: np.ndarray, iterations: int,
+               began: float, settings: ReducedStaticSettings) -> ReducedState:
+        energy, force = self.energy_force(found.q)
+        reaction, torque = self.wrench(pose, force - load)
+        strain = energy - 0.5 * float(found.q @ self.weight_stiffness @ found.q)
+        doubt = "" if found.converged else "no stable equilibrium was found"
+        doubt = doubt or self.doubt(pose, found.novelty, settings.novelty_limit)
+        return ReducedState(
+            found.converged, not doubt, doubt, found.q, pose, self.young, strain,
+            float(energy - self.load @ found.q), reaction, torque, found.novelty, iterations,
+            time.perf_counter() - began)
+
+    def wrench(self, pose: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return force and torque of the gripper from the forces on the grasp coordinates."""
+        wrench = self.held.by_pose(pose).T @ out[:self.basis.lift_count]
+        return wrench[:3], wrench[3:] if len(wrench) == 6 else np.zeros(3)
+
+    def write(self, path: Path, beside: Mapping[str, np.ndarray] | None = None) -> None:
+        """Write the model as plain arrays (npz, nothing pickled); ``beside`` goes into the file
+        too, under names that begin with ``snapshot_``, which :meth:`read` leaves alone."""
+        arrays = {
+            "format": FORMAT, "grasp_nodes": self.grasp.nodes, "grasp_weights": self.grasp.weights,
+            "grasp_centre": self.grasp.centre, "grasp_mode": self.grasp.mode, "rest": self.rest,
+            "columns": self.basis.columns, "lift_count": self.basis.lift_count,
+            "states": self.basis.states, "captured": self.basis.captured, "reach": self.basis.reach,
+            **{f"polynomial_{k}": v for k, v in vars(self.polynomial).items()},
+            "load": self.load, "weight_stiffness": self.weight_stiffness, "mass": self.mass,
+            "damping": [self.damping.mass, self.damping.stiffness],
+            "control_young": self.control_young, "poses": self.poses,
+            "training_young": self.training_young, "energies": self.energies,
+            "young_spread": self.young_spread, "extent": self.extent,
+            "error_names": list(self.error), "error_values": list(self.error.values())}
+        if self.strain_fields is not None:
+            arrays["strain_fields"] = self.strain_fields
+        with open(path, "wb") as stream:
+            np.savez(stream, **arrays, **(beside or {}))
+
+    @classmethod
+    def read(cls, path: Path) -> "ReducedModel":
+        """Read a model that :meth:`write` wrote.
+
+        Raises:
+            InputError: it is not one, or of another format.
+        """
+        arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
+                  if not name.startswith("snapshot_")}
+        if int(arrays.get("format", -1)) != FORMAT:
+            raise InputError(f"{path} has another format.", "", "Build it again.")
+        grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
+                      "pinned" if str(arrays["grasp_mode"]) == "pinned" else "clamped")
+        basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
+                      float(arrays["captured"]), arrays["reach"])
+        linear, quadratic, by_lambda, by_mu = (
+            arrays[f"polynomial_{name}"] for name in ("linear", "quadratic", "by_lambda", "by_mu"))
+        polynomial = StrainPolynomial(linear, quadratic, by_lambda, by_mu,
+                                      float(arrays["polynomial_poisson"]))
+        error = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
+                         strict=True))
+        return cls(grasp, arrays["rest"], basis, polynomial, arrays["load"],
+                   arrays["weight_stiffness"], arrays["mass"],
+                   RayleighDamping(*arrays["damping"]), arrays["control_young"],
+                   arrays["poses"], arrays["training_young"], arrays["energies"],
+                   float(arrays["young_spread"]), float(arrays["extent"]), error,
+                   strain_fields=arrays.get("strain_fields"))
+
+
+@dataclass(frozen=True)
+class _Found:
+    q: np.ndarray
+    converged: bool
+    novelty: float
+    iterations: int
+    potential: float
+    steady: bool = False  # every tangent on the way was positive definite
+
+    def agrees(self, other: "_Found") -> bool:
+        """Whether both are the same equilibrium."""
+        return (self.converged and other.converged
+                and abs(self.potential - other.potential) <= 1e-6 * abs(other.potential))
+
+    def ranking(self, settings: ReducedStaticSettings) -> tuple[bool, bool, float]:
+        """Sort key: converged, then within the training, then the lower potential energy."""
+        return not self.converged, self.novelty >= settings.novelty_limit, self.potential
+
+
+def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                  control_young: np.ndarray,
+                  settings: ReducedSettings = _DEFAULT,
+                  progress: Progress = SILENT) -> tuple[ReducedModel, Snapshots]:
+    """Solve the full model at training grasps and make the reduced model of them.
+
+    Args:
+        model: The branch (St. Venant-Kirchhoff).
+        grasp: The patch that is held, clamped or pinned.
+        weights: From control points to tetrahedra, shape [tet_count, K]
+            (limber.mechanics.young_weights).
+        control_young: Young's modulus at the control points [Pa], shape [K].
+
+    Raises:
+        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
+    """
+    training = settings.training
+    rng = np.random.default_rng(training.seed)
+    trainer = Trainer(model, grasp, weights, control_young,
+                      young_tangents=training.young_spread > 1)
+    poses = sample_poses(model, grasp, training.grasp_count, rng, training)
+    young = sample_young(control_young, len(poses), rng, training.young_spread)
+    snapshots = trainer.take(poses, young, vibration_every=training.vibration_every,
+                             vibration_count=training.vibration_count,
+                             progress=progress.part(0.0, 0.9))
+    progress(0.9, "reducing", snapshots=len(snapshots))
+    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings,
+                               keeps_strain=True)
+    progress(1.0, "reduced model ready", size=reduced.size)
+    return reduced, snapshots
+
+
+def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                     control_young: np.ndarray, snapshots: Snapshots,
+                     settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
+    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`.
+
+    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is wanted, which doubles its size.
+    """
+    control_young = np.asarray(control_young, float)
+    if not settings.vibration_count:
+        snapshots = snapshots.without_vibrations()
+    basis = make_basis(model, grasp, snapshots, settings.size,
+                       settings.vibration_count if len(snapshots.vibrations) else 0)
+    polynomial, fields = make_polynomial(model, basis, weights, control_young, snapshots,
+                                         settings.field_count, keeps_fields=keeps_strain)
+    flat = basis.columns.reshape(basis.size, -1)
+    spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
+    weight = model.weight_stiffness
+    carried = np.zeros((basis.size, basis.size)) if weight is None else flat @ np.array(
+        [weight @ column for column in basis.columns]).reshape(basis.size, -1).T
+    return ReducedModel(
+        grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(), carried,
+        reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
+        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent, strain_fields=fields)
+
+
+def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Solve with the lower triangle; raise the diagonal until it is positive definite.
+
+    Returns the solution (NaN where there is none) and whether nothing had to be raised.
+    """
+    from scipy.linalg.lapack import dposv
+
+    _, solution, info = dposv(matrix, right, lower=1)
+    if info == 0:
+        return solution, True
+    scale, shift = np.abs(np.diag(matrix)).mean(), 1e-6
+    while shift <= 1e3 and np.isfinite(scale):
+        _, solution, info = dposv(matrix + shift * scale * np.eye(len(matrix)), right, lower=1)
+        if info == 0:
+            return solution, False
+        shift *= 4
+    return np.full(len(right), np.nan), False
+
+
+def as_control_points(model: BranchModel, points: Sequence[np.ndarray] | None = None,
+                      ) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
+
+    Control points are the mesh's; where the field is not what they can give (or there are none)
+    it becomes one region with its own pattern, and only its level can change.
+    """
+    from limber.mechanics.materials.young_field import young_weights
+
+    marks = model.mesh.point_data.get("control_point")
+    if points is None and marks is not None and (marks >= 0).any():
+        order = np.argsort(marks[marks >= 0])
+        points = model.mesh.nodes[np.flatnonzero(marks >= 0)[order]]
+    if points is not None:
+        weights = young_weights(model.mesh, np.asarray(points))
+        young = np.linalg.lstsq(weights, model.young, rcond=None)[0]
+        if (young > 0).all() and np.abs(weights @ young / model.young - 1).max() < 1e-6:
+            return weights, young
+    level = float(model.young.mean())
+    return (model.young / level)[:, None], np.array([level])

@@ -1,0 +1,402 @@
+"""Strain as a quadratic polynomial of the reduced coordinates, and the force that follows.
+
+The Green-Lagrange strain of u = sum q_i u_i is exactly quadratic in q. It is projected onto a few
+strain fields phi_a that true solutions have, e_a = integral phi_a : C : strain(q), a quadratic
+form each. With the StVK energy e^T H e / 2 the force J^T H e (J = de/dq) is a cubic polynomial in
+q, and H = sum_k E_k (l Lambda_k + m M_k) is linear in Young's modulus E_k of each control point
+and in the two numbers l, m that stand for Poisson's ratio.
+
+Why projected: a basis of a few dozen displacements cannot release the axial strain that goes with
+a large rotation, and that strain is a thousand times stiffer than bending. Its part outside the
+fields of true solutions is noise of the basis; dropped, it no longer stiffens the branch (as
+assumed strains do in elements). With as many fields as the polynomial has terms the projection
+is the identity, and force and energy are the full model's on the subspace to round-off.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.numerics.compiled import compiled
+from limber.core.present import present
+from limber.mechanics.materials.materials import Material, lame
+from limber.mechanics.model import BranchModel
+from limber.reduced.basis import (
+    SWING_STRAIN_SHARE,
+    TANGENT_SHARE,
+    VIBRATION_STEP,
+    Basis,
+    tangent_steps,
+)
+from limber.reduced.training import Snapshots
+
+_CHUNK_POINTS = 1000
+_PAIRS = np.array([[0, 0], [1, 1], [2, 2], [0, 1], [0, 2], [1, 2]])
+_SHEAR = np.array([1.0, 1.0, 1.0, np.sqrt(2), np.sqrt(2), np.sqrt(2)])
+_TRACE = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+_SMALLEST = 1e-11
+"""Eigenvalue of the strain fields, relative to the largest, below which they are round-off."""
+
+
+_ALIKE = 1e-6
+"""Eigenvalue of the normalised fields' products under which they count as alike."""
+
+
+@dataclass(frozen=True)
+class StrainPolynomial:
+    """The quadratic strain map and its moduli.
+
+    Attributes:
+        linear: Linear part of e, shape [m, size].
+        quadratic: Quadratic part, lower triangles of symmetric matrices by rows, shape
+            [m, size (size + 1) / 2].
+        by_lambda, by_mu: Moduli per Young's modulus at each control point and per l or m,
+            [K, m, m].
+        poisson: Poisson's ratio that by_lambda and by_mu were scaled with (mean of the branch).
+    """
+
+    linear: np.ndarray
+    quadratic: np.ndarray
+    by_lambda: np.ndarray
+    by_mu: np.ndarray
+    poisson: float
+
+    def moduli(self, young: np.ndarray, poisson: float | None = None) -> np.ndarray:
+        """Return H for Young's modulus at the control points [Pa], shape [K]; [m, m]."""
+        return sum(e * part for e, part in zip(young, self.parts(poisson), strict=True))
+
+    def parts(self, poisson: float | None = None) -> list[np.ndarray]:
+        """Return dH/dE_k for each control point."""
+        lam, mu = lame(1.0, self.poisson if poisson is None else poisson)
+        return [lam * a + mu * b for a, b in zip(self.by_lambda, self.by_mu, strict=True)]
+
+    def whitened(self, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return linear and quadratic parts in which H is the identity, and H's root.
+
+        With H = L L^T the strain coordinates become L^T e.
+        """
+        root = np.linalg.cholesky((moduli + moduli.T) / 2)
+        return (np.ascontiguousarray(root.T @ self.linear),
+                np.ascontiguousarray(root.T @ self.quadratic), root)
+
+
+@compiled
+def evaluate_strain(linear, quadratic, q, increment, velocity, damping, by_rate, strain, jacobian,
+                    gradient, tangent):
+    """Evaluate whitened strain, force and tangent; return the energy [J].
+
+    Writes strain e [m], its derivative J [m, size], the force J^T e [size] and the lower triangle
+    of the tangent [size, size]. With an ``increment`` (else empty) the geometric part takes the
+    strain that the last linearisation predicted (mixed integration points). With a ``velocity``
+    (else empty) the stress ``damping`` [s] times the rate of the strain is added to force and
+    tangent; ``by_rate`` [1/s] is the change of the velocity with q.
+    """
+    count, size = linear.shape
+    gradient[:] = 0.0
+    tangent[:] = 0.0
+    energy = 0.0
+    for a in range(count):
+        row, form = jacobian[a], quadratic[a]
+        for i in range(size):
+            row[i] = 0.0
+        at = 0
+        for i in range(size):
+            qi = q[i]
+            total = form[at + i] * qi
+            for j in range(i):
+                total += form[at + j] * q[j]
+                row[j] += form[at + j] * qi
+            row[i] += total
+            at += i + 1
+        predicted = 0.0
+        at = 0
+        for i in range(len(increment)):
+            along = 0.0
+            for j in range(i):
+                along += form[at + j] * increment[j]
+            predicted += increment[i] * (2.0 * along + form[at + i] * increment[i])
+            at += i + 1
+        value = 0.0
+        for i in range(size):
+            value += (linear[a, i] + row[i]) * q[i]
+            row[i] = linear[a, i] + 2.0 * row[i]
+        strain[a] = value
+        energy += 0.5 * value * value
+        viscous, growth = 0.0, 1.0
+        if len(velocity):
+            growth += damping * by_rate
+            for i in range(size):
+                viscous += damping * row[i] * velocity[i]
+        geometric = 2.0 * (value + viscous - predicted)
+        at = 0
+        for i in range(size):
+            ri = row[i]
+            gradient[i] += ri * (value + viscous)
+            ri *= growth
+            for j in range(i + 1):
+                tangent[i, j] += ri * row[j] + geometric * form[at + j]
+            at += i + 1
+    return energy
+
+
+@compiled
+def strain_only(linear, quadratic, q, strain):
+    """Write the whitened strain [m]; return the energy [J]."""
+    count, size = linear.shape
+    energy = 0.0
+    for a in range(count):
+        form = quadratic[a]
+        value = 0.0
+        at = 0
+        for i in range(size):
+            total = 0.0
+            for j in range(i):
+                total += form[at + j] * q[j]
+            value += q[i] * (linear[a, i] + 2.0 * total + form[at + i] * q[i])
+            at += i + 1
+        strain[a] = value
+        energy += 0.5 * value * value
+    return energy
+
+
+def compile_kernels() -> None:
+    """Call every kernel once; the compiled code stays in the user's cache folder."""
+    linear, quadratic, q, strain = np.eye(2), np.ones((2, 3)), np.ones(2), np.empty(2)
+    for increment in (np.empty(0), q):
+        evaluate_strain(linear, quadratic, q, increment, increment, 0.0, 0.0, strain,
+                        np.empty((2, 2)), np.empty(2), np.empty((2, 2)))
+    strain_only(linear, quadratic, q, strain)
+    gradient = np.zeros((1, 3, 3, 1))
+    _green_change(gradient, gradient, np.zeros(1, np.int64), np.ones(1), np.empty((1, 6, 1)))
+
+
+def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
+                    control_young: np.ndarray, snapshots: Snapshots | None,
+                    field_count: int | None, *, keeps_fields: bool = False,
+                    ) -> tuple[StrainPolynomial, np.ndarray | None]:
+    """Return the strain polynomial of a basis, and the fields if they are wanted.
+
+    Args:
+        weights: From control points to tetrahedra, shape [tet_count, K].
+        control_young: Young's modulus at the control points [Pa] that the projection's inner
+            product takes, shape [K].
+        snapshots: Whose strains the fields are made of.
+        field_count: Number of strain fields; None: all, no projection.
+        keeps_fields: Whether to return them, single precision, shape [tet_count, q, 6, m] (00 11 22
+            01 02 12); their sum by the polynomial's e is the strain.
+
+    Raises:
+        InputError: the material is not St. Venant-Kirchhoff.
+    """
+    if model.material != Material.st_venant_kirchhoff:
+        raise InputError(f"A reduced model of material {model.material.name}.",
+                         "Only St. Venant-Kirchhoff's force is a cubic polynomial.",
+                         "Use the full model, or st_venant_kirchhoff.")
+    points = _Points(model, weights, control_young)
+    if field_count is None:
+        transform = _all_fields(points, basis)
+        sources = None
+    else:
+        sources = _strain_sources(model, present(snapshots, "snapshot"))
+        transform = _leading_fields(points, sources, field_count)
+    return _projected(points, basis, sources, transform, keeps_fields)
+
+
+def reduced_mass(model: BranchModel, basis: Basis) -> np.ndarray:
+    """Return the mass matrix of the coordinates, shape [size, size]."""
+    heavy = np.array([model.mass_matrix @ column for column in basis.columns])
+    return basis.columns.reshape(basis.size, -1) @ heavy.reshape(basis.size, -1).T
+
+
+class _Points:
+    """Quadrature points in chunks: what strain fields are integrated over."""
+
+    def __init__(self, model: BranchModel, weights: np.ndarray, control_young: np.ndarray):
+        self.model, self.weights = model, weights
+        self.poisson = float(np.average(model.poisson, weights=model.weights.sum(axis=1)))
+        lam, mu = lame(weights @ control_young, model.poisson)
+        self.lam, self.mu = lam, mu
+        # Lamé coefficients per Young's modulus, relative to those of the mean Poisson's ratio:
+        # 1 everywhere if it is the same everywhere.
+        here, mean = lame(1.0, model.poisson), lame(1.0, self.poisson)
+        self.ratio = [a / b if b else np.ones_like(a) for a, b in zip(here, mean, strict=True)]
+
+    def chunks(self) -> Iterator[slice]:
+        step = max(1, _CHUNK_POINTS // self.model.weights.shape[1])
+        for start in range(0, self.model.mesh.tet_count, step):
+            yield slice(start, start + step)
+
+    def gradient(self, fields: np.ndarray, chunk: slice) -> np.ndarray:
+        """Return H = du/dX of fields [f, n, 3] at a chunk's points, shape [points, 3, 3, f]."""
+        local = fields[:, self.model.mesh.tets[chunk]].astype(float, copy=False)
+        H = np.einsum("feai,eqja->eqijf", local, self.model.gradients[chunk], optimize=True)
+        return H.reshape(-1, 3, 3, len(fields))
+
+    def volume(self, chunk: slice) -> np.ndarray:
+        return self.model.weights[chunk].reshape(-1)
+
+    def per_point(self, values: np.ndarray, chunk: slice) -> np.ndarray:
+        return np.repeat(values[chunk], self.model.weights.shape[1])
+
+    def stress(self, strain: np.ndarray, chunk: slice) -> np.ndarray:
+        """Return C : strain times the volume; strain [points, 6, f] with scaled shear."""
+        lam, mu = self.per_point(self.lam, chunk), self.per_point(self.mu, chunk)
+        volume = self.volume(chunk)[:, None, None]
+        trace = strain[:, :3].sum(axis=1, keepdims=True)
+        return volume * (lam[:, None, None] * trace * _TRACE[:, None]
+                         + 2 * mu[:, None, None] * strain)
+
+
+def _green(H: np.ndarray) -> np.ndarray:
+    """Green-Lagrange strain of H [p, 3, 3, f], shear scaled, shape [p, 6, f]."""
+    return np.stack([
+        scale * 0.5 * (H[:, i, j] + H[:, j, i] + (H[:, :, i] * H[:, :, j]).sum(axis=1))
+        for (i, j), scale in zip(_PAIRS, _SHEAR, strict=True)], axis=1)
+
+
+@compiled
+def _green_change(H, D, owners, scales, strain):
+    """Write the change of the strain (shear scaled) at states H [p, 3, 3, s] by D [p, 3, 3, f].
+
+    Field f belongs to state owners[f] and is scaled by scales[f].
+    """
+    root = np.sqrt(0.5)
+    for p in range(D.shape[0]):
+        for f in range(D.shape[3]):
+            s, scale = owners[f], scales[f]
+            for k in range(6):
+                i, j = _PAIRS[k, 0], _PAIRS[k, 1]
+                total = D[p, i, j, f] + D[p, j, i, f]
+                for c in range(3):
+                    total += H[p, c, i, s] * D[p, c, j, f] + D[p, c, i, f] * H[p, c, j, s]
+                strain[p, k, f] = scale * total * (0.5 if k < 3 else root)
+
+
+@dataclass(frozen=True)
+class _Sources:
+    """States, and changes with the state that each belongs to, whose strains are true ones.
+
+    The first ``rest_count`` states are at rest, the others swung out and weigh less.
+    """
+
+    states: np.ndarray
+    rest_count: int
+    changes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+    def strains(self, points: _Points, chunk: slice) -> np.ndarray:
+        H = points.gradient(self.states, chunk)
+        parts = [_green(H)]
+        parts[0][:, :, self.rest_count:] *= SWING_STRAIN_SHARE
+        for fields, owners, scales in self.changes:
+            if not len(fields):
+                continue
+            strain = np.empty((len(H), 6, len(fields)))
+            _green_change(H, points.gradient(fields, chunk), owners, scales, strain)
+            parts.append(strain)
+        return np.concatenate(parts, axis=2)
+
+
+def _strain_sources(model: BranchModel, snapshots: Snapshots) -> _Sources:
+    def flat(tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        owners = np.repeat(np.arange(len(tangents)), tangents.shape[1])
+        return tangents.reshape(len(owners), *tangents.shape[2:]), owners
+
+    steps = 2 * TANGENT_SHARE * tangent_steps(model, snapshots)
+    moved, moved_owner = flat(snapshots.pose_tangents)
+    stiffer, stiffer_owner = flat(snapshots.young_tangents)
+    return _Sources(np.concatenate([snapshots.displacement, snapshots.swings]),
+                    len(snapshots), [
+        (moved, moved_owner, np.tile(steps, len(snapshots))),
+        (stiffer, stiffer_owner, np.full(len(stiffer), 2 * TANGENT_SHARE)),
+        (snapshots.vibrations, snapshots.vibration_states,
+         np.full(len(snapshots.vibrations), VIBRATION_STEP * model.extent))])
+
+
+def _leading_fields(points: _Points, sources: _Sources, count: int) -> np.ndarray:
+    """Return coefficients of the leading strain fields in the sources, [sources, fields]."""
+    gram = np.zeros((1, 1))
+    for chunk in points.chunks():
+        strain = sources.strains(points, chunk)
+        flat = strain.reshape(-1, strain.shape[2])
+        gram = gram + points.stress(strain, chunk).reshape(flat.shape).T @ flat
+    return _leading(gram, count)
+
+
+def _leading(gram: np.ndarray, count: int | None) -> np.ndarray:
+    values, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    keep = np.flatnonzero(values > _SMALLEST * values[-1])[::-1][:count]
+    return vectors[:, keep] / np.sqrt(values[keep])
+
+
+def _terms(points: _Points, basis: Basis, chunk: slice) -> np.ndarray:
+    """Return the strain of each term q_i and q_i q_j (j <= i), shape [points, 6, terms]."""
+    H = points.gradient(basis.columns, chunk)
+    size = basis.size
+    later, earlier = np.tril_indices(size)
+    terms = np.empty((len(H), 6, size + len(later)))
+    for k, ((i, j), scale) in enumerate(zip(_PAIRS, _SHEAR, strict=True)):
+        terms[:, k, :size] = 0.5 * scale * (H[:, i, j] + H[:, j, i])
+        product = np.matmul(np.swapaxes(H[:, :, i], 1, 2), H[:, :, j])
+        product = 0.25 * scale * (product + np.swapaxes(product, 1, 2))
+        terms[:, k, size:] = product[:, later, earlier]
+    return terms
+
+
+def _all_fields(points: _Points, basis: Basis) -> np.ndarray:
+    gram = np.zeros((1, 1))
+    for chunk in points.chunks():
+        terms = _terms(points, basis, chunk)
+        flat = terms.reshape(-1, terms.shape[2])
+        gram = gram + points.stress(terms, chunk).reshape(flat.shape).T @ flat
+    # Terms of very different size: scaled first, so that none drowns in another's round-off.
+    scale = 1 / np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    return scale[:, None] * _leading(gram * scale * scale[:, None], None)
+
+
+def _projected(points: _Points, basis: Basis, sources: _Sources | None,
+               transform: np.ndarray, keeps_fields: bool,
+               ) -> tuple[StrainPolynomial, np.ndarray | None]:
+    count, regions = transform.shape[1], points.weights.shape[1]
+    coupling = np.zeros((count, 1))
+    own = np.zeros((count, count))
+    by_lambda = np.zeros((regions, count, count))
+    by_mu = np.zeros((regions, count, count))
+    kept = []
+    for chunk in points.chunks():
+        terms = _terms(points, basis, chunk)
+        strain = terms if sources is None else sources.strains(points, chunk)
+        fields = strain @ transform
+        if keeps_fields:
+            kept.append((fields / _SHEAR[:, None]).astype(np.float32))
+        flat = fields.reshape(-1, count)
+        stress = points.stress(fields, chunk).reshape(flat.shape)
+        coupling = coupling + stress.T @ terms.reshape(len(flat), -1)
+        own += stress.T @ flat
+        trace, volume = fields[:, :3].sum(axis=1), points.volume(chunk)
+        for k in range(regions):
+            part = points.per_point(points.weights[:, k], chunk) * volume
+            lam = part * points.per_point(points.ratio[0], chunk)
+            mu = part * points.per_point(points.ratio[1], chunk)
+            by_lambda[k] += trace.T @ (lam[:, None] * trace)
+            by_mu[k] += 2 * flat.T @ (np.repeat(mu, 6)[:, None] * flat)
+    inverse = _orthonormal(own)
+    coupling = inverse @ coupling
+    size = basis.size
+    polynomial = StrainPolynomial(
+        np.ascontiguousarray(coupling[:, :size]), np.ascontiguousarray(coupling[:, size:]),
+        inverse @ by_lambda @ inverse.T, inverse @ by_mu @ inverse.T, points.poisson)
+    if not keeps_fields:
+        return polynomial, None
+    fields = np.concatenate(kept) @ inverse.T.astype(np.float32)
+    return polynomial, fields.reshape(*points.model.weights.shape, 6, len(inverse))
+
+
+def _orthonormal(own: np.ndarray) -> np.ndarray:
+    """Return what makes fields of products ``own`` orthonormal, so that coefficients are what the
+    functionals measure, shape [m, fields]."""
+    scale = 1 / np.sqrt(np.diag(own))
+    values, vectors = np.linalg.eigh((own + own.T) / 2 * scale * scale[:, None])
+    keep = values > _ALIKE
+    return (vectors[:, keep] / np.sqrt(values[keep])).T * scale

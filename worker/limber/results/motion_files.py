@@ -1,0 +1,169 @@
+"""Motion on disk: PC2 caches for Blender, VTU series for ParaView."""
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from limber.core.errors import InputError
+from limber.core.files.atomic import write_atomically
+from limber.core.files.reading import read_json_as
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.model import BranchModel
+from limber.mechanics.strain import StrainState, strain_state
+
+_PC2_HEADER = struct.Struct("<12siiffi")
+
+
+def surface_nodes(mesh: TetMesh) -> np.ndarray:
+    """Return the nodes of the surface triangles, ascending: the vertex order of PC2 files."""
+    return np.unique(mesh.surface_faces())
+
+
+def write_pc2(path: Path, positions: np.ndarray, start: float = 0.0, rate: float = 1.0) -> None:
+    """Write positions over time as a PC2 point cache (Blender's Mesh Cache modifier).
+
+    Args:
+        positions: Vertices [m], shape [frames, n, 3].
+        start: First frame's number.
+        rate: Frames a sample.
+    """
+    positions = np.asarray(positions, np.float32)
+    shaped = positions.ndim == 3 and positions.shape[2] == 3 and len(positions) > 0
+    if not shaped or not np.isfinite(positions).all():
+        raise InputError(f"Frames of shape {positions.shape}, or not finite.",
+                         "A cache needs [frames, vertices, 3].", "Check the motion.")
+    header = _PC2_HEADER.pack(b"POINTCACHE2\0", 1, positions.shape[1], start, rate,
+                              positions.shape[0])
+    write_atomically(Path(path), header + positions.astype("<f4").tobytes())
+
+
+def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
+    """Return positions [frames, n, 3], start and rate of a PC2 file.
+
+    Raises:
+        InputError: it is not one, or it is cut short.
+    """
+    data = Path(path).read_bytes()
+    whole = len(data) >= _PC2_HEADER.size
+    header = data[:_PC2_HEADER.size] if whole else bytes(_PC2_HEADER.size)
+    name, _, count, start, rate, frames = _PC2_HEADER.unpack(header)
+    if name != b"POINTCACHE2\0" or len(data) - _PC2_HEADER.size != frames * count * 12:
+        raise InputError(f"{path} is not a whole PC2 file.", "It is damaged or of another kind.",
+                         "Write it again.")
+    body = np.frombuffer(data, "<f4", offset=_PC2_HEADER.size)
+    if not (frames > 0 and count > 0 and np.isfinite(body).all()
+            and np.isfinite([start, rate]).all()):
+        raise InputError(f"{path} has no frames, or places that are not finite.",
+                         "Nothing can move so.", "Write it again.")
+    return body.reshape(frames, count, 3), start, rate
+
+
+class FramesFile(BaseModel):
+    """Content of ``frames/NAME.json`` as far as it is read: lists with a number a frame."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    frame_count: int | None = Field(None, ge=1)
+    rate: float = Field(24.0, gt=0, le=1e6)
+    times_s: list[float] | None = None
+    energies_j: list[float] | None = None
+    kinetic_energies_j: list[float] | None = None
+    min_det_f: list[float] | None = None
+    largest_principal_strains: list[float] | None = None
+    grasp_forces_n: list[tuple[float, float, float]] | None = None
+
+    @model_validator(mode="after")
+    def _one_length(self) -> "FramesFile":
+        for name in ("times_s", "energies_j", "kinetic_energies_j", "min_det_f",
+                     "largest_principal_strains", "grasp_forces_n"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if self.frame_count is None:
+                self.frame_count = len(values)
+            if len(values) != self.frame_count:
+                raise ValueError(f"{name} has {len(values)} entries, not {self.frame_count}")
+        return self
+
+
+def read_frames_file(path: Path) -> FramesFile:
+    """Read what is said of the frames of a motion.
+
+    Raises:
+        InputError: it cannot be read, or its lists do not fit each other.
+    """
+    return read_json_as(path, FramesFile, "what is said of a motion's frames")
+
+
+def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np.ndarray]:
+    """Return what a surface can be coloured by in each frame, for ``frames/NAME.npz``.
+
+    Averages by volume of the tetrahedra about a vertex; for det F the least of them.
+
+    Args:
+        states: One a frame, from :func:`limber.mechanics.strain.strain_state`.
+
+    Returns:
+        ``strain_energy_density_j_m3``, ``principal_strain`` (the largest),
+        ``principal_stress_pa`` (the largest) and ``det_f``, each [frames, vertices], single
+        precision, vertices as in PC2 files.
+    """
+    nodes = surface_nodes(mesh)
+    average = node_average(mesh)[nodes]
+    least = [_least_at_nodes(mesh, state.det_f)[nodes] for state in states]
+    fields = {
+        "strain_energy_density_j_m3": [average @ state.energy_density for state in states],
+        "principal_strain": [average @ state.principal_strain[:, -1] for state in states],
+        "principal_stress_pa": [average @ state.principal_stress[:, -1] for state in states],
+        "det_f": least}
+    return {name: np.array(values, np.float32) for name, values in fields.items()}
+
+
+def node_average(mesh: TetMesh) -> sp.csr_matrix:
+    """Return the matrix that averages values of tetrahedra at each node by volume, [n, tets]."""
+    count, width = mesh.tets.shape
+    volume = np.repeat(np.abs(mesh.volumes), width)
+    matrix = sp.csr_matrix((volume, (mesh.tets.ravel(), np.repeat(np.arange(count), width))),
+                           (mesh.node_count, count))
+    total = np.asarray(matrix.sum(axis=1)).ravel()
+    return (sp.diags(1 / np.maximum(total, np.finfo(float).tiny)) @ matrix).tocsr()
+
+
+def _least_at_nodes(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
+    least = np.full(mesh.node_count, np.inf)
+    np.minimum.at(least, mesh.tets.ravel(), np.repeat(values, mesh.tets.shape[1]))
+    return least
+
+
+def write_pvd_series(folder: Path, name: str, model: BranchModel, times: np.ndarray,
+                     displacement: np.ndarray) -> list[Path]:
+    """Write ``name.pvd`` and one VTU a frame, with strain, stress and energy density.
+
+    Args:
+        folder: Where to write; it must exist.
+        displacement: [m], shape [frames, node_count, 3].
+
+    Returns:
+        The files written, the PVD last; ParaView opens that one.
+    """
+    folder, paths = Path(folder), []
+    for number, moved in enumerate(displacement):
+        state = strain_state(model, moved)
+        mesh = TetMesh(
+            model.mesh.nodes + moved, model.mesh.tets,
+            cell_data={"young": model.young, "energy_density": state.energy_density,
+                       "principal_strain": state.principal_strain,
+                       "principal_stress": state.principal_stress, "det_f": state.det_f},
+            point_data={"displacement": moved})
+        paths.append(folder / f"{name}-{number:04d}.vtu")
+        mesh.write(paths[-1])
+    sets = "\n".join(f'    <DataSet timestep="{time:.9g}" file="{path.name}"/>'
+                     for time, path in zip(times, paths, strict=True))
+    pvd = folder / f"{name}.pvd"
+    write_atomically(pvd, '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n'
+                     f"  <Collection>\n{sets}\n  </Collection>\n</VTKFile>\n")
+    return [*paths, pvd]

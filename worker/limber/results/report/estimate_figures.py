@@ -1,0 +1,227 @@
+"""Pictures of an estimate: E along the branch, loss against evaluations, simulated on observed."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from limber.estimation.uncertainty.covariance import OUTLIER
+from limber.estimation.uncertainty.identifiability import UNRESOLVED_DEVIATION
+
+OBSERVED, SIMULATED, TRUE = "#222222", "#2a6fb0", "#c0602a"
+
+
+def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
+    """Yield each figure (matplotlib) of ``estimate.json`` with its caption.
+
+    Args:
+        estimate: Content of a branch's ``estimate.json``.
+    """
+    yield (young_along_branch(estimate), _interval_caption(estimate))
+    yield (what_the_pulls_tell(estimate),
+           "How well the pulls tell each parameter: standard deviation before the fit (at its "
+           f"start) and after it. Over {UNRESOLVED_DEVIATION:g} (line) a modulus is linked to its "
+           "neighbour.")
+    yield (loss_over_evaluations(estimate),
+           "Loss against forward simulations; the line is the best so far.")
+    for pull in estimate["pulls"]:
+        if np.size(pull["observed_m"]):
+            yield (simulated_over_observed(pull, estimate),
+                   f"Pull {pull['name']}: simulated (blue) over observed (black) at several "
+                   "frames; bars are residuals, ten times enlarged.")
+        if np.size(pull.get("point_residual", ())):
+            yield (residuals_over_time(pull),
+                   f"Pull {pull['name']}: residuals of each point and of the force over their "
+                   f"deviation; about 1 is noise, crosses from {OUTLIER} are outliers.")
+        if pull["measured_force_n"] and _numbers(pull["measured_force_n"]).size:
+            yield (force_over_time(pull),
+                   f"Pull {pull['name']}: force of the gripper on the branch.")
+    if estimate.get("held_out"):
+        yield (held_out_scores(estimate),
+               "Pulls foretold by a fit that did not see them: error over the pull's own travel "
+               "and peak force.")
+
+
+def young_along_branch(estimate: dict[str, Any]) -> Any:
+    """E at the control points with intervals, and the truth where there is one."""
+    figure, axes = _figure(5.2, 3.2)
+    place = np.array(estimate["fractions"])
+    young = np.array(estimate["young_pa"]) / 1e6
+    interval = np.array(estimate["young_interval_pa"]) / 1e6
+    sensor = np.array(estimate.get("young_interval_sensor_pa", estimate["young_interval_pa"]))
+    if len(place) == 1:
+        # One modulus for the whole branch.
+        place, young = np.array([0.0, 1.0]), np.repeat(young, 2)
+        interval, sensor = np.repeat(interval, 2, axis=0), np.repeat(sensor, 2, axis=0)
+    axes.fill_between(place, *interval.T, color=SIMULATED, alpha=0.18, lw=0,
+                      label="95 %, radii and mesh included")
+    axes.errorbar(place, young, np.abs(sensor.T / 1e6 - young), fmt="o-", color=SIMULATED,
+                  capsize=4, label="estimated, 95 % by the sensors alone")
+    truth = estimate.get("truth")
+    if truth:
+        axes.plot(truth["fractions"], np.array(truth["young_pa"]) / 1e6, "D", ms=7, mfc="none",
+                  color=TRUE, label="assumed" if truth.get("assumed") else "true")
+    if young.max() > 5 * young.min() or interval[:, 1].max() > 20 * young.max():
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(bottom=0)
+    axes.set_xlabel("place on the main path (0 base, 1 tip)")
+    axes.set_ylabel("Young's modulus [MPa]")
+    axes.set_xlim(0, 1)
+    axes.legend(frameon=False)
+    return figure
+
+
+def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
+    """Standard deviations of the parameters before and after the fit."""
+    figure, axes = _figure(5.2, 3.0)
+    before = np.array(estimate["deviations_before_fit"], float)
+    after = np.sqrt(np.abs(np.diag(np.array(estimate["covariance"], float))))
+    groups = [*estimate["groups"]]
+    extra = estimate["parameters"][len(set(groups)):]
+    names = [f"E{k + 1}" for k in range(len(groups))] + list(extra)
+    after = np.concatenate([after[groups], after[len(set(groups)):]])
+    place = np.arange(len(names))
+    least = 1e-4
+    axes.bar(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color="#bbbbbb",
+             label="before the fit")
+    axes.bar(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after it")
+    axes.axhline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
+    axes.set_yscale("log")
+    axes.set_xticks(place, names)
+    axes.set_ylabel("standard deviation of log E")
+    axes.legend(frameon=False)
+    return figure
+
+
+def residuals_over_time(pull: dict[str, Any]) -> Any:
+    """Standardised residual of every point and of the force at every frame."""
+    figure, axes = _figure(5.2, 3.0)
+    points = _numbers(pull["point_residual"])
+    time = np.array(pull["all_times_s"])
+    force = _numbers(pull["force_residual"])
+    shades = ["#16324f", "#2a6fb0", "#6aa5d8", "#a9cdea"]
+    columns = [(f"point {k + 1}", points[:, k], shades[k % 4]) for k in range(points.shape[1])]
+    if np.isfinite(force).any():
+        columns.append(("force", force, "#2e8b57"))
+    for label, values, colour in columns[:9]:
+        axes.plot(time, values, ".-", ms=3, lw=0.7, color=colour, label=label)
+        far = np.where(np.isfinite(values), values, 0.0) > OUTLIER
+        axes.plot(time[far], values[far], "x", color=TRUE, ms=7)
+    axes.axhline(OUTLIER, color=TRUE, lw=0.8)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("residual / its deviation")
+    figure.legend(frameon=False, ncol=5, fontsize=8, loc="outside upper left")
+    return figure
+
+
+def held_out_scores(estimate: dict[str, Any]) -> Any:
+    """Errors of foretold pulls in percent, points and force."""
+    scores = estimate["held_out"]
+    figure, axes = _figure(5.2, 1.2 + 0.45 * len(scores))
+    place = np.arange(len(scores))
+    for shift, key, colour, label in ((0.2, "relative_distance", SIMULATED, "points, of travel"),
+                                      (-0.2, "relative_force", "#2e8b57", "force, of its peak")):
+        values = 100 * np.array([_number(score.get(key)) for score in scores.values()])
+        axes.barh(place + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
+    axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
+                            for name, score in scores.items()])
+    axes.set_xlabel("error of the foretold pull [%]")
+    figure.legend(frameon=False, ncol=2, fontsize=8, loc="outside upper right")
+    return figure
+
+
+def loss_over_evaluations(estimate: dict[str, Any]) -> Any:
+    """The paper's loss J [m^2] of every forward simulation."""
+    figure, axes = _figure(5.2, 3.2)
+    loss = np.array([np.nan if entry["loss_m2"] is None else entry["loss_m2"]
+                     for entry in estimate["history"]], float)
+    count = np.arange(1, len(loss) + 1)
+    axes.semilogy(count, loss, ".", color="#999999")
+    axes.semilogy(count, np.fmin.accumulate(loss), color=SIMULATED,
+                  label=estimate["method"])
+    axes.set_xlabel("forward simulations")
+    axes.set_ylabel("loss J [m²]")
+    axes.legend(frameon=False)
+    return figure
+
+
+def simulated_over_observed(pull: dict[str, Any], estimate: dict[str, Any]) -> Any:
+    """Observed and simulated points at several frames, in the plane in which they move most."""
+    figure, axes = _figure(5.2, 4.2)
+    observed, simulated = _numbers(pull["observed_m"]), _numbers(pull["simulated_m"])
+    rest = np.array(estimate["control_points_m"])
+    centre = rest.mean(axis=0)
+    up = np.linalg.svd(rest - centre)[2][0]
+    up = up * np.sign(up[2] or 1.0)
+    motion = (simulated - simulated[0]).reshape(-1, 3)
+    sideways = motion - np.outer(motion @ up, up)
+    across = np.linalg.svd(sideways, full_matrices=False)[2][0]
+    plane = np.column_stack([across, up])
+    for number in range(len(observed)):
+        shade = 0.3 + 0.7 * (number + 1) / len(observed)
+        seen, model = (observed[number] - centre) @ plane, (simulated[number] - centre) @ plane
+        label = {"label": "simulated"} if number == len(observed) - 1 else {}
+        axes.plot(*model.T, "-", color=SIMULATED, alpha=shade, lw=2, **label)
+        label = {"label": "observed"} if label else {}
+        axes.plot(*seen.T, "o", color=OBSERVED, alpha=shade, ms=4, **label)
+        for start, end in zip(model, model + 10 * (seen - model), strict=True):
+            axes.plot([start[0], end[0]], [start[1], end[1]], color=TRUE, alpha=shade, lw=0.8)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("sideways [m]")
+    axes.set_ylabel("along the branch at rest [m]")
+    axes.legend(frameon=False, loc="lower left")
+    return figure
+
+
+def force_over_time(pull: dict[str, Any]) -> Any:
+    """Measured and simulated force of the gripper on the branch."""
+    figure, axes = _figure(5.2, 3.0)
+    measured, simulated = _numbers(pull["measured_force_n"]), _numbers(pull["simulated_force_n"])
+    time = np.array(pull["all_times_s"])
+    for axis, colour in zip(range(3), ("#b03a2e", "#2e8b57", "#2a6fb0"), strict=True):
+        axes.plot(time, measured[:, axis], ".", ms=4, color=colour, alpha=0.6)
+        axes.plot(time, simulated[:, axis], color=colour, label="xyz"[axis])
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("force [N], dots measured")
+    axes.legend(frameon=False, ncol=3)
+    return figure
+
+
+
+def _interval_caption(estimate: dict[str, Any]) -> str:
+    parts = estimate.get("young_deviation") or {}
+    told = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
+            (("sensor", "sensors"), ("geometry", "shape from the scan"), ("mesh", "mesh"))
+            if parts.get(key) is not None]
+    missing = ""
+    if parts and parts.get("geometry") is None:
+        missing = (" The radii came without a deviation: what they are off by is not in the "
+                   "interval.")
+    elif parts.get("axis_is_exact", True) and parts:
+        missing = " Where the scan's axis runs is taken as exact."
+    return ("Young's modulus along the branch with its 95 % interval"
+            + (f"; largest standard deviation by {', '.join(told)}" if told else "")
+            + "." + missing)
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _numbers(values: Any) -> np.ndarray:
+    """JSON's null, which stands for a number that was not measured, as NaN."""
+    return np.array(values, dtype=float)
+
+
+def _figure(width: float, height: float) -> tuple[Any, Any]:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes

@@ -1,0 +1,80 @@
+"""What a robot did with a plan: the force that was felt beside the predicted one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.recordings.time_series import read_stream
+from limber.results.report.estimate_figures import OBSERVED, SIMULATED
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MOST_POINTS = 1500
+_GAP_SECONDS = 0.5
+_NAMES = [*(f"{kind}_f{axis}_n" for kind in ("smooth", "expected") for axis in "xyz"),
+          *(f"expected_{entry}_n2" for entry in ("xx", "yy", "zz"))]
+
+
+def execution_rows(result: Mapping[str, Any]) -> list[list[str]]:
+    """Return the rows of an execution's result, as its stage tells it."""
+    ended = ("its end, and came back" if result.get("reached")
+             else f"a stop: {result.get('stop_reason')}")
+    rows = [["what", "value"], ["came to", ended]]
+    for key, label, scale, form in [
+            ("predicted_peak_force_n", "peak force, predicted [N]", 1, "{:.2f}"),
+            ("peak_force_n", "peak force, felt [N]", 1, "{:.2f}"),
+            ("force_within_share", "force within 5 % of the peak or the interval [% of the way]",
+             100, "{:.1f}"),
+            ("force_error_of_peak", "difference, 95 % of the way below [% of the peak]", 100,
+             "{:.1f}"),
+            ("path_error_m", "distance from the path, worst [mm]", 1000, "{:.2f}")]:
+        value = result.get(key)
+        if value is not None and np.isfinite(value):
+            rows.append([label, form.format(scale * value)])
+    return rows
+
+
+def force_along_the_way(path: Path) -> "Figure":
+    """Draw the felt force (smoothed) beside the predicted one and its 95 % interval.
+
+    Raises:
+        InputError: the log is damaged, or holds no moment for which a force was predicted.
+    """
+    from matplotlib.figure import Figure
+
+    log = read_stream(path)
+    missing = [name for name in _NAMES if name not in log.columns]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}.", "It is no log of an execution.",
+                         "Execute the plan again.")
+    table = log.values[:, [log.columns.index(name) for name in _NAMES]]
+    known = np.isfinite(table).all(axis=1)
+    if not known.any():
+        raise InputError(f"{path} has no predicted force.", "The branch was not led.",
+                         "Execute the plan again.")
+    known = np.flatnonzero(known)
+    known = known[::max(1, len(known) // _MOST_POINTS)]
+    times, table = log.times[known] - log.times[known[0]], table[known]
+    # Nothing is drawn across a time in which nothing was expected.
+    after = np.flatnonzero(np.diff(times) > _GAP_SECONDS) + 1
+    times, table = np.insert(times, after, np.nan), np.insert(table, after, np.nan, axis=0)
+    felt, expected, variances = table[:, :3], table[:, 3:6], table[:, 6:]
+    figure = Figure(figsize=(9.0, 5.2), layout="constrained")
+    for axes, column, name in zip(figure.subplots(3, 1, sharex=True), range(3), "xyz",
+                                  strict=True):
+        half = 1.96 * np.sqrt(np.maximum(variances[:, column], 0.0))
+        axes.fill_between(times, expected[:, column] - half, expected[:, column] + half,
+                          color=SIMULATED, alpha=0.2, lw=0)
+        axes.plot(times, expected[:, column], color=SIMULATED, label="predicted, 95 % of it")
+        axes.plot(times, felt[:, column], ".", ms=2, color=OBSERVED, label="felt")
+        axes.set_ylabel(f"force {name} [N]")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25)
+        if name == "x":
+            axes.legend(frameon=False, ncols=2)
+    axes.set_xlabel("time since the robot set out [s]")
+    return figure

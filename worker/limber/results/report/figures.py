@@ -1,0 +1,233 @@
+"""The report's own figures: scan and skeleton, radii, mesh, pull and energy samples."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.store import Branch
+from limber.store.loading import load_skeleton
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ORDER_COLOURS = ("#1f6f43", "#c7632a", "#3a63a8", "#8c4f9f", "#5d6a63")
+_CLOUD = "#a9b3ad"
+# More points than this only darken a picture, and slow it.
+_SHOWN_POINTS = 30_000
+
+
+def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Cloud, centreline tree, control points and targets, from the front and from the side."""
+    skeleton = load_skeleton(branch)
+    points = _cloud_points(branch)
+    mesh = TetMesh.read(branch.path("mesh.vtu")) if branch.has("mesh.vtu") else None
+    figure, axes = _two_views(points)
+    for axis, (first, label) in zip(axes, ((0, "x"), (1, "y")), strict=True):
+        axis.scatter(points[:, first], points[:, 2], s=1.0, color=_CLOUD, linewidths=0)
+        _draw_tree(axis, skeleton, first)
+        if mesh is not None and "control_point" in mesh.point_data:
+            nodes = mesh.nodes[mesh.point_data["control_point"] >= 0]
+            axis.scatter(nodes[:, first], nodes[:, 2], s=60, facecolors="none",
+                         edgecolors="#b0126b", linewidths=1.4, zorder=5)
+        for target in targets:
+            place = target["position_m"]
+            axis.plot(place[first], place[2], marker="*", markersize=13, color="#e0a100",
+                      markeredgecolor="#5c4300", zorder=6)
+            axis.annotate(target["name"], (place[first], place[2]), (7, 5), fontsize=9,
+                          textcoords="offset points", zorder=6)
+        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
+        axis.grid(alpha=0.25)
+    return figure
+
+
+def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Diameter along the main path with its interval, and what calipers found."""
+    import matplotlib.pyplot as plt
+
+    from limber.geometry.skeleton.qsm_tables import diameters as along_path
+
+    figure, axis = plt.subplots(figsize=(9, 3.2))
+    path = skeleton.main_path()
+    along = skeleton.arc_length[path]
+    thick, sigma = 1e3 * along_path(skeleton, along).T
+    colour = _order_colour(0)
+    axis.plot(along, thick, color=colour, linewidth=1.4, label="scan")
+    axis.fill_between(along, thick - 2 * sigma, thick + 2 * sigma, color=colour, alpha=0.15,
+                      linewidth=0)
+    if compared:
+        axis.plot([row["along_m"] for row in compared],
+                  [1e3 * row["measured_m"] for row in compared], "o", color="#b0126b",
+                  markersize=6, label="calipers")
+        axis.legend(frameon=False)
+    axis.set(xlabel="distance from the root along the main path [m]", ylabel="diameter [mm]")
+    axis.set_ylim(bottom=0)
+    axis.grid(alpha=0.25)
+    return figure
+
+
+def radii(branch: Branch) -> "Figure":
+    """Radius and its uncertainty over the distance from the root, one colour an order."""
+    import matplotlib.pyplot as plt
+
+    skeleton = load_skeleton(branch)
+    figure, axis = plt.subplots(figsize=(9, 3.6))
+    distance = skeleton.arc_length
+    for run in skeleton.runs():
+        own = run if skeleton.branch[run[0]] == skeleton.branch[run[-1]] else run[1:]
+        colour = _order_colour(int(skeleton.order[own[-1]]))
+        axis.plot(distance[own], 1e3 * skeleton.radius[own], color=colour, linewidth=1.2)
+        sigma = skeleton.radius_sigma[own]
+        if sigma.any():
+            axis.fill_between(distance[own], 1e3 * (skeleton.radius[own] - 2 * sigma),
+                              1e3 * (skeleton.radius[own] + 2 * sigma), color=colour, alpha=0.15,
+                              linewidth=0)
+    axis.set(xlabel="distance from the root along the tree [m]", ylabel="radius [mm]")
+    axis.set_ylim(bottom=0)
+    axis.grid(alpha=0.25)
+    return figure
+
+
+def mesh_by_modulus(branch: Branch) -> "Figure":
+    """The mesh's surface, shaded, coloured by Young's modulus; base black, grasp patch red."""
+    import matplotlib.pyplot as plt
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import LogNorm, Normalize
+
+    mesh = TetMesh.read(branch.path("mesh.vtu"))
+    faces, young = _coloured_faces(mesh)
+    spread = young.max() / young.min()
+    low, high = (young.min(), young.max()) if spread > 1.001 else (0.0, 1.5 * young.max())
+    norm = (LogNorm if spread > 10 else Normalize)(low / 1e6, high / 1e6)
+    figure, axes = _two_views(mesh.nodes)
+    for axis, first, depth, label in ((axes[0], 0, 1, "x"), (axes[1], 1, 0, "y")):
+        corners = mesh.nodes[faces]
+        back_to_front = np.argsort(corners[:, :, depth].mean(axis=1) * (1 if first else -1))
+        colours = plt.get_cmap("viridis")(norm(young / 1e6))
+        colours[:, :3] *= _shade(corners, depth)[:, None]
+        axis.add_collection(PolyCollection(
+            corners[back_to_front][:, :, [first, 2]], facecolors=colours[back_to_front],
+            edgecolors="face", linewidths=0.1))
+        for name, colour in (("fixed", "black"), ("grasp", "#d1242f")):
+            marked = mesh.nodes[np.asarray(mesh.point_data.get(name, [])).nonzero()[0]]
+            axis.scatter(marked[:, first], marked[:, 2], s=3, color=colour, zorder=4)
+        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
+        axis.autoscale_view()
+        axis.grid(alpha=0.25)
+    if spread > 1.001:
+        scale = plt.cm.ScalarMappable(norm, "viridis")
+        figure.colorbar(scale, ax=axes, label="Young's modulus [MPa]", shrink=0.7)
+    else:
+        figure.suptitle(f"Young's modulus {young.mean() / 1e6:.4g} MPa everywhere", fontsize=10)
+    return figure
+
+
+def pull(recording: Any) -> "Figure":
+    """Force on the branch and displacement of the grasp over time."""
+    import matplotlib.pyplot as plt
+
+    time = recording.times
+    figure, (upper, lower) = plt.subplots(2, 1, figsize=(9, 5), sharex=True)
+    moved = recording.poses[:, :3] - recording.poses[0, :3]
+    for column, (name, colour) in enumerate(zip("xyz", ORDER_COLOURS, strict=False)):
+        upper.plot(time, recording.wrenches[:, column], ".-", color=colour, label=name)
+        lower.plot(time, 1e3 * moved[:, column], ".-", color=colour, label=name)
+    upper.set(ylabel="force on the branch [N]")
+    lower.set(ylabel="grasp moved by [mm]", xlabel="time [s]")
+    for axis in (upper, lower):
+        axis.grid(alpha=0.25)
+    upper.legend(ncols=3, frameon=False)
+    return figure
+
+
+def motion(frames: Mapping[str, Any]) -> "Figure":
+    """Energies and grasp force of a simulated motion over time."""
+    import matplotlib.pyplot as plt
+
+    time = frames["times_s"]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6))
+    left.plot(time, 1e3 * np.array(frames["energies_j"]), color=ORDER_COLOURS[0], label="strain")
+    kinetic = 1e3 * np.array(frames["kinetic_energies_j"])
+    if kinetic.any():
+        left.plot(time, kinetic, color=ORDER_COLOURS[1], label="kinetic")
+    left.set(xlabel="time [s]", ylabel="energy [mJ]")
+    left.legend(frameon=False)
+    force = np.array(frames["grasp_forces_n"])
+    for name, column, colour in zip("xyz", force.T, ORDER_COLOURS, strict=False):
+        right.plot(time, column, color=colour, label=name)
+    right.set(xlabel="time [s]", ylabel="force on the grasp [N]")
+    right.legend(ncols=3, frameon=False)
+    for axis in (left, right):
+        axis.grid(alpha=0.25)
+    return figure
+
+
+def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
+    """Energy and force of the sampled grasp poses over their distance from rest."""
+    import matplotlib.pyplot as plt
+
+    rest = data["rest_pose"][:3] if "rest_pose" in data else data["poses"][:, :3].mean(axis=0)
+    distance = 1e3 * np.linalg.norm(data["poses"][:, :3] - rest, axis=1)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8))
+    left.scatter(distance, 1e3 * data["energies_j"], s=9, color=ORDER_COLOURS[0])
+    left.set(xlabel="grasp moved by [mm]", ylabel="strain energy [mJ]")
+    force = np.linalg.norm(data["forces_n"], axis=1)
+    right.scatter(distance, force, s=9, color=ORDER_COLOURS[1])
+    right.set(xlabel="grasp moved by [mm]", ylabel="force [N]")
+    for axis in (left, right):
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.25)
+    return figure
+
+
+def _two_views(points: np.ndarray) -> tuple["Figure", np.ndarray]:
+    """Return a figure of two axes, as wide as a front and a side view of ``points`` need."""
+    import matplotlib.pyplot as plt
+
+    extent = np.ptp(points, axis=0)
+    height = 7.0
+    widths = np.clip(height * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
+    return plt.subplots(1, 2, figsize=(widths.sum() + 2.5, height), layout="constrained",
+                        width_ratios=widths)
+
+
+def _draw_tree(axis: Any, skeleton: Skeleton, first: int) -> None:
+    from matplotlib.collections import LineCollection
+
+    child = np.flatnonzero(skeleton.parent >= 0)
+    ends = np.stack([skeleton.nodes[skeleton.parent[child]], skeleton.nodes[child]], axis=1)
+    colours = [_order_colour(int(order)) for order in skeleton.order[child]]
+    axis.add_collection(LineCollection(ends[:, :, [first, 2]], colors=colours, linewidths=1.3,
+                                       zorder=3))
+
+
+def _order_colour(order: int) -> str:
+    return ORDER_COLOURS[min(order, len(ORDER_COLOURS) - 1)]
+
+
+def _cloud_points(branch: Branch) -> np.ndarray:
+    from limber.geometry.io.clouds import read_cloud
+
+    points = read_cloud(branch.path("cloud.ply")).points
+    return points[:: max(1, len(points) // _SHOWN_POINTS)]
+
+
+def _coloured_faces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Boundary faces and the modulus of the tetrahedra behind them: nodal means suffice here."""
+    faces = mesh.surface_faces()
+    corners = mesh.tets[:, :4]
+    total = np.zeros(mesh.node_count)
+    count = np.zeros(mesh.node_count)
+    np.add.at(total, corners, mesh.cell_data["young"][:, None])
+    np.add.at(count, corners, 1.0)
+    nodal = total / np.maximum(count, 1.0)
+    return faces, nodal[faces].mean(axis=1)
+
+
+def _shade(corners: np.ndarray, depth: int) -> np.ndarray:
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    facing = np.abs(normal[:, depth]) / np.where(length > 0, length, 1.0)
+    return 0.45 + 0.55 * facing

@@ -1,0 +1,148 @@
+"""What the report says of wind, snow, fruit and cuts that a branch was put under."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.core.files.reading import read_arrays, read_json_as, require_shapes
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.results.motion_files import read_pc2
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_Interval = tuple[float, float]
+_Way = tuple[float, float, float]
+
+
+class Gusts(BaseModel):
+    """Of ``loads/NAME.json``: how far gusts go beyond the mean."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    factor: float
+    peak_factor: float
+    dynamic: float
+    damping: float
+    mean_speed_m_s: float
+    mean_tip_displacement_m: _Way
+
+
+class LoadFile(BaseModel):
+    """Content of ``loads/NAME.json`` as far as it is shown."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    tip_displacement_m: _Way
+    sag_m: float
+    sag_interval_m: _Interval | None = None
+    greatest_strain: float
+    greatest_strain_interval: _Interval | None = None
+    strain_over_limit: float
+    frequencies_hz: list[float] = Field(min_length=1)
+    frequencies_before_hz: list[float] = Field(min_length=1)
+    first_frequency_interval_hz: _Interval | None = None
+    wind_force_n: _Way
+    added_mass_kg: float
+    cut_mass_kg: float
+    bears_times: float | None = None
+    bears_times_interval: _Interval | None = None
+    held_by: str | None = None
+    gusts: Gusts | None = None
+
+
+def read_load(path: Path) -> LoadFile:
+    """Read what ``limber load --name`` kept.
+
+    Raises:
+        InputError: it cannot be read, or says something else.
+    """
+    return read_json_as(path, LoadFile, "the result of a load")
+
+
+def load_rows(load: LoadFile) -> list[list[str]]:
+    """Return what the loads do to the branch, each with its interval where one is known."""
+    tip = 1e3 * float(np.linalg.norm(load.tip_displacement_m))
+    rows = [["what", "value", "95 % interval"],
+            ["force of the wind [N]", f"{np.linalg.norm(load.wind_force_n):.3g}", ""],
+            ["added mass [kg]", f"{load.added_mass_kg:.4g}", ""],
+            ["mass cut off [kg]", f"{load.cut_mass_kg:.4g}", ""],
+            ["the tip moves by [mm]", f"{tip:.1f}", ""],
+            ["of that down [mm]", f"{1e3 * load.sag_m:.1f}",
+             _between(load.sag_interval_m, 1e3, 1)],
+            ["greatest strain", f"{load.greatest_strain:.5f}",
+             _between(load.greatest_strain_interval, 1.0, 5)],
+            ["of what the wood bears", f"{100 * load.strain_over_limit:.0f} %", ""],
+            ["first frequency [Hz]", f"{load.frequencies_hz[0]:.3f}",
+             _between(load.first_frequency_interval_hz, 1.0, 3)],
+            ["first frequency before [Hz]", f"{load.frequencies_before_hz[0]:.3f}", ""]]
+    if load.bears_times is not None:
+        ended = {"strain": "until the wood fails", "equilibrium": "until it finds no rest"}.get(
+            load.held_by or "", "more was not tried")
+        rows.append([f"bears these loads so many times ({ended})", f"{load.bears_times:.2f}",
+                     _between(load.bears_times_interval, 1.0, 2)])
+    if load.gusts is not None:
+        mean = 1e3 * float(np.linalg.norm(load.gusts.mean_tip_displacement_m))
+        rows += [["mean wind [m/s]", f"{load.gusts.mean_speed_m_s:.2f}", ""],
+                 ["the tip moves in the mean wind by [mm]", f"{mean:.1f}", ""],
+                 ["peak of the gusts over the mean load", f"{load.gusts.factor:.2f}", ""],
+                 ["swaying over that of a branch that follows at once",
+                  f"{load.gusts.dynamic:.2f}", ""],
+                 ["damping of the first mode, with the air's", f"{100 * load.gusts.damping:.1f} %",
+                  ""]]
+    return [row for row in rows if row[1] not in ("0", "0.0")]
+
+
+def _between(interval: _Interval | None, factor: float, digits: int) -> str:
+    if interval is None:
+        return "not known"
+    return " to ".join(f"{factor * value:.{digits}f}" for value in interval)
+
+
+def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
+    """Draw the branch as scanned (grey) and under the loads, coloured by its greatest strain.
+
+    Args:
+        mesh: The branch's.
+        frames: ``frames/load-NAME.pc2``, beside it ``.npz``.
+
+    Raises:
+        InputError: the frames are damaged or of another mesh.
+    """
+    import matplotlib.pyplot as plt
+    from matplotlib.collections import PolyCollection
+
+    nodes, corners = np.unique(mesh.surface_faces(), return_inverse=True)
+    corners = corners.reshape(-1, 3)
+    positions, _, _ = read_pc2(frames)
+    values = read_arrays(frames.with_suffix(".npz"), "fields of a motion")
+    arrays = {**values, "positions": positions}
+    require_shapes(frames, arrays, {"positions": (2, len(nodes), 3),
+                                    "principal_strain": (2, len(nodes))}, "a load's frames")
+    strain = 100 * arrays["principal_strain"][1][corners].mean(axis=1)
+    shades = plt.get_cmap("inferno")
+    largest = max(float(strain.max()), 1e-9)
+    norm = plt.Normalize(0.0, largest)
+    both = positions.reshape(-1, 3)
+    extent = np.ptp(both, axis=0)
+    widths = np.clip(7.0 * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
+    figure, axes = plt.subplots(1, 2, figsize=(widths.sum() + 2.5, 7.0), layout="constrained",
+                                width_ratios=widths)
+    for axis, first, depth, label in ((axes[0], 0, 1, "x"), (axes[1], 1, 0, "y")):
+        for state, is_loaded in ((positions[0], False), (positions[1], True)):
+            faces = state[corners]
+            order = np.argsort(faces[:, :, depth].mean(axis=1) * (1 if first else -1))
+            colours = shades(0.9 * norm(strain)) if is_loaded else np.tile(
+                (0.8, 0.8, 0.8, 1.0), (len(faces), 1))
+            axis.add_collection(PolyCollection(
+                faces[order][:, :, [first, 2]], facecolors=colours[order], edgecolors="face",
+                linewidths=0.1))
+        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
+        axis.autoscale_view()
+        axis.grid(alpha=0.25)
+    scale = plt.cm.ScalarMappable(plt.Normalize(0.0, largest / 0.9), shades)
+    bar = figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.7)
+    bar.ax.set_ylim(0.0, largest)
+    return figure

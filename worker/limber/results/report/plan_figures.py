@@ -1,0 +1,269 @@
+"""Figures of a plan: energy along both paths, and both paths over a slice of the energy field."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from limber.core.constants import PATH_COLOURS
+from limber.planning.cost import arc_lengths
+from limber.planning.field.energy_field import EnergyField
+from limber.planning.plan_file import PlanFile, Way, read_plan
+from limber.planning.search_files import CostToGo, read_trees
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LABELS = {"baseline": "shortest (length alone)", "plan": "gentle (deformation-aware)"}
+_STILL = 1e-9  # [m] a path that is no longer has no length
+_GRID = 160  # points of the slice along its longer side
+
+
+def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
+    """Return the figures of plan ``name`` with their captions; none of one that stays in place."""
+    plan = read_plan(branch.path(f"plans/{name}.json"))
+    if plan.summary["plan"]["length_m"] <= _STILL:
+        return []
+    field = EnergyField.read(branch.path("energy.npz"))
+    shown = [
+        (along_paths(plan), "Energy above the hanging state (strain and weight), gripper force and "
+                            "largest strain along both paths, on the full model; the energy of the "
+                            "field that the planner saw is dashed."),
+        (paths_over_slice(field, plan, _tree_of(branch, name)),
+         "Both paths over the energy field, in the plane that fits them best; white where the "
+         "branch was not sampled. The cross is the rest pose; grey, as seen onto that plane, what "
+         "D-RRT* searched."),
+        (convergence(plan), "Cost of the best path so far over the planner's iterations, relative "
+                            "to the last."),
+    ]
+    if plan.summary.get("certificate"):
+        if branch.has(f"plans/{name}-bound.npz"):
+            bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
+            shown.append((paths_over_bound(field, bound, plan), "Both paths over the bound, in the "
+                          "same plane: what any path from there to the goal costs at least. The "
+                          "gentlest path runs down it as steeply as it falls."))
+        shown.append((certificate(plan), "What the gentle path costs, and what no path on the "
+                      "energy field costs less than, as the grid of the proof is refined."))
+    if plan.summary.get("detour"):
+        shown.append((trade_off(plan), "Energy against length of the gentlest paths for several "
+                      "weights of distance; no path lies below the dashed line."))
+    return shown
+
+
+def along_paths(plan: PlanFile) -> "Figure":
+    """Draw energy, force and strain over the length of both paths."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for key, path in _ways(plan).items():
+        along = 1e3 * arc_lengths(path.poses[:, :3])
+        style = {"color": PATH_COLOURS[key], "label": _LABELS[key]}
+        axes[0].plot(along, 1e3 * path.energies, **style)
+        if path.field_energies is not None:
+            axes[0].plot(along, 1e3 * path.field_energies, "--", lw=1, color=PATH_COLOURS[key])
+        axes[1].plot(along, path.force_sizes, **style)
+        axes[2].plot(along, 100 * path.strains, **style)
+    for axis, label in zip(axes, ("energy above rest [mJ]", "gripper force [N]",
+                                  "largest strain [%]"), strict=True):
+        axis.set(xlabel="along the path [mm]", ylabel=label)
+        axis.grid(alpha=0.25)
+    axes[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def paths_over_slice(field: EnergyField, plan: PlanFile,
+                     tree: tuple[np.ndarray, np.ndarray] | None = None) -> "Figure":
+    """Draw both paths, and a search tree, over the energy field in the paths' common plane."""
+    from matplotlib.collections import LineCollection
+
+    view = _View.of(field, plan)
+    energy = field.energy(view.points)
+    energy[~field.region.contains(view.points)] = np.nan
+    figure, axis = view.figure()
+    # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
+    top = max(1.5 * max(way.energies.max() for way in _ways(plan).values()), 1e-9)
+    view.fill(figure, axis, 1e3 * energy, 1e3 * top, "energy above rest [mJ]", "viridis")
+    if tree is not None:
+        nodes, parents = 1e3 * view.flat(tree[0]), tree[1]
+        axis.add_collection(LineCollection(
+            np.stack([nodes[1:], nodes[parents[1:]]], axis=1), colors="#dddddd", linewidths=0.4,
+            alpha=0.7), autolim=False)
+    view.draw_paths(axis)
+    return figure
+
+
+def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Figure":
+    """Draw both paths over the least cost of any path to the goal, in the paths' common plane."""
+    view = _View.of(field, plan)
+    cost = bound.at(view.points)
+    cost[~field.region.contains(view.points)] = np.nan
+    figure, axis = view.figure()
+    known = cost[np.isfinite(cost)]
+    top = float(known.max()) if len(known) else 1.0
+    view.fill(figure, axis, cost, top, "cost to the goal at least", "cividis", lines=True)
+    view.draw_paths(axis)
+    return figure
+
+
+@dataclass(frozen=True)
+class _View:
+    """The plane that fits both paths best, a grid of points in it, and the paths on it [m]."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    paths: dict[str, np.ndarray]
+    rest: np.ndarray
+
+    @classmethod
+    def of(cls, field: EnergyField, plan: PlanFile) -> "_View":
+        paths = {key: way.poses[:, :3] for key, way in _ways(plan).items()}
+        origin, across, up = _plane(np.concatenate(list(paths.values())))
+        axes = np.stack([across, up])
+        flat = {key: (path - origin) @ axes.T for key, path in paths.items()}
+        rest = (field.rest - origin) @ axes.T
+        shown = np.concatenate([*flat.values(), rest[None]])
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        margin = 0.25 * (high - low).max()
+        x, y = (np.linspace(low[k] - margin, high[k] + margin, _GRID) for k in range(2))
+        return cls(origin, axes, x, y, flat, rest)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Of the grid [m], shape [n, 3]."""
+        across, up = self.axes
+        return (self.origin + self.x[None, :, None] * across
+                + self.y[:, None, None] * up).reshape(-1, 3)
+
+    def flat(self, points: np.ndarray) -> np.ndarray:
+        """Return points [n, 3] as seen onto the plane [m], [n, 2]."""
+        return (points - self.origin) @ self.axes.T
+
+    def figure(self) -> tuple["Figure", "Axes"]:
+        from matplotlib.figure import Figure
+
+        # As high as the slice needs at equal scales: paths are often long and flat.
+        height = 6.2 * float(np.ptp(self.y) / max(np.ptp(self.x), 1e-9)) + 1.0
+        figure = Figure(figsize=(8, float(np.clip(height, 2.8, 6.5))), layout="constrained")
+        axis = figure.subplots()
+        axis.set(xlabel="in the plane, along the straight line [mm]", ylabel="upwards [mm]",
+                 aspect="equal")
+        return figure, axis
+
+    def fill(self, figure: "Figure", axis: "Axes", values: np.ndarray, top: float, label: str,
+             colours: str, *, lines: bool = False) -> None:
+        """Fill the plane by ``values`` at the grid's points up to ``top``; NaN stays white."""
+        from matplotlib.ticker import MaxNLocator
+
+        levels = MaxNLocator(14).tick_values(0.0, top)
+        masked = np.ma.masked_invalid(values.reshape(_GRID, _GRID))
+        filled = axis.contourf(1e3 * self.x, 1e3 * self.y, masked, levels=levels, cmap=colours,
+                               extend="max")
+        if lines:
+            axis.contour(1e3 * self.x, 1e3 * self.y, masked, levels=levels, colors="white",
+                         linewidths=0.4)
+        figure.colorbar(filled, ax=axis, label=label)
+
+    def draw_paths(self, axis: "Axes") -> None:
+        for key, points in self.paths.items():
+            axis.plot(*(1e3 * points.T), color="white", lw=4)
+            axis.plot(*(1e3 * points.T), color=PATH_COLOURS[key], lw=2, label=_LABELS[key])
+            axis.plot(*(1e3 * points[-1]), "o", color=PATH_COLOURS[key], mec="white")
+        axis.plot(*(1e3 * self.paths["plan"][0]), "s", color="black", mec="white", label="start")
+        axis.plot(*(1e3 * self.rest), "x", color="black", ms=9, mew=2, label="rest pose")
+        axis.set(xlim=1e3 * self.x[[0, -1]], ylim=1e3 * self.y[[0, -1]])
+        axis.legend(loc="best", fontsize=8, framealpha=0.85)
+
+
+def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return nodes [m] and parents of what D-RRT* searched; None where it is not kept."""
+    file = f"plans/{name}-trees.csv"
+    return read_trees(branch.path(file)).get("D-RRT*") if branch.has(file) else None
+
+
+def convergence(plan: PlanFile) -> "Figure":
+    """Draw the cost of the best path over iterations, both relative to their last."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    axis = figure.subplots()
+    for key, history in plan.summary["convergence"].items():
+        # On a first, coarse grid there may be no path yet.
+        history = [entry for entry in history if entry["cost"] is not None]
+        if history:
+            cost = np.array([entry["cost"] for entry in history])
+            axis.plot([entry["iteration"] for entry in history], cost / cost[-1],
+                      color=PATH_COLOURS[key], label=_LABELS[key])
+    axis.set(xlabel="iterations", ylabel="cost / final cost")
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False)
+    return figure
+
+
+def certificate(plan: PlanFile) -> "Figure":
+    """Draw how the lower and the upper bound on the best path's cost close, grid by grid."""
+    from matplotlib.figure import Figure
+
+    levels = plan.summary["certificate"]["levels"]
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    axis = figure.subplots()
+    spacing = 1e3 * np.array([level["spacing_m"] for level in levels])
+    lower, upper = (np.array([level[name] for level in levels], float)
+                    for name in ("lower", "upper"))
+    axis.fill_between(spacing, lower, upper, color=PATH_COLOURS["plan"], alpha=0.15,
+                      label="the best path lies here")
+    axis.plot(spacing, upper, "o-", color=PATH_COLOURS["plan"], label="best path found")
+    axis.plot(spacing, lower, "o--", color=PATH_COLOURS["plan"], label="no path is cheaper: proven")
+    axis.set(xscale="log", xlabel="cells of the grid [mm]", ylabel="cost", ylim=(0.0, None))
+    axis.invert_xaxis()
+    axis.set_xticks(spacing, [f"{value:.2g}" for value in spacing])
+    axis.minorticks_off()
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def trade_off(plan: PlanFile) -> "Figure":
+    """Draw energy against length of the gentlest paths, and below which no path is."""
+    from matplotlib.figure import Figure
+
+    detour = plan.summary["detour"]
+    curve = sorted(detour["curve"], key=lambda point: point["length_m"])
+    length = 1e3 * np.array([point["length_m"] for point in curve])
+    energy = 1e3 * np.array([point["energy_integral_jm"] for point in curve])
+    span = np.linspace(1e3 * detour["shortest_m"], max(length.max(), 1e3 * detour["longest_m"]), 80)
+    bounded = [point for point in curve if point["lower_bound_jm"] is not None]
+    lines = [1e3 * point["lower_bound_jm"] - point["metre_jm"] * span for point in bounded]
+    floor = np.maximum(np.max(lines, axis=0), 0.0)
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axis = figure.subplots()
+    # A path that is allowed to be longer may be any shorter one: the curve only falls.
+    best = np.minimum.accumulate(energy)
+    axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
+                      color=PATH_COLOURS["plan"], alpha=0.15, label="the best lies here")
+    axis.plot(span, floor, "--", color=PATH_COLOURS["plan"], lw=1, label="proven bound")
+    axis.plot(length, energy, "o-", color=PATH_COLOURS["plan"], ms=4, label="gentlest found")
+    axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="length allowed")
+    axis.set(xlabel="length of the path [mm]", ylabel="energy over length [mJ m]", ylim=(0.0, None))
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _ways(plan: PlanFile) -> dict[str, Way]:
+    return {"baseline": plan.baseline, "plan": plan.plan}
+
+
+def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return origin and two axes of the plane that fits points best, the second upwards."""
+    origin = points.mean(axis=0)
+    _, _, directions = np.linalg.svd(points - origin, full_matrices=False)
+    normal = directions[2]
+    # A plane of paths is seldom horizontal; where it is, any second axis does.
+    up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.2 else directions[1]
+    return origin, np.cross(up, normal), up

@@ -1,0 +1,43 @@
+"""What the report says of how a branch rang."""
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.core.files.reading import read_json_as
+
+
+class VibrationFile(BaseModel):
+    """Content of ``vibration.json`` as far as it is shown."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    young_pa: float = Field(gt=0)
+    young_interval_pa: tuple[float, float]
+    frequencies_hz: list[float] = Field(min_length=1)
+    frequency_deviations_hz: list[float]
+    damping_ratios: list[float]
+    damping_ratio_deviations: list[float]
+    model_frequencies_hz: list[float]
+    left_over: float
+
+
+def vibration_rows(path: Path) -> tuple[list[list[str]], list[list[str]]]:
+    """Return the modulus, and the vibrations of the record, as rows with a header.
+
+    Raises:
+        InputError: the file cannot be read, or says something else.
+    """
+    told = read_json_as(path, VibrationFile, "how a branch rang")
+    low, high = told.young_interval_pa
+    modulus = [["what", "value", "95 % interval"],
+               ["Young's modulus, mean of the branch [MPa]", f"{told.young_pa / 1e6:.4g}",
+                f"{low / 1e6:.4g} to {high / 1e6:.4g}"],
+               ["of the record, not explained", f"{100 * told.left_over:.0f} %", ""]]
+    vibrations = [["frequency [Hz]", "+-", "damping", "+-"]]
+    vibrations += [[f"{frequency:.4g}", f"{spread:.2g}", f"{100 * ratio:.2f} %",
+                    f"{100 * wide:.2g} %"]
+                   for frequency, spread, ratio, wide in zip(
+                       told.frequencies_hz, told.frequency_deviations_hz, told.damping_ratios,
+                       told.damping_ratio_deviations, strict=False)]
+    return modulus, vibrations

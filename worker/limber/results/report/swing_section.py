@@ -1,0 +1,99 @@
+"""What the report says of a free swing that the branch was fitted to."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.core.errors import InputError
+from limber.core.files.reading import read_json_as
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_Interval = tuple[float, float]
+_Track = list[list[tuple[float | None, float | None, float | None]]]
+"""Of each time, each marker's place [m]; None where it was not seen."""
+
+
+class SwingFile(BaseModel):
+    """Content of ``swing.json`` as far as it is shown."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    pull: str
+    young_pa: float = Field(gt=0)
+    young_interval_pa: _Interval
+    damping_ratio: float
+    damping_ratio_interval: _Interval
+    release_s: float
+    release_deviation_s: float
+    frequency_hz: float
+    relative_residual: float
+    warnings: list[str] = []
+    times_s: list[float] = Field(min_length=2)
+    seen_m: _Track
+    simulated_m: _Track
+
+
+def read_swing(path: Path) -> SwingFile:
+    """Read what ``limber swing`` wrote.
+
+    Raises:
+        InputError: it cannot be read, says something else, or its tracks are of unequal length.
+    """
+    swing = read_json_as(path, SwingFile, "a swing")
+    counts = {len(markers) for track in (swing.seen_m, swing.simulated_m) for markers in track}
+    if len(swing.seen_m) != len(swing.times_s) or len(swing.simulated_m) != len(swing.times_s) or (
+            len(counts) != 1 or not counts.pop()) or any(
+            None in place for markers in swing.simulated_m for place in markers):
+        raise InputError(f"{path}: seen and simulated are not of the same markers at its times.",
+                         "A swing was expected.", "It is damaged: run `limber swing` again.")
+    return swing
+
+
+def swing_rows(swing: SwingFile) -> list[list[str]]:
+    """Return what a free swing told, a row a quantity: value and 95 % interval."""
+    release = [swing.release_s + side * 1.96 * swing.release_deviation_s
+               for side in (-1, 1)]
+    rows = [["what", "value", "95 % interval"]]
+    for label, value, interval, form, scale in (
+            ("Young's modulus, mean [MPa]", swing.young_pa, swing.young_interval_pa,
+             ".4g", 1e-6),
+            ("damping ratio of the first vibration", swing.damping_ratio,
+             swing.damping_ratio_interval, ".3g", 1.0),
+            ("let go at [s]", swing.release_s, release, ".4g", 1.0)):
+        low, high = interval
+        rows.append([label, f"{scale * value:{form}}",
+                     f"{scale * low:{form}} to {scale * high:{form}}"])
+    return [*rows, ["first frequency [Hz]", f"{swing.frequency_hz:.4g}", "-"],
+            ["left over, of the largest displacement", f"{100 * swing.relative_residual:.2g} %",
+             "-"]]
+
+
+def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
+    """Return the displacement [m] of the marker that swings most, along its way: seen (NaN where
+    it was not) and simulated, shape [f] each."""
+    seen, simulated = np.array(swing.seen_m, float), np.array(swing.simulated_m, float)
+    most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
+    way = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
+    return seen[:, most] @ way, simulated[:, most] @ way
+
+
+def swing_over_time(swing: SwingFile) -> "Figure":
+    """Draw seen and simulated displacement of the marker that swings most."""
+    from matplotlib.figure import Figure
+
+    from limber.results.report.estimate_figures import OBSERVED, SIMULATED
+
+    figure = Figure(figsize=(5.2, 3.0), layout="constrained")
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    seen, simulated = along_its_way(swing)
+    axes.plot(swing.times_s, 1e3 * seen, ".", ms=4, color=OBSERVED, label="seen")
+    axes.plot(swing.times_s, 1e3 * simulated, color=SIMULATED, label="simulated")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("displacement [mm]")
+    axes.legend(frameon=False)
+    return figure

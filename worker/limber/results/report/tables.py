@@ -1,0 +1,200 @@
+"""The tables that the report and the demo share, as rows of text with a header row."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+ASSUMED = ("The modulus of the simulated pull is assumed: this branch was not pulled. The estimate "
+           "shows that the assumed modulus is found again, and nothing about the real branch.")
+
+
+def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
+                 ) -> list[list[str]]:
+    """Return estimated Young's modulus a control point, with truth and error where known.
+
+    Args:
+        estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa].
+        pull: What ``limber virtual-pull`` returned (``young_true_pa`` [K], and ``young_assumed``
+            where these are of a scan that nobody pulled), or None.
+    """
+    truth = (pull or {}).get("young_true_pa")
+    header = ["control point", "E [MPa]", "95 % interval [MPa]"]
+    told = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
+    rows = [[*header, *told, "in the interval"] if truth else header]
+    for number, young in enumerate(estimate["young_pa"]):
+        row = [str(number + 1), _mpa(young), _interval(estimate, number)]
+        if truth:
+            row += [_mpa(truth[number]), f"{100 * (young / truth[number] - 1):+.1f} %",
+                    "yes" if _holds(estimate, number, truth[number]) else "NO"]
+        rows.append(row)
+    return rows
+
+
+def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
+    """How many 95 % intervals hold the truth, in words; arguments of :func:`modulus_rows`."""
+    truth = pull["young_true_pa"]
+    held = sum(_holds(estimate, number, value) for number, value in enumerate(truth))
+    return f"{held} of {len(truth)} intervals of 95 % hold the " + (
+        f"assumed modulus. {ASSUMED}" if is_assumed(pull) else "true modulus.")
+
+
+def is_assumed(pull: Mapping[str, Any] | None) -> bool:
+    """Whether a simulated pull's modulus is assumed, and no truth about the scanned branch."""
+    return bool((pull or {}).get("young_assumed"))
+
+
+def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
+    """Return shortest against gentle path, with peaks and changes in percent."""
+    rows = [["measure", "shortest", "gentle", "change"]]
+    for label, key, unit in [
+            ("path length", "length_m", "m"),
+            ("energy along the path", "energy_integral_jm", "J m"),
+            ("energy sum, 5 mm steps", "energy_sum_nmm", "N mm"),
+            ("peak energy", "peak_energy_j", "J"), ("peak force", "peak_force_n", "N")]:
+        before, after = plan["baseline"].get(key), plan["plan"].get(key)
+        if before is None or after is None:
+            continue
+        change = f"{100 * (after / before - 1):+.1f} %" if before else "-"
+        rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
+    return rows
+
+
+def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return what makes each modulus unsure, as standard deviations in percent.
+
+    Args:
+        estimate: ``young_deviation`` with ``sensor``, ``geometry``, ``mesh`` and ``total``, each
+            [K] of log E or None where that was not examined; ``fractions`` [K].
+    """
+    parts = estimate.get("young_deviation") or {}
+    known = {"sensor": "by sensors", "geometry": "by the scan's shape", "mesh": "by the mesh",
+             **({"path": "by the gripper's path"} if parts.get("path") else {}),
+             **({"hung": "by the mass of twigs"} if parts.get("hung") else {}),
+             **({"grip": "by the length in the gripper"} if parts.get("grip") else {}),
+             "total": "together"}
+    if not any(parts.get(name) for name in known):
+        return []
+    rows = [["control point", "place (0 base, 1 tip)", *known.values()]]
+    for number, place in enumerate(estimate["fractions"]):
+        shares = ["not examined" if not parts.get(name) else "not known"
+                  if parts[name][number] is None else f"{100 * parts[name][number]:.1f} %"
+                  for name in known]
+        rows.append([str(number + 1), f"{place:.2f}", *shares])
+    return rows
+
+
+def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return what makes the moduli unsure, largest first, and what would shrink each.
+
+    Args:
+        estimate: ``causes``, each with ``cause``, ``share``, ``deviation`` and ``advice``
+            (:func:`limber.estimation.uncertainty.variance_parts.largest`).
+    """
+    causes = estimate.get("causes") or []
+    if not causes:
+        return []
+    rows = [["cause", "part of the variance", "deviation of E by it", "what would shrink it"]]
+    return rows + [[each["cause"], f"{100 * each['share']:.0f} %",
+                    f"up to {100 * min(each['deviation'], 99.0):.1f} %", each["advice"]]
+                   for each in causes]
+
+
+def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return how well each pull is foretold by a fit that did not see it.
+
+    Args:
+        estimate: ``held_out``, pull's name to ``rms_m``, ``rms_force_n``, ``relative_distance``,
+            ``relative_force`` (each None where not measured) and ``in_fit``.
+    """
+    scores = estimate.get("held_out") or {}
+    if not scores:
+        return []
+    rows = [["pull", "points [mm]", "of their travel", "force [N]", "of its peak", "foretold by"]]
+    for name, score in scores.items():
+        rows.append([
+            name, _known(score.get("rms_m"), "{:.2f}", 1e3),
+            _known(score.get("relative_distance"), "{:.1f} %", 100),
+            _known(score.get("rms_force_n"), "{:.3g}"),
+            _known(score.get("relative_force"), "{:.1f} %", 100),
+            "the other pulls" if score.get("in_fit", True) else "this estimate"])
+    return rows
+
+
+
+def share_rows(shares: Mapping[str, float]) -> list[list[str]]:
+    """Return which share of the axes' length each state of the radius has."""
+    return [["radius", "share of the axes' length"],
+            *([name, f"{100 * share:.1f} %"] for name, share in shares.items())]
+
+
+def order_rows(orders: Sequence[Mapping[str, float]]) -> list[list[str]]:
+    """Return branches, length, volume and taper of each branching order, and of all."""
+    def row(name: str, part: Mapping[str, float]) -> list[str]:
+        return [name, f"{part['branch_count']:.0f}", f"{part['length_m']:.3f}",
+                f"{1e6 * part['volume_m3']:.1f}", f"{1e3 * part['taper']:.2f}"]
+    whole = {name: sum(part[name] for part in orders)
+             for name in ("branch_count", "length_m", "volume_m3")}
+    whole["taper"] = sum(part["taper"] * part["length_m"] for part in orders) / max(
+        whole["length_m"], 1e-300)
+    return [["order", "branches", "length [m]", "volume [cm3]", "taper [mm of radius a m]"],
+            *(row(str(part["order"]), part) for part in orders), row("all", whole)]
+
+
+def diameter_rows(diameters: Sequence[Mapping[str, float]]) -> list[list[str]]:
+    """Return diameters at shares of the main path's length."""
+    return [["share of the main path", "from the root [m]", "diameter [mm]",
+             "standard deviation [mm]"],
+            *([f"{100 * row['share']:.0f} %", f"{row['along_m']:.3f}",
+               f"{1e3 * row['diameter_m']:.2f}", _known(row["sigma_m"] or None, "{:.2f}", 1e3)]
+              for row in diameters)]
+
+
+def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the scan's diameters beside those that calipers found."""
+    return [["from the root [m]", "calipers [mm]", "scan [mm]", "difference",
+             "in standard deviations"],
+            *([f"{row['along_m']:.3f}", f"{1e3 * row['measured_m']:.2f}",
+               f"{1e3 * row['diameter_m']:.2f}", f"{100 * row['difference']:+.1f} %",
+               _known(row["sigmas"], "{:+.1f}")] for row in compared)]
+
+
+def doubt_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the doubtful parts of a skeleton.
+
+    Args:
+        doubtful: Each with ``kind``, ``branch``, ``at`` [3], ``length_m``, ``radius_m`` and
+            ``value`` (see :class:`limber.geometry.skeleton.doubtful_parts.Doubt`).
+    """
+    told = {"unlikely branch": "probability {:.2f}", "unresolved radius": "sigma {:.0%} of it",
+            "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
+    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "how doubtful"]]
+    for part in doubtful:
+        value = part["value"]
+        if part["kind"] in ("kink", "starts backwards"):
+            value = math.degrees(value)
+        rows.append([part["kind"], str(part["branch"]),
+                     " ".join(f"{place:.8g}" for place in part["at"]),
+                     f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
+                     told[part["kind"]].format(value) if part["kind"] in told else "no points"])
+    return rows
+
+
+def _holds(estimate: Mapping[str, Any], number: int, truth: float) -> bool:
+    low, high = estimate["young_interval_pa"][number]
+    return low is not None and high is not None and bool(low <= truth <= high)
+
+
+def _mpa(value: float) -> str:
+    """Four digits [MPa], the unit of the column."""
+    return f"{float(f'{value / 1e6:.4g}'):,.10g}"
+
+
+def _known(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "-" if value is None else form.format(scale * value)
+
+
+def _interval(estimate: Mapping[str, Any], number: int) -> str:
+    interval = (estimate.get("young_interval_pa") or {number: None})[number]
+    if not interval or None in interval:
+        return "undetermined"
+    return f"{_mpa(interval[0])} to {_mpa(interval[1])}"

@@ -1,0 +1,60 @@
+"""The process that has bpy and makes a scene: the add-on's ``make_scene.py`` on prepared data.
+
+The core never imports bpy: the ``bpy`` package in this Python, or a Blender program, runs it.
+"""
+
+import importlib.util
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from limber.core.errors import MissingDependencyError
+from limber.core.progress import Progress
+
+
+def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
+    """Run the script with ``arguments``; returns what it made and with which Blender."""
+    from limber.core.processes.stage_process import run_json_process
+
+    progress(0.0, "starting Blender")
+    result = run_json_process("scene", [*blender_command(), "--", *map(str, arguments)], progress,
+                              fix="`limber doctor` says which Blender was used.")
+    return {key: result[key] for key in ("object_count", "frame_count", "blender")}
+
+
+def blender_command() -> list[str]:
+    """Return the command that runs the add-on's script in a process with bpy.
+
+    Raises:
+        MissingDependencyError: neither the bpy package nor a Blender is there, or no script.
+    """
+    script = str(scene_script())
+    named = os.environ.get("LIMBER_SCENE_BLENDER")
+    if named is None and importlib.util.find_spec("bpy") is not None:
+        return [sys.executable, script]
+    blender = named or os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
+    if not blender:
+        raise MissingDependencyError(
+            "There is no bpy package in this Python and no Blender was found.",
+            "A scene needs one of them.",
+            "Install bpy (pip install 'limber[blender]'), or set LIMBER_BLENDER to a Blender.")
+    return [blender, "--background", "--factory-startup", "--python-exit-code", "3",
+            "--python", script]
+
+
+def scene_script() -> Path:
+    """Return the path of ``make_scene.py``: the wheel's own copy, or the checkout's.
+
+    Raises:
+        MissingDependencyError: it is in neither.
+    """
+    here = Path(__file__).parent
+    places = [here / "addon" / "make_scene.py", here.parents[3] / "addon" / "make_scene.py"]
+    for place in places:
+        if place.is_file():
+            return place
+    raise MissingDependencyError(
+        f"The add-on's {places[0].name} is not installed.", "`limber scene` needs it.",
+        "Install Limber from its wheel, or run it from a checkout of the project.")

@@ -1,0 +1,138 @@
+"""What a Blender scene shows of a branch folder: arrays ready to show, and what they mean.
+
+The add-on computes nothing, so colours, tick labels and the direction of view are worked out
+here. One ``.npz`` file carries them to Blender's process: plain arrays (nothing pickled), and
+``info``, a JSON text. Vertices are those of the mesh's surface in the order of the PC2 frames:
+``mesh.surface_faces()`` compacted by ``numpy.unique``.
+
+Arrays (m, s, J, Pa; what a folder does not have is left out):
+
+==============================================  ====================================================
+``vertices`` [v, 3], ``faces`` [f, 3]           the surface
+``scalar:NAME`` [v], ``color:NAME`` [v, 4]      values at rest, or the worst of all frames, and
+                                                linear colours; NAME in ``info["scalars"]``
+``frame_scalar:NAME`` [frames, v]               the same in each frame; ``info["frame_scalars"]``
+``frame_level:NAME`` [frames, v] bytes,         its colours: which of the palette that the scale's
+``palette:COLOURS`` [256, 4]                    ``colours`` names
+``frame_times``, ``frame_energy``,              one number a frame: ``info["frames"]`` says
+``frame_kinetic_energy``, ``frame_min_det_f``,  ``rate_hz`` and whether the times are those of a
+``frame_strain`` [frames]                       motion (``is_timed``) or one pose a frame
+``cloud`` [c, 3], ``cloud_color`` [c, 4]        the aligned scan
+``skeleton`` [n, 3], ``skeleton_parent``,       the centreline; flags: 1 root, 2 fork, 4 tip, 8
+``skeleton_radius``, ``skeleton_radius_sigma``  radius limited, 16 interpolated, 32 unresolved, 64
+``skeleton_order``, ``skeleton_probability``,   bridged, 128 edited; the probability that a node
+``skeleton_flags`` [n]                          is there
+``control_points`` [k, 3], ``grasp`` [1, 3],    marks at rest, the radii of the balls that mark them
+``targets`` [t, 3]; each with ``_radius``       (``info["targets"]`` names the targets)
+``control_points_motion`` [frames, k, 3],       where they are in each frame
+``targets_motion``, ``grasp_motion`` [frames, 3]
+``path:KEY`` [p, 3], ``path_pose:KEY`` [p, 6],  paths of ``info["paths"]``: points, poses, energy
+``path_energy:KEY`` ``path_force:KEY``          (colours by ``info["path_energy"]``), force, strain
+``path_strain:KEY`` [p], ``path_color:KEY``
+``tree:KEY`` [q, 3], ``tree_parent:KEY`` [q]    search trees of ``info["trees"]``: nodes, and which
+                                                earlier one each hangs on (-1: none)
+``rods:NAME`` [u, 3], ``rod_faces:NAME``        thin rods in the colours of ``info["rods"]``:
+[x, 3], ``rod_color:NAME`` [u, 4]               ``plan``, ``baseline`` by energy, ``skeleton`` as
+                                                thick as it is, ``fit`` along simulated points
+                                                with balls at measured ones
+``observation`` [t, m, 3], ``observation_       what was measured in the pull that
+visible`` [t, m], ``observation_times`` [t],    ``info["observation"]`` names, and the gripper
+``observation_grasp`` [g, 3], ``observation_
+grasp_times`` [g]
+``observation_motion`` [frames, m, 3],          the same points in each frame, where the frames
+``observation_seen`` [frames, m]                are of that pull
+``robot_links`` [frames, 8, 3],                 the arm of the plan's dry run: base, the origins of
+``robot_radius`` [1]                            its six links, grasp; how thick to draw it
+``frame_bounds`` [2, 3], ``view_points``,       what the camera must see, and its direction
+``view_direction`` [3]
+==============================================  ====================================================
+
+``info`` also has ``graphs`` (see :mod:`limber.results.scene.graphs`), ``goal`` and ``hemisphere``
+(centre, radius, axis), ``base``, ``alignment`` (4x4, scan's file to branch), ``map_offset`` (the
+branch's origin in the scan's coordinates, double precision), ``uuid`` and ``source``.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.loads.loaded_branch import NamedTarget
+from limber.results.motion_files import node_average
+from limber.results.scene.animation import add_motion
+from limber.results.scene.arrays import FORMAT, SceneData
+from limber.results.scene.colours import colour_scale
+from limber.results.scene.fit_errors import add_fit
+from limber.results.scene.observation import add_observation
+from limber.results.scene.paths import add_hemisphere, add_plan
+from limber.results.scene.robot_links import add_robot
+from limber.results.scene.still_objects import (
+    add_cloud,
+    add_marks,
+    add_scalar,
+    add_skeleton,
+    add_skeleton_rods,
+    add_targets,
+    add_view,
+    alignment,
+    map_offset,
+)
+from limber.store import Branch
+
+__all__ = ["FORMAT", "SceneData", "scene_data"]
+
+
+def scene_data(branch: Branch, plan: str | None = None, motion: str | None = None,
+               targets: Sequence[NamedTarget] = (), strength: float | None = None) -> SceneData:
+    """Gather what there is to show of ``branch``.
+
+    Args:
+        plan: Which path; the newest by default.
+        motion: Which frames; the plan's by default, else the newest.
+        targets: Named places on the branch.
+        strength: Stress that breaks the wood [Pa]; assumed where it is not given.
+
+    Raises:
+        BranchFolderError: no mesh yet, no such plan or frames, or frames of another mesh.
+    """
+    mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
+    faces = mesh.surface_faces()
+    used, compact = np.unique(faces, return_inverse=True)
+    data = SceneData({"vertices": mesh.nodes[used], "faces": compact.reshape(-1, 3)})
+    matrix = alignment(branch)
+    data.info = {"format": FORMAT, "name": branch.name, "folder": str(branch.folder.resolve()),
+                 "uuid": branch.uuid, "unit": "m", "scalars": {}, "frame_scalars": {}, "paths": {},
+                 "rods": {}, "graphs": {},
+                 "notes": [_size_note(branch, mesh)], "source": branch.manifest.source,
+                 "alignment": matrix, "map_offset": map_offset(matrix)}
+    if "young" in mesh.cell_data:
+        young = (node_average(mesh) @ mesh.cell_data["young"])[used]
+        add_scalar(data, "young", young,
+                   colour_scale(young, f"Young's modulus ({_origin(branch)})", "Pa", "viridis"))
+    add_cloud(data, branch)
+    add_skeleton(data, branch)
+    add_skeleton_rods(data)
+    add_marks(data, mesh, used)
+    add_targets(data, targets)
+    plan = add_plan(data, branch, plan)
+    add_hemisphere(data, branch)
+    add_motion(data, branch, plan, motion, strength)
+    add_robot(data, branch, plan)
+    add_observation(data, branch)
+    add_fit(data, branch, (data.info.get("observation") or {}).get("pull"))
+    add_view(data)
+    data.arrays = {name: np.ascontiguousarray(array) for name, array in data.arrays.items()}
+    return data
+
+
+def _origin(branch: Branch) -> str:
+    """Return where the mesh's modulus is from: one that was assumed looks the same in colours."""
+    made = branch.manifest.files.get("mesh.vtu")
+    return "assumed" if made is None or made.stage in ("reconstruct", "mesh") else "estimated"
+
+
+def _size_note(branch: Branch, mesh: TetMesh) -> str:
+    entry = branch.manifest.stages.get("reconstruct") or branch.manifest.stages.get("mesh")
+    length = (entry.result if entry else {}).get("length_m")
+    extent = f"{length:.2f} m of centreline" if length else f"{np.ptp(mesh.nodes[:, 2]):.2f} m high"
+    return f"{extent}, {mesh.tet_count} tetrahedra"

@@ -1,0 +1,193 @@
+"""Graphs beside a branch: Young's modulus along it, energy along paths, the force of a pull.
+
+A graph is drawn by whoever shows it, in a frame of its own: all places are shares of the frame's
+width and height from its lower left corner, ticks are words. Lines are ``{"label", "color",
+"points", "is_dotted"}``, bands ``{"label", "color", "rows"}`` with rows ``[x, low, high]``; colours
+are sRGB. ``cursor`` has the place of each frame of the plan's or the pull's motion, where the graph
+is of one.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from limber.planning.cost import arc_lengths
+from limber.results.scene.colours import with_unit
+
+MEASURED, SIMULATED, TRUE = (0.95, 0.95, 0.95), (0.40, 0.71, 1.0), (1.0, 0.62, 0.30)
+FIRST, SECOND = (0.93, 0.36, 0.42), (0.45, 0.62, 1.0)
+"""Of the planned path and of the one that it is compared with: as the paths themselves
+(:data:`limber.core.constants.PATH_COLOURS`), lighter on the graph's dark ground."""
+_MOST_POINTS = 400
+_LOG_FROM = 5.0
+"""Times that a quantity above zero grows by before its axis is logarithmic."""
+
+
+@dataclass
+class Axis:
+    """An axis: what it means, its unit, and the values it spans."""
+
+    title: str
+    unit: str
+    low: float
+    high: float
+    log: bool = False
+
+    @classmethod
+    def over(cls, title: str, unit: str, values: Sequence[np.ndarray], *,
+             log: bool = False) -> "Axis":
+        """Return an axis over all values; from zero where they do not fall below it."""
+        given = np.concatenate([np.ravel(part) for part in values]).astype(float)
+        given = given[np.isfinite(given)]
+        low, high = (float(given.min()), float(given.max())) if len(given) else (0.0, 1.0)
+        if log and low > 0 and high > _LOG_FROM * low:
+            return cls(title, unit, low / 1.15, high * 1.15, log=True)
+        low = min(low, 0.0)
+        return cls(title, unit, low, low + 1.06 * (high - low) if high > low else low + 1.0)
+
+    def place(self, values: float | np.ndarray) -> np.ndarray:
+        """Return where values stand, as shares of the axis."""
+        values = np.asarray(values, float)
+        if self.log:
+            values = np.log(np.maximum(values, 1e-300))
+            return (values - np.log(self.low)) / np.log(self.high / self.low)
+        return (values - self.low) / (self.high - self.low)
+
+    def ticks(self) -> list[list[Any]]:
+        """Return ``[share, words]`` of a few round values."""
+        values = _decades(self.low, self.high) if self.log else _steps(self.low, self.high)
+        largest = max((abs(value) for value in values), default=1.0)
+        # On a logarithmic axis each tick has a prefix of its own.
+        return [[float(self.place(value)),
+                 with_unit(value, self.unit, abs(value) if self.log else largest)]
+                for value in values]
+
+
+@dataclass
+class Graph:
+    """A graph that is being put together."""
+
+    title: str
+    x: Axis
+    y: Axis
+    cursor: np.ndarray = field(default_factory=lambda: np.empty(0))
+    lines: list[dict[str, Any]] = field(default_factory=list)
+    bands: list[dict[str, Any]] = field(default_factory=list)
+
+    def line(self, label: str, color: tuple[float, float, float], x: np.ndarray, y: np.ndarray,
+             *, is_dotted: bool = False) -> None:
+        """Add a line, or single points; where there is no number it is left out."""
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        known = np.isfinite(x) & np.isfinite(y)
+        chosen = np.flatnonzero(known)
+        if len(chosen) > _MOST_POINTS:
+            chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).astype(int)]
+        if len(chosen):
+            points = np.column_stack([self.x.place(x[chosen]), self.y.place(y[chosen])])
+            self.lines.append({"label": label, "color": color, "is_dotted": is_dotted,
+                               "points": np.clip(points, 0.0, 1.0).round(4).tolist()})
+
+    def band(self, label: str, color: tuple[float, float, float], x: np.ndarray, low: np.ndarray,
+             high: np.ndarray) -> None:
+        """Add a band between two lines."""
+        rows = np.column_stack([self.x.place(x), self.y.place(low), self.y.place(high)])
+        self.bands.append({"label": label, "color": color,
+                           "rows": np.clip(rows, 0.0, 1.0).round(4).tolist()})
+
+    def told(self) -> dict[str, Any]:
+        """Return the graph as the scene's file has it."""
+        return {"title": self.title, "lines": self.lines, "bands": self.bands,
+                "cursor": self.x.place(self.cursor).round(4).tolist(),
+                **{name: {"title": axis.title, "ticks": axis.ticks()}
+                   for name, axis in (("x", self.x), ("y", self.y))}}
+
+
+def _steps(low: float, high: float) -> list[float]:
+    """Return round values from ``low`` to ``high``, evenly spaced: three to seven."""
+    step = 10.0 ** math.floor(math.log10((high - low) / 3))
+    step *= max(factor for factor in (1.0, 2.0, 5.0) if 3 * factor * step <= high - low)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [step * number for number in range(first, last + 1)]
+
+
+def _decades(low: float, high: float) -> list[float]:
+    """Return 1, 2 and 5 of each power of ten from ``low`` to ``high``; over three decades 1."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    factors = (1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)
+    values = [factor * 10.0**power for power in powers for factor in factors]
+    return [value for value in values if low <= value <= high]
+
+
+def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
+    """Return Young's modulus along the branch with its interval, and the truth where known.
+
+    Args:
+        estimate: Content of ``estimate.json``.
+    """
+    place = np.array(estimate["fractions"], float)
+    young = np.array(estimate["young_pa"], float)
+    interval = np.array(estimate["young_interval_pa"], float)
+    if len(place) == 1:
+        # One modulus for the whole branch.
+        place, young, interval = np.array([0.0, 1.0]), np.repeat(young, 2), np.repeat(
+            interval, 2, axis=0)
+    # A modulus that nothing tells has no interval; its line stays.
+    is_known = np.isfinite(interval).all(axis=1)
+    truth = estimate.get("truth") or {}
+    true = np.array(truth.get("young_pa") or [], float)
+    axis = Axis.over("Young's modulus", "Pa", [young, interval[is_known], true], log=True)
+    graph = Graph("Young's modulus along the branch",
+                  Axis("place on the main path (0 base, 1 tip)", "", 0.0, 1.0), axis)
+    if is_known.sum() > 1:
+        graph.band("95 %", SIMULATED, place[is_known], *interval[is_known].T)
+    graph.line("estimated", SIMULATED, place, young)
+    graph.line("", SIMULATED, place, young, is_dotted=True)
+    if len(true) and len(true) == len(truth.get("fractions") or []):
+        graph.line("assumed" if truth.get("assumed") else "true", TRUE, truth["fractions"], true,
+                   is_dotted=True)
+    return graph.told()
+
+
+def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[str, Any]:
+    """Return the energy along paths.
+
+    Args:
+        paths: By ``plan`` and ``baseline``: title, points [p, 3] m and energies [p] J.
+    """
+    along = {key: arc_lengths(points) for key, (_, points, _) in paths.items()}
+    graph = Graph("Energy along the paths",
+                  Axis.over("along the path", "m", list(along.values())),
+                  Axis.over("energy", "J", [energy for _, _, energy in paths.values()]),
+                  along.get("plan", np.empty(0)))
+    for key, (title, _, energy) in paths.items():
+        graph.line(title, FIRST if key == "plan" else SECOND, along[key], energy)
+    return graph.told()
+
+
+def force_graph(name: str, times: np.ndarray, measured: np.ndarray,
+                simulated: np.ndarray | None = None, cursor: np.ndarray | None = None,
+                ) -> dict[str, Any] | None:
+    """Return the force of a pull over time; None where none was measured.
+
+    Args:
+        name: Of the pull.
+        times: [s], shape [n].
+        measured: Force of the gripper [N], shape [n, 3]; NaN where it was not measured.
+        simulated: What the estimate has there, likewise.
+        cursor: When each frame of the motion in sight is [s], on the same clock.
+    """
+    known = {"measured": measured, "simulated": simulated}
+    forces = {label: np.linalg.norm(np.asarray(values, float).reshape(-1, 3), axis=1)
+              for label, values in known.items() if values is not None}
+    if not all(np.isfinite(force).any() for force in forces.values()):
+        return None
+    graph = Graph(f"Force of pull {name}", Axis.over("time", "s", [times]),
+                  Axis.over("force", "N", list(forces.values())),
+                  np.empty(0) if cursor is None else cursor)
+    graph.line("measured", MEASURED, times, forces["measured"], is_dotted=True)
+    if "simulated" in forces:
+        graph.line("simulated", SIMULATED, times, forces["simulated"])
+    return graph.told()

@@ -1,0 +1,188 @@
+"""Where the robot stands: its base in the branch's frame, from points that it has touched."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.robot.cell.cell import Cell
+from limber.robot.ur.kinematics import forward, inverted, matrices, pose_vectors
+from limber.robot.ur.samples import Sample
+
+_FEWEST = 4
+_LEAST_SPREAD = 0.02  # m, of the second principal direction
+_LEAST_OUT_OF_PLANE = 0.005  # m, of the third
+# Real arms differ from their nominal measures by millimetres: so far a tool is known from joints.
+_TOOL_M, _TOOL_RAD = 0.01, np.radians(2.0)
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """The base's pose and how well the touched points agree.
+
+    Attributes:
+        pose: Of the robot's base in the branch's frame [m, rad], shape [6].
+        residuals: Distance of each point after the fit [m], shape [n].
+        position_sigma: Standard error of the base's position where the points are [m].
+        rotation_sigma: Standard error of its rotation about its worst axis [rad].
+    """
+
+    pose: np.ndarray
+    residuals: np.ndarray
+    position_sigma: float
+    rotation_sigma: float
+
+    @property
+    def residual(self) -> float:
+        """Root mean square of the residuals [m]."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+
+def spread_of(points: np.ndarray) -> np.ndarray:
+    """Root mean squares of points [n, 3] along their principal directions [m], shape [3]."""
+    away = points - points.mean(axis=0)
+    return np.linalg.svd(away, compute_uv=False) / np.sqrt(len(points))
+
+
+def least_depth(largest_residual: float) -> float:
+    """Return how far points have to spread out of their plane [m] for a mirror to show.
+
+    Mirrored points are off by twice that spread, which has to exceed the residual that is allowed.
+    """
+    return max(_LEAST_OUT_OF_PLANE, 0.5 * largest_residual)
+
+
+def require_frame(points: np.ndarray, names: Sequence[str], which: str,
+                  largest_residual: float = 0.01) -> None:
+    """Refuse points that leave the frame open, or its handedness.
+
+    Three points, or any number in a plane, fit a mirrored frame without a residual.
+
+    Args:
+        points: [m], shape [n, 3].
+        names: Of the points.
+        which: What they are, for the message: ``on the branch`` or ``as they were touched``.
+        largest_residual: That :func:`fit_base` allows [m].
+
+    Raises:
+        InputError: too few, no numbers, too close to each other, in a line or in a plane.
+    """
+    if len(points) < _FEWEST:
+        raise InputError(f"{len(points)} points {which}.", "Four or more that lie in no plane are "
+                         "needed: fewer fit a mirrored frame as well.", "Touch more points.")
+    if not np.isfinite(points).all():
+        worst = names[int((~np.isfinite(points)).any(axis=1).argmax())]
+        raise InputError(f"Point {worst} {which} is no number.", "", "Touch it again.")
+    away = np.linalg.norm(points[:, None] - points[None], axis=2)
+    away[np.tril_indices(len(points))] = np.inf
+    first, second = np.unravel_index(away.argmin(), away.shape)
+    if away[first, second] < largest_residual:
+        raise InputError(
+            f"Points {names[first]} and {names[second]} are {1000 * away[first, second]:.1f} mm "
+            f"apart {which}.", f"At least {1000 * largest_residual:.0f} mm are needed: closer ones "
+            "pass for each other.", "Leave one of them out, and touch another place.")
+    spread = spread_of(points)
+    if spread[1] < _LEAST_SPREAD:
+        raise InputError(
+            f"The points {which} spread by {1000 * spread[1]:.1f} mm across their line (root mean "
+            f"square); {1000 * _LEAST_SPREAD:.0f} mm are needed.", "The frame could turn about it.",
+            "Touch points that lie beside it, such as twigs and the pot's rim.")
+    needed = least_depth(largest_residual)
+    if spread[2] < needed:
+        raise InputError(
+            f"The points {which} lie in a plane: they spread by {1000 * spread[2]:.1f} mm out of "
+            f"it (root mean square); {1000 * needed:.0f} mm are needed.",
+            "A mirrored frame would fit as well.",
+            "Touch points above and below it, such as the pot's rim and the branch's tip.")
+
+
+def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
+    """Return where the middle of the gripper is by the controller's own pose, base frame [m, 3].
+
+    The controller knows the arm's true measures. Its pose is that of the tool that is set there:
+    newer controllers tell that tool. With others the nominal measures tell which it is, the
+    cell's ``tool.grasp_pose`` or none, but nothing of the place.
+
+    Raises:
+        InputError: another tool is set.
+    """
+    grasp = np.array(cell.tool.grasp_pose)
+    if sample.tool is not None:
+        return _carried(sample.pose, sample.tool, grasp)
+    seen = pose_vectors(inverted(forward(cell.arm, sample.joints)) @ matrices(sample.pose))
+    for tool in (grasp, np.zeros(6)):
+        if (length(seen[:3] - tool[:3]) <= _TOOL_M
+                and length(turn_between(tool, seen)) <= _TOOL_RAD):
+            return _carried(sample.pose, tool, grasp)
+    raise InputError(
+        f"The tool that is set in the controller is at about {_millimetres(seen)} in the flange's "
+        f"frame, the cell's tool.grasp_pose at {_millimetres(grasp)}.",
+        "The controller's pose is of another point than the gripper's middle.",
+        "Set the tool centre point to tool.grasp_pose on the pendant, or correct the cell file.")
+
+
+def _carried(pose: np.ndarray, tool: np.ndarray, grasp: np.ndarray) -> np.ndarray:
+    return (matrices(pose) @ inverted(matrices(tool)) @ matrices(grasp))[:3, 3]
+
+
+def _millimetres(pose: np.ndarray) -> str:
+    place = ", ".join(f"{1000 * value:.0f}" for value in pose[:3])
+    turn = ", ".join(f"{value:.1f}" for value in np.degrees(pose[3:]))
+    return f"({place}) mm, turned by ({turn}) degrees"
+
+
+def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: float = 0.01,
+             names: Sequence[str] | None = None) -> BaseFit:
+    """Fit the rigid transform from the robot's base to the branch's frame (Kabsch 1976).
+
+    Args:
+        touched: Points as the robot's tip touched them, base frame [m], shape [n, 3].
+        on_branch: The same points in the branch's frame [m], shape [n, 3].
+        largest_residual: A point that is farther off than this [m] was mixed up or mistouched.
+        names: Of the points, for messages; by default their numbers from 1 on.
+
+    Raises:
+        InputError: fewer than four points, points in a plane or too close to each other, mirrored
+            points, or a point far off.
+    """
+    touched, on_branch = np.asarray(touched, float), np.asarray(on_branch, float)
+    if touched.shape != on_branch.shape or touched.ndim != 2 or touched.shape[1] != 3:
+        raise InputError(f"{len(touched)} touched points for {len(on_branch)} on the branch.",
+                         "Each has its counterpart.", "Correct the list.")
+    names = [str(number + 1) for number in range(len(touched))] if names is None else names
+    require_frame(on_branch, names, "on the branch", largest_residual)
+    require_frame(touched, names, "as they were touched", largest_residual)
+    turn, residuals = _registered(touched, on_branch)
+    if residuals.max() > largest_residual:
+        raise _off(residuals, _registered(-touched, on_branch)[1], names, largest_residual)
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = turn, on_branch.mean(axis=0) - turn @ touched.mean(axis=0)
+    # Six unknowns come out of 3 n numbers.
+    sigma = float(np.sqrt((residuals**2).sum() / (3 * len(touched) - 6)))
+    return BaseFit(pose_vectors(frame), residuals, sigma / np.sqrt(len(touched)),
+                   sigma / (np.sqrt(len(touched)) * float(spread_of(on_branch)[1])))
+
+
+def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotation [3, 3] that fits points [n, 3] best, and what is left of each [m, n]."""
+    a, b = touched - touched.mean(axis=0), on_branch - on_branch.mean(axis=0)
+    left, _, right = np.linalg.svd(b.T @ a)
+    turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    return turn, np.linalg.norm(a @ turn.T - b, axis=1)
+
+
+def _off(residuals: np.ndarray, mirrored: np.ndarray, names: Sequence[str],
+         largest_residual: float) -> InputError:
+    """Return why points do not fit, from what is left of each and of their mirror image [m, n]."""
+    off = ", ".join(f"{name} {1000 * value:.1f}"
+                    for name, value in zip(names, residuals, strict=True))
+    if mirrored.max() <= largest_residual:
+        return InputError(f"The points fit in a mirror alone; as they are, they are off by [mm]: "
+                          f"{off}.", "One of the frames is left-handed.",
+                          "Correct the signs or the order of its axes.")
+    worst = int(residuals.argmax())
+    return InputError(f"Point {names[worst]} is off by {1000 * residuals[worst]:.1f} mm; all of "
+                      f"them [mm]: {off}.", "It was taken for another one, or the units differ.",
+                      "Touch it again, or leave it out.")

@@ -1,0 +1,335 @@
+"""The cell: where the robot stands beside the branch, what it holds and what is in its way.
+
+``cell.toml`` is written by ``limber robot calibrate`` and by hand. All lengths are in metres,
+angles in radians, masses in kilograms. The branch's frame is that of its folder (z up).
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tomlkit
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from limber.core.errors import InputError
+from limber.core.files.atomic import write_atomically
+from limber.core.files.reading import read_toml
+from limber.core.json_values import plain
+from limber.robot.ur.arms import ARMS, Arm, arm_named
+from limber.robot.ur.kinematics import inverted, matrices
+
+Vector = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float]
+
+# Farther than this from anything an arm can do: the number is in another unit.
+_FAR = 20.0
+
+
+def _in_metres(value: tuple[float, ...]) -> tuple[float, ...]:
+    if max(abs(part) for part in value[:3]) > _FAR:
+        raise ValueError(f"lies {max(abs(part) for part in value[:3]):g} m away: millimetres?")
+    return value
+
+
+def _known_model(value: str) -> str:
+    try:
+        return arm_named(value).name
+    except InputError as error:
+        raise ValueError(f"is none of {', '.join(ARMS)}") from error
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class RobotEntry(_Entry):
+    """Which robot, and at which address."""
+
+    model: str = Field(description="ur3, ur5, ur10, ur3e, ur5e, ur10e or ur16e.")
+    address: str = Field("127.0.0.1", min_length=1, description="Address of the controller.")
+    version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
+                                description="Controller version that was seen when calibrating.")
+    pose_sigma_m: float = Field(
+        5e-5, ge=0, le=0.01, description="How exactly the arm goes a way of some centimetres.")
+    pose_sigma_rad: float = Field(3e-4, ge=0, le=0.1, description="And a turn.")
+    joint_limits_rad: tuple[tuple[float, float], ...] | None = Field(
+        None, min_length=6, max_length=6,
+        description="Narrower limits of the joints, as set in the controller's safety.")
+
+    _known = field_validator("model")(_known_model)
+
+
+class BaseEntry(_Entry):
+    """The robot's base frame, as its pendant shows it, in the branch's frame."""
+
+    pose: Pose = Field(description="Position [m] and rotation vector [rad].")
+    position_sigma_m: float = Field(0.005, ge=0, le=0.5)
+    rotation_sigma_rad: float = Field(0.01, ge=0, le=0.5)
+    residual_m: float | None = Field(None, ge=0, description="What calibration left over.")
+
+    _near = field_validator("pose")(_in_metres)
+
+
+class CapsuleEntry(_Entry):
+    """A rod with round ends, in the frame of the flange: one part of the gripper's shape."""
+
+    start_m: Vector
+    end_m: Vector
+    radius_m: float = Field(gt=0, le=1)
+
+
+class ToolEntry(_Entry):
+    """The gripper: where it holds, what it weighs, its shape."""
+
+    grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's.")
+    mass_kg: float | None = Field(
+        None, ge=0, le=20, description="Payload, 0 for a bare flange; unstated, nothing moves.")
+    centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="In the frame of the flange.")
+    parts: tuple[CapsuleEntry, ...] = ()
+    compliance_m_per_n: float = Field(
+        5e-5, ge=0, le=1e-2, description="What arm, fingers and bark give way by.")
+    gripper: Literal["none", "digital_output", "by_hand"] = "by_hand"
+    grip_seconds: float = Field(
+        1.0, gt=0, le=30, description="Given to the gripper to close or open.")
+    close_output: int = Field(0, ge=0, le=7, description="Digital output that closes it.")
+
+    _near = field_validator("grasp_pose", "centre_of_mass_m")(_in_metres)
+
+
+class ApproachEntry(_Entry):
+    """How the gripper comes to the branch and leaves it."""
+
+    direction: Vector = Field((0.0, 0.0, 1.0), description="In the frame of the grasp.")
+    distance_m: float = Field(0.08, gt=0, le=1)
+
+    @field_validator("direction")
+    @classmethod
+    def _unit(cls, value: Vector) -> Vector:
+        length = float(np.linalg.norm(value))
+        if length < 1e-9:
+            raise ValueError("has no direction")
+        return tuple(float(part) / length for part in value)
+
+
+class SensorEntry(_Entry):
+    """The force-torque sensor that the guard and recordings use."""
+
+    kind: Literal["controller", "ft300", "replay", "none"] = Field(
+        "controller", description="replay: what a file holds, for the virtual robot alone.")
+    file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
+                             "sensor's frame.")
+    pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's.")
+    force_range_n: float = Field(100.0, gt=0)
+    torque_range_nm: float = Field(10.0, gt=0)
+    force_sigma_n: float = Field(0.15, gt=0)
+    torque_sigma_nm: float = Field(0.02, gt=0)
+    drift_n_per_minute: float = Field(0.8, ge=0)
+
+    @model_validator(mode="after")
+    def _has_its_file(self) -> "SensorEntry":
+        if (self.kind == "replay") != (self.file is not None):
+            raise ValueError("file is the CSV of kind = \"replay\", and goes with nothing else")
+        return self
+
+
+class LimitsEntry(_Entry):
+    """What no motion may exceed; clamped far below what the robot itself allows."""
+
+    speed_m_s: float = Field(0.05, gt=0, le=0.25)
+    acceleration_m_s2: float = Field(0.3, gt=0, le=2.0)
+    turn_speed_rad_s: float = Field(0.5, gt=0, le=1.5)
+    soft_force_n: float = Field(10.0, gt=0, description="Motion pauses.")
+    hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
+    hard_torque_nm: float = Field(3.0, gt=0)
+    unexpected_force_n: float = Field(
+        3.0, gt=0, description="Distance of the measured force from the predicted one that stops.")
+    singularity: float = Field(0.05, gt=0, le=0.5)
+    joint_margin_rad: float = Field(0.05, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _order(self) -> "LimitsEntry":
+        if self.soft_force_n >= self.hard_force_n:
+            raise ValueError("soft_force_n must be less than hard_force_n: it is the one that "
+                             "pauses before the other stops")
+        return self
+
+
+class CameraEntry(_Entry):
+    """A depth camera: a pinhole that looks along its z axis, y down."""
+
+    pose: Pose
+    mount: Literal["branch", "flange"] = Field("branch", description="Frame that pose is in.")
+    width: int = Field(640, gt=0)
+    height: int = Field(480, gt=0)
+    focal_px: tuple[float, float] = (600.0, 600.0)
+    centre_px: tuple[float, float] = (320.0, 240.0)
+    range_m: tuple[float, float] = (0.2, 2.0)
+
+    _near = field_validator("pose")(_in_metres)
+
+
+class SecondArmEntry(_Entry):
+    """Another arm that works on the branch while this one holds it."""
+
+    model: str
+    base_pose: Pose = Field(description="Its base frame in the branch's frame.")
+    grasp_pose: Pose = (0.0,) * 6
+
+    _known = field_validator("model")(_known_model)
+    _near = field_validator("base_pose")(_in_metres)
+
+
+class WorkspaceEntry(_Entry):
+    """The box that the grasp stays in, branch frame."""
+
+    low_m: Vector
+    high_m: Vector
+
+    _near = field_validator("low_m", "high_m")(_in_metres)
+
+    @model_validator(mode="after")
+    def _order(self) -> "WorkspaceEntry":
+        if not all(low < high for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise ValueError("low_m must be below high_m in x, y and z")
+        return self
+
+
+class BoxEntry(_Entry):
+    """A box in the way."""
+
+    kind: Literal["box"] = "box"
+    name: str = ""
+    size_m: Vector = Field(description="Edge lengths.")
+    pose: Pose = Field(description="Of its middle, branch frame.")
+
+    @field_validator("size_m")
+    @classmethod
+    def _solid(cls, value: Vector) -> Vector:
+        if min(value) <= 0 or max(value) > _FAR:
+            raise ValueError("edge lengths must be positive and in metres")
+        return value
+
+
+class MeshEntry(_Entry):
+    """A closed surface in the way, branch frame."""
+
+    kind: Literal["mesh"] = "mesh"
+    name: str = ""
+    file: str = Field(description="STL, PLY or OBJ, beside the cell file.")
+    unit: Literal["m", "cm", "mm"] = "m"
+
+
+Obstacle = Annotated[BoxEntry | MeshEntry, Field(discriminator="kind")]
+
+
+class Cell(_Entry):
+    """Content of ``cell.toml``."""
+
+    format_version: Literal[1] = 1
+    branch: str | None = Field(None, description="Identity of the branch (branch.json) that "
+                               "base.pose was calibrated for.")
+    calibrated: str | None = Field(None, description="When, ISO 8601.")
+    robot: RobotEntry
+    base: BaseEntry
+    tool: ToolEntry = ToolEntry()
+    approach: ApproachEntry = ApproachEntry()
+    sensor: SensorEntry = SensorEntry()
+    limits: LimitsEntry = LimitsEntry()
+    camera: CameraEntry | None = None
+    second_arm: SecondArmEntry | None = None
+    workspace: WorkspaceEntry | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+
+    @model_validator(mode="after")
+    def _carries_its_tool(self) -> "Cell":
+        if (self.tool.mass_kg or 0.0) > self.arm.payload:
+            raise ValueError(f"tool.mass_kg is {self.tool.mass_kg:g}, and a {self.arm.name} "
+                             f"carries {self.arm.payload:g}")
+        return self
+
+    @property
+    def arm(self) -> Arm:
+        return arm_named(self.robot.model)
+
+    @property
+    def joint_limits(self) -> np.ndarray:
+        """The cell's limits of the joints [rad] within the arm's, shape [6, 2]."""
+        limits = self.arm.joint_limits
+        if self.robot.joint_limits_rad is None:
+            return limits
+        own = np.asarray(self.robot.joint_limits_rad, float)
+        return np.column_stack([np.maximum(limits[:, 0], own[:, 0]),
+                                np.minimum(limits[:, 1], own[:, 1])])
+
+    def flange_frames(self, grasp_poses: np.ndarray) -> np.ndarray:
+        """Return the flange's frames in the robot's base for grasp poses in the branch's frame.
+
+        Args:
+            grasp_poses: [m, rad], shape [..., 6].
+
+        Returns:
+            Shape [..., 4, 4].
+        """
+        return (inverted(matrices(self.base.pose)) @ matrices(grasp_poses)
+                @ inverted(matrices(self.tool.grasp_pose)))
+
+    def grasp_frames(self, flange_frames: np.ndarray) -> np.ndarray:
+        """Return the grasp's frames in the branch's frame for flange frames [..., 4, 4]."""
+        return (matrices(self.base.pose) @ np.asarray(flange_frames, float)
+                @ matrices(self.tool.grasp_pose))
+
+
+def read_cell(path: str | Path) -> Cell:
+    """Read a cell file.
+
+    Raises:
+        InputError: it cannot be read, is not TOML (the line is named), or an entry makes no sense
+            (the field is named).
+    """
+    path = Path(path)
+    content = read_toml(path, "the description of a robot's cell (TOML; `limber "
+                              "robot calibrate` makes one)", finite=False)
+    try:
+        return Cell.model_validate(content)
+    except ValidationError as error:
+        told = "; ".join(_told(path, item) for item in error.errors())
+        raise InputError(told, "The robot would be taken to stand or reach where it does not.",
+                         "Correct the entries; lengths are in metres, angles in radians.",
+                         ) from error
+
+
+def write_cell(path: str | Path, cell: Cell) -> None:
+    """Write a cell file; entries that are None are left out."""
+    write_atomically(Path(path), tomlkit.dumps(_without_none(plain(cell))))
+
+
+def _told(path: Path, item: dict) -> str:
+    place = ".".join(str(part) for part in item["loc"])
+    line = _line_of(path, item["loc"])
+    where = f"{path}, line {line}" if line else f"{path}"
+    message = item["msg"].removeprefix("Value error, ")
+    return f"{where}: {place}: {message}" if place else f"{where}: {message}"
+
+
+def _line_of(path: Path, location: tuple) -> int | None:
+    """The line of an entry: its key within its table. A table's own line where it is missing."""
+    names = [part for part in location if isinstance(part, str)]
+    table, found = "", None
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        text = line.strip()
+        if text.startswith("["):
+            table = text.strip("[] ").split("]")[0]
+            if names and table == names[0] and found is None:
+                found = number
+        key = text.split("=")[0].strip()
+        if "=" in text and ([table, key] if table else [key]) == names[:2 if table else 1]:
+            return number
+    return found
+
+
+def _without_none(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(item) for item in value]
+    return value

@@ -1,0 +1,70 @@
+"""Whether a cell, a branch and what was made for them belong together."""
+
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.robot.cell.cell import Cell
+
+_SAME_M, _SAME_RAD = 1e-3, 5e-3
+
+
+def require_payload(cell: Cell) -> None:
+    """Refuse to move an arm that is not told what it carries.
+
+    Raises:
+        InputError: the cell does not state the gripper's mass.
+    """
+    if cell.tool.mass_kg is None:
+        raise InputError("The cell file states no tool.mass_kg: the payload is not set.",
+                         "The controller would take the gripper's weight for a force on it, and "
+                         "so would the guard.", "Weigh the gripper; 0 for a bare flange.")
+
+
+def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
+    """Return a warning where a plan was made in no robot's cell.
+
+    Args:
+        made_for: What the plan's file says of its robot.
+
+    Raises:
+        InputError: it was made for another robot, another branch or another place of the base.
+    """
+    if not made_for:
+        return ("The plan was made in no robot's cell (`limber plan --cell`): obstacles and the "
+                "gripper's shape were not looked at.")
+    if made_for.get("model") != cell.arm.name:
+        raise InputError(f"The plan was made for a {made_for.get('model')}, the cell has a "
+                         f"{cell.arm.name}.", "Another arm reaches elsewhere and turns otherwise.",
+                         "Plan again with this cell.")
+    if made_for.get("branch") not in (None, cell.branch):
+        raise InputError(f"The plan was made in a cell of branch {made_for['branch']}, this one is "
+                         f"of {cell.branch}.", "The robot would reach to where another branch "
+                         "stands.", "Plan again with this cell.")
+    base = made_for.get("base_pose")
+    if base is not None:
+        off = np.abs(np.array(base, float) - np.array(cell.base.pose))
+        if off[:3].max() > _SAME_M or off[3:].max() > _SAME_RAD:
+            raise InputError(
+                f"The plan was made with the robot's base {1e3 * off[:3].max():.1f} mm and "
+                f"{np.degrees(off[3:].max()):.2f} degrees from where the cell has it now.",
+                "The cell was calibrated again since: reach and obstacles lie otherwise.",
+                "Plan again with this cell.")
+    return None
+
+
+def check_branch(cell: Cell, uuid: str | None, folder: object) -> str | None:
+    """Return a warning where the cell names no branch.
+
+    Raises:
+        InputError: the cell was calibrated for another branch.
+    """
+    if cell.branch is None:
+        return ("The cell file names no branch: that its base.pose was calibrated for this one is "
+                "taken on trust. `limber robot calibrate` writes it.")
+    if cell.branch != uuid:
+        raise InputError(f"The cell was calibrated for branch {cell.branch}, {folder} is {uuid}.",
+                         "The robot would reach to where another branch stands.",
+                         "Calibrate it for this branch: limber robot calibrate.")
+    return None

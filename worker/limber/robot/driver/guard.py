@@ -1,0 +1,517 @@
+"""The guard: one object that every motion of the robot passes.
+
+It is a pure state machine: samples and wishes go in, decisions come out; it opens no connection
+and reads no clock. After a stop nothing goes on by itself: a person acknowledges it and chooses.
+
+This is software on a computer that can stall, behind a network that can break. It is no certified
+safety function and claims no standard: the controller's own limits and the button on the pendant
+are what protects people.
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from limber.core.errors import SafetyStop
+from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
+from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
+from limber.robot.ur.arms import Arm
+from limber.robot.ur.kinematics import singularity_distance
+from limber.robot.ur.samples import Sample
+
+_RUNNING, _NORMAL, PLAYING = 7, 1, 2
+_SAME = 1e-9  # N, N m
+_DEVIATIONS = 2.0  # of a prediction that are allowed for
+_MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a difference lies
+_MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides pulls askew
+_PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, on a retreat
+_NO_DOUBT = np.zeros((6, 6))
+_RISES = "the {} rises on the way back"
+_UNLIKE = "force unlike the predicted one [N]"
+_SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
+_FELL = "the predicted force fell at once: the branch slipped, broke or came loose [N]"
+
+
+class State(Enum):
+    """What the guard allows."""
+
+    IDLE = "idle"
+    MOVING = "moving"
+    PAUSED = "paused"
+    STOPPED = "stopped"
+
+
+class Verdict(Enum):
+    """What is to be done after a sample."""
+
+    GO = "go"
+    PAUSE = "pause"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A verdict and its reason."""
+
+    verdict: Verdict
+    reason: str = ""
+    value: float = 0.0
+    limit: float = 0.0
+
+    def __str__(self) -> str:
+        if self.limit:
+            return f"{self.reason} ({self.value:.3g}, allowed {self.limit:.3g})"
+        return self.reason
+
+
+_GO = Decision(Verdict.GO)
+
+
+@dataclass(frozen=True)
+class GuardSettings:
+    """Limits of the guard.
+
+    Attributes:
+        limits: The cell's.
+        workspace: Box that the grasp stays in, branch frame, or None.
+        joint_limits: [rad], shape [6, 2].
+        longest_silence: Age at which data is lost [s].
+        frozen_time: How long a wrench may repeat to the last digit [s]; a living sensor's noise
+            never does.
+        filter_time: Time constant of the force that is compared with the predicted one [s]. The
+            hard limits look at every reading as it comes.
+        off_path: Distance from where the robot was sent [m].
+        lost_share: Share of its force that a held branch loses when it slips or breaks.
+        loss_time: Time in which such a loss counts as sudden [s].
+        least_force: Force below which a loss is not told from noise [N].
+        largest_torque_error: Of the torque against the predicted one [N m].
+        relief_way: Way of a retreat on which a force over the soft limit falls by ``least_force``
+            at least [m].
+        relief_time: The same for a slow one [s].
+    """
+
+    limits: LimitsEntry
+    joint_limits: np.ndarray
+    workspace: WorkspaceEntry | None = None
+    longest_silence: float = 0.05
+    frozen_time: float = 0.05
+    filter_time: float = 0.01
+    off_path: float = 0.01
+    lost_share: float = 0.4
+    loss_time: float = 0.5
+    least_force: float = 1.0
+    largest_torque_error: float = 1.0
+    relief_way: float = 0.02
+    relief_time: float = 10.0
+
+
+@dataclass
+class _Relief:
+    """What a retreat has brought down of what was over its limit.
+
+    Attributes:
+        force, torque: Least ones since it began [N], [N m].
+        excess: Least excess over each limit of the arm's place.
+        marked_force, marked_clock, marked_grasp: From where a fall is measured next.
+    """
+
+    force: float
+    torque: float
+    excess: dict[str, float] = field(default_factory=dict)
+    marked_force: float = np.inf
+    marked_clock: float = -np.inf
+    marked_grasp: np.ndarray | None = None
+
+
+@dataclass
+class _Memory:
+    """What the guard remembers of the last samples."""
+
+    clock: float | None = None
+    raw: np.ndarray | None = None
+    frozen_since: float = 0.0
+    filtered: np.ndarray | None = None
+    peak: float = 0.0
+    usual_off: np.ndarray | None = None
+    grasp: np.ndarray | None = None
+    way: np.ndarray | None = None
+    relief: _Relief | None = None
+
+
+class Guard:
+    """Watches one robot.
+
+    Attributes:
+        state: What it allows now.
+        reason: Why it stopped or paused last.
+    """
+
+    def __init__(self, arm: Arm, settings: GuardSettings, rate: float):
+        self._arm, self._settings, self._step = arm, settings, 1.0 / rate
+        self.state = State.IDLE
+        self.reason = ""
+        self._memory = _Memory()
+        self._is_tared = False
+
+    # What a person does
+
+    def tared(self) -> None:
+        """The force sensor has been tared: from now on its limits hold."""
+        self._is_tared = True
+
+    def begin(self) -> None:
+        """Allow a motion.
+
+        Raises:
+            SafetyStop: after a stop that was not acknowledged, while one is paused, or before the
+                force sensor was tared.
+        """
+        if self.state != State.IDLE:
+            raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
+                             "No motion begins before a person has looked.",
+                             "Choose: hold, retreat or release.")
+        if not self._is_tared:
+            raise SafetyStop("The force sensor is not tared.", "Its bias would pass for a force "
+                             "on the branch.", "Tare it with the gripper hanging free.")
+        self.state = State.MOVING
+        self._memory = _Memory()
+
+    def begin_retreat(self, wrench: np.ndarray) -> None:
+        """Allow a motion back along the way that was followed: a person has chosen it.
+
+        It is needed where something is over its limit. So each limit that is passed when it begins
+        gives way to the least value since then, plus what is allowed of a force that differs from
+        the predicted one: the motion stops where a force rises, or does not fall.
+
+        Args:
+            wrench: What the gripper exerts on the branch, smoothed [N, N m], shape [6].
+
+        Raises:
+            SafetyStop: the robot moves, or the force is not known.
+        """
+        if self.state == State.MOVING:
+            raise SafetyStop("The robot is moving.", "", "Stop it before it goes back.")
+        if not np.isfinite(wrench).all():
+            raise SafetyStop("The force is not known: the sensor shows no number, or is at the end "
+                             "of its range.", "Whether it falls on the way back could not be "
+                             "seen.", "Open the gripper.")
+        self.state = State.IDLE
+        self.begin()
+        self._memory.relief = _Relief(length(wrench[:3]), length(wrench[3:]))
+
+    def end(self) -> None:
+        """The motion is over."""
+        self._memory.relief = None
+        if self.state in (State.MOVING, State.PAUSED):
+            self.state = State.IDLE
+
+    def resume(self) -> None:
+        """Go on after a pause.
+
+        Raises:
+            SafetyStop: it is not paused.
+        """
+        if self.state != State.PAUSED:
+            raise SafetyStop(f"The robot is {self.state.value}, not paused.", self.reason,
+                             "Only a pause goes on; after a stop choose what to do.")
+        self.state = State.MOVING
+        self._memory.peak = 0.0
+
+    def acknowledge(self) -> None:
+        """A person has seen the stop; a new motion may be asked for."""
+        if self.state in (State.STOPPED, State.PAUSED):
+            self.state = State.IDLE
+
+    # What happens
+
+    def silence(self, age: float) -> Decision:
+        """No sample has come for ``age`` [s]."""
+        if age > self._settings.longest_silence:
+            return self._stop("no data from the robot [s]", age, self._settings.longest_silence)
+        return _GO
+
+    def event(self, reason: str) -> Decision:
+        """Something that no sample shows: a lost connection, a parent that is gone."""
+        return self._stop(reason)
+
+    def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,
+             expected: np.ndarray | None = None, doubt: np.ndarray | None = None,
+             grasp: np.ndarray | None = None, sent: np.ndarray | None = None) -> Decision:
+        """Judge a sample.
+
+        Args:
+            wrench: What the gripper exerts on the branch by the sensor in use, tared, branch
+                frame [N, N m], shape [6].
+            raw: The reading as it came and turned to the flange's axes, shape [2, 6]. A frozen
+                sensor repeats one of them to the last digit, whatever the robot turns.
+            expected: The same as the model predicts it, or None.
+            doubt: Covariance of that prediction, shape [6, 6]: what is allowed of the difference is
+                wider by twice its deviations, never by more than the soft force limit.
+            grasp: Where the grasp is, branch frame [m], shape [3].
+            sent: Where the tool was sent to be by now, base frame [m], shape [3], or None.
+        """
+        last, self._memory.grasp = self._memory.grasp, grasp
+        self._memory.way = None if last is None or grasp is None else grasp - last
+        for check in (self._check_clock(sample), self._check_modes(sample),
+                      self._check_wrench(sample, wrench, raw),
+                      self._check_place(sample, grasp, sent),
+                      self._check_expected(wrench, expected, doubt)):
+            if check.verdict == Verdict.STOP:
+                return check
+        if self._memory.relief is not None:
+            return self._check_relief(self._memory.relief, sample, wrench, grasp)
+        force = length(wrench[:3])
+        if self.state == State.MOVING and force > self._settings.limits.soft_force_n:
+            self.state = State.PAUSED
+            self.reason = "soft force limit"
+            return Decision(Verdict.PAUSE, "soft force limit [N]", force,
+                            self._settings.limits.soft_force_n)
+        if self.state == State.PAUSED:
+            return Decision(Verdict.PAUSE, self.reason)
+        return _GO
+
+    def permit(self, current: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
+        """Return a target [6] that keeps the speed limits, on the way from ``current`` to it.
+
+        Raises:
+            SafetyStop: nothing may move now, or the target is no pose.
+        """
+        if self.state != State.MOVING:
+            raise SafetyStop(f"The robot is {self.state.value}.", self.reason, "")
+        if target.shape != (6,) or not np.isfinite(target).all():
+            self._stop("a target that is no pose")
+            raise SafetyStop("A target that is no pose.", f"{target}", "")
+        limits = self._settings.limits
+        way = length(target[:3] - current[:3])
+        turn = length(turn_between(current, target))
+        part = min(1.0, limits.speed_m_s * seconds / way if way > 0 else 1.0,
+                   limits.turn_speed_rad_s * seconds / turn if turn > 0 else 1.0)
+        return target if part >= 1.0 else pose_between(current, target, part)
+
+    # Checks
+
+    def _check_clock(self, sample: Sample) -> Decision:
+        last, self._memory.clock = self._memory.clock, sample.clock
+        if not np.isfinite(sample.clock):
+            return self._stop("the controller's clock shows no number")
+        if last is None:
+            return _GO
+        passed = sample.clock - last
+        if passed <= 0:
+            return self._stop("the controller's clock went back [s]", passed, self._step)
+        if passed > self._settings.longest_silence + self._step:
+            return self._stop("the controller's clock jumped [s]", passed,
+                              self._settings.longest_silence)
+        return _GO
+
+    def _check_modes(self, sample: Sample) -> Decision:
+        if sample.safety_mode != _NORMAL:
+            return self._stop(_SAFETY.get(sample.safety_mode, f"safety mode {sample.safety_mode}"))
+        if sample.robot_mode != _RUNNING:
+            return self._stop(f"robot mode {sample.robot_mode}: it is not running")
+        if self.state in (State.MOVING, State.PAUSED) and sample.runtime_state != PLAYING:
+            return self._stop("the program on the controller was stopped")
+        return _GO
+
+    def _check_wrench(self, sample: Sample, wrench: np.ndarray, raw: np.ndarray) -> Decision:
+        numbers = np.concatenate((wrench, sample.wrench, sample.pose, sample.joints, sample.speed))
+        if not np.isfinite(numbers).all():
+            return self._stop("a sensor shows no number")
+        memory = self._memory
+        # Turning a wrench to other axes and back leaves rounding in its last digits.
+        if memory.raw is None or np.abs(raw - memory.raw).max(axis=1).min() > _SAME:
+            memory.frozen_since = sample.clock
+        memory.raw = raw.copy()
+        if sample.clock - memory.frozen_since > self._settings.frozen_time:
+            return self._stop("the force sensor is frozen [s]",
+                              sample.clock - memory.frozen_since, self._settings.frozen_time)
+        return self.feel(wrench)
+
+    def feel(self, wrench: np.ndarray) -> Decision:
+        """Judge a force [6] by the hard limits alone: it came between two samples."""
+        limits = self._settings.limits
+        if not self._is_tared:
+            # Nothing moves yet, and what a sensor shows before its tare is its bias.
+            return _GO
+        if np.isnan(wrench).any():
+            return self._stop("a sensor shows no number")
+        force, torque = length(wrench[:3]), length(wrench[3:])
+        most_force, most_torque = limits.hard_force_n, limits.hard_torque_nm
+        told = "hard {} limit"
+        if (relief := self._memory.relief) is not None:
+            told = _RISES
+            most_force = max(most_force, self._relieved_force(relief))
+            most_torque = max(most_torque, self._relieved_torque(relief))
+        if force > most_force:
+            return self._stop(told.format("force") + " [N]", force, most_force)
+        if torque > most_torque:
+            return self._stop(told.format("torque") + " [N m]", torque, most_torque)
+        return _GO
+
+    def _relieved_force(self, relief: _Relief) -> float:
+        return relief.force + max(self._settings.limits.unexpected_force_n,
+                                  self._settings.least_force)
+
+    def _relieved_torque(self, relief: _Relief) -> float:
+        return relief.torque + self._settings.largest_torque_error
+
+    def _check_relief(self, relief: _Relief, sample: Sample, wrench: np.ndarray,
+                      grasp: np.ndarray | None) -> Decision:
+        """Judge a sample of a retreat: what is over a limit falls, or it stops."""
+        settings, limits = self._settings, self._settings.limits
+        smooth = self._filtered(wrench)
+        force, torque = length(smooth[:3]), length(smooth[3:])
+        relief.force, relief.torque = min(relief.force, force), min(relief.torque, torque)
+        most = max(limits.soft_force_n, self._relieved_force(relief))
+        if force > most:
+            return self._stop(_RISES.format("force") + " [N]", force, most)
+        most = max(limits.hard_torque_nm, self._relieved_torque(relief))
+        if torque > most:
+            return self._stop(_RISES.format("torque") + " [N m]", torque, most)
+        mark = relief.marked_grasp
+        has_gone = (mark is not None and grasp is not None
+                    and length(grasp - mark) > settings.relief_way)
+        if mark is None or has_gone or sample.clock - relief.marked_clock > settings.relief_time:
+            if force > limits.soft_force_n and force > relief.marked_force - settings.least_force:
+                return self._stop("the force does not fall on the way back [N]", force,
+                                  limits.soft_force_n)
+            relief.marked_force, relief.marked_clock, relief.marked_grasp = (
+                force, sample.clock, grasp)
+        return _GO
+
+    def _is_over(self, name: str, excess: float, slack: float) -> bool:
+        """Whether the arm is past a limit of its place by ``excess``; on a retreat it may be, as
+        long as that does not grow by more than ``slack``."""
+        relief = self._memory.relief
+        if excess <= 0 or relief is None:
+            return excess > 0
+        least = relief.excess[name] = min(relief.excess.get(name, excess), excess)
+        return excess > least + slack
+
+    def _filtered(self, wrench: np.ndarray) -> np.ndarray:
+        """Return the force [6] that is compared with the predicted one; ``wrench`` enters it."""
+        kept = np.exp(-self._step / self._settings.filter_time)
+        before = wrench if self._memory.filtered is None else self._memory.filtered
+        self._memory.filtered = kept * before + (1 - kept) * wrench
+        return self._memory.filtered
+
+    def _check_place(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
+                     ) -> Decision:
+        limits, settings = self._settings.limits, self._settings
+        speed = length(sample.speed[:3])
+        if speed > 1.5 * limits.speed_m_s + 0.005:
+            return self._stop("speed [m/s]", speed, limits.speed_m_s)
+        margin = np.minimum(sample.joints - settings.joint_limits[:, 0],
+                            settings.joint_limits[:, 1] - sample.joints)
+        joint = int(margin.argmin())
+        if self._is_over(f"joint {joint}", 0.5 * limits.joint_margin_rad - float(margin[joint]),
+                         _PLACE_SLACK):
+            return self._stop(f"joint {joint + 1} at its limit")
+        distance = float(singularity_distance(self._arm, sample.joints).min())
+        if self.state == State.MOVING and self._is_over(
+                "singularity", 0.5 * limits.singularity - distance, _PLACE_SLACK):
+            return self._stop("singularity", distance, 0.5 * limits.singularity)
+        box = settings.workspace
+        if box is not None and grasp is not None and self.state == State.MOVING:
+            outside = float(np.maximum(np.array(box.low_m) - grasp,
+                                       grasp - np.array(box.high_m)).max())
+            if self._is_over("workspace", outside - 1e-3, 1e-3):
+                return self._stop("the grasp left the workspace")
+        if sent is not None and self.state == State.MOVING:
+            off = length(sample.pose[:3] - sent)
+            if off > settings.off_path:
+                return self._stop("off its path [m]", off, settings.off_path)
+        return _GO
+
+    def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None,
+                        doubt: np.ndarray | None) -> Decision:
+        settings, memory = self._settings, self._memory
+        if self.state not in (State.MOVING, State.PAUSED):
+            return _GO
+        if memory.relief is not None:
+            # A force that falls at once is what a retreat is for.
+            return _GO
+        filtered = self._filtered(wrench)
+        force = length(filtered[:3])
+        if expected is None:
+            # Nothing is predicted while E is being measured: a sudden loss still tells a slip, but
+            # not while the branch is let back and pulls the way that the gripper goes.
+            if memory.way is not None and float(memory.way @ filtered[:3]) < 0:
+                memory.peak = force
+            memory.peak = max(memory.peak * np.exp(-self._step / settings.loss_time), force)
+            lost = memory.peak - force
+            if lost > max(settings.lost_share * memory.peak, settings.least_force):
+                return self._stop("the force fell at once: slip or break [N]", lost,
+                                  max(settings.lost_share * memory.peak, settings.least_force))
+            return _GO
+        doubt = _NO_DOUBT if doubt is None else doubt
+        wanted = length(expected[:3])
+        if wanted > settings.least_force:
+            along = float(filtered[:3] @ expected[:3]) / wanted
+            unsure = _DEVIATIONS * float(np.sqrt(max(
+                expected[:3] @ doubt[:3, :3] @ expected[:3], 0.0))) / wanted
+            if along < (1 - settings.lost_share) * wanted - settings.least_force - unsure:
+                return self._stop("the branch slipped, broke or was never held: force along the "
+                                  "predicted one [N]", along, wanted)
+        limits = settings.limits
+        off = filtered - expected
+        before = self._usual_off(off[:3])
+        for name, part, allowed, most in (
+                (None, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
+                ("torque unlike the predicted one [N m]", slice(3, 6),
+                 settings.largest_torque_error, limits.hard_torque_nm)):
+            error = length(off[part])
+            if error > allowed:
+                within = _allowed(off[part], doubt[part, part], allowed, most)
+                if error > within:
+                    return self._stop(name or self._force_named(off[:3], expected[:3], before),
+                                      error, within)
+        return _GO
+
+    def _usual_off(self, off: np.ndarray) -> np.ndarray:
+        """Return the usual difference to the expected force [3] up to now; ``off`` enters it."""
+        memory = self._memory
+        before = off if memory.usual_off is None else memory.usual_off
+        kept = np.exp(-self._step / self._settings.loss_time)
+        memory.usual_off = kept * before + (1 - kept) * off
+        return before
+
+    def _force_named(self, off: np.ndarray, expected: np.ndarray, before: np.ndarray) -> str:
+        """Return what a force [3] beside the expected one [3] is called: what it most often is.
+
+        Args:
+            off: The difference, shape [3].
+            before: What it usually was up to now, shape [3].
+        """
+        wanted, missing = length(expected), -float(off @ expected)
+        if wanted <= self._settings.least_force:
+            return _UNLIKE
+        size = length(off)
+        at_once = length(off - before) > 0.5 * size
+        if at_once and missing > _MOSTLY_AT_ONCE * wanted * size:
+            return _FELL
+        return _SHORT if missing > _MOSTLY * wanted * size else _UNLIKE
+
+    def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
+        decision = Decision(Verdict.STOP, reason, value, limit)
+        self._memory.relief = None
+        if self.state != State.STOPPED:
+            self.state = State.STOPPED
+            self.reason = str(decision)
+        return decision
+
+
+def _allowed(off: np.ndarray, covariance: np.ndarray, least: float, most: float) -> float:
+    """How large a difference may be in the direction of ``off`` [3], which is not 0.
+
+    The border is an ellipsoid: ``least``, wider by deviations of the prediction up to ``most``.
+    """
+    squares, axes = np.linalg.eigh(covariance)
+    radii = least**2 + np.minimum(_DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)
+    along = axes.T @ (off / length(off))
+    return float(1.0 / np.sqrt((along**2 / radii).sum()))
+
+
+_SAFETY = {3: "protective stop", 4: "recovery mode", 5: "safeguard stop", 6: "emergency stop",
+           7: "emergency stop", 8: "safety violation", 9: "safety fault"}

@@ -1,0 +1,252 @@
+"""The other side of the driver's pipe: what `record`, `execute` and the session hold."""
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.core.processes.ending import end_by_closing
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.deadline import CALL_SECONDS, ended_by_deadline
+from limber.robot.motion.trajectory import Trajectory
+
+_CONNECT_SECONDS = 25.0
+_BEAT_SECONDS = 0.2
+_STANDS_SECONDS = 0.3
+_ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop}
+
+COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
+           "fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm",
+           "smooth_fx_n", "smooth_fy_n", "smooth_fz_n",
+           "smooth_tx_nm", "smooth_ty_nm", "smooth_tz_nm",
+           "q1_rad", "q2_rad", "q3_rad", "q4_rad", "q5_rad", "q6_rad",
+           "expected_fx_n", "expected_fy_n", "expected_fz_n",
+           "expected_tx_nm", "expected_ty_nm", "expected_tz_nm",
+           "expected_xx_n2", "expected_xy_n2", "expected_xz_n2",
+           "expected_yy_n2", "expected_yz_n2", "expected_zz_n2")
+"""What a row of samples holds: grasp pose and wrench on the branch, in the branch's frame; the
+last six are the covariance of the expected force."""
+
+
+class RobotLink:
+    """A robot in a driver process; a context manager.
+
+    Args:
+        cell: The robot's cell.
+        on_samples: Called with each batch of samples, shape [n, 37] as in :data:`COLUMNS`, from a
+            thread of its own.
+        python: Interpreter that has ur-rtde; by default this one.
+
+    Raises:
+        LimberError: no robot answers, or it cannot be moved now; the reason is the driver's.
+    """
+
+    def __init__(self, cell: Cell, on_samples: Callable[[np.ndarray], None] | None = None,
+                 python: str | None = None):
+        self._on_samples = on_samples
+        self._news = threading.Condition()
+        self._sampled = threading.Event()
+        self._latest = np.empty(0)
+        self._events: list[dict[str, Any]] = []
+        self.warnings: list[str] = []
+        self._ended = False
+        command = [python or sys.executable, "-m", "limber.robot.driver.driver"]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                        stderr=subprocess.DEVNULL, text=True, encoding="utf-8")
+        self._write_lock = threading.Lock()
+        self._closing = threading.Event()
+        self._write(cell.model_dump_json())
+        threading.Thread(target=self._read, name="robot samples", daemon=True).start()
+        try:
+            self.facts = self.wait("connected", seconds=_CONNECT_SECONDS)
+        except BaseException:
+            self.close()
+            raise
+        threading.Thread(target=self._beat, name="robot keep-alive", daemon=True).start()
+
+    def __enter__(self) -> "RobotLink":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def wait_for_samples(self, seconds: float = 5.0) -> np.ndarray:
+        """Return the last of the next samples that come, shape [37] as in :data:`COLUMNS`.
+
+        Raises:
+            WorkError: none come.
+        """
+        self._sampled.clear()
+        if not self._sampled.wait(seconds):
+            raise WorkError(f"The robot's driver sends no samples in {seconds:.0f} s.",
+                            "A port may be silent.", "Look at the robot.")
+        return self._latest
+
+    def tare(self, seconds: float = 0.5) -> dict[str, Any]:
+        """Take the present force as nothing; the gripper hangs free and still."""
+        self._order(order="tare", seconds=seconds)
+        return self.wait("tared", seconds=seconds + 5.0)
+
+    def start(self, trajectory: Trajectory) -> None:
+        """Begin to follow a trajectory.
+
+        Raises:
+            SafetyStop: the guard or the driver refuses.
+        """
+        expected = trajectory.expected
+        self._order(order="follow", times=trajectory.times.tolist(),
+                    poses=trajectory.poses.tolist(),
+                    start_joints=None if trajectory.joints is None
+                    else trajectory.joints[0].tolist(),
+                    expected=None if expected is None else {
+                        name: value.tolist() for name, value in vars(expected).items()})
+        self.wait("started", seconds=5.0)
+
+    def follow(self, trajectory: Trajectory) -> dict[str, Any]:
+        """Follow a trajectory to its end; returns the event that ended it.
+
+        That is ``reached``, ``stopped`` or ``paused``, with its reason.
+
+        Raises:
+            SafetyStop: it was refused. WorkError: the driver is gone.
+        """
+        self.start(trajectory)
+        return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
+
+    def retreat(self) -> dict[str, Any]:
+        """Go back the way it came, slower; a person has asked for it.
+
+        Returns:
+            The event that ended it: ``reached``, or ``stopped`` with its reason, as where the force
+            does not fall on the way.
+
+        Raises:
+            SafetyStop: there is no way back, or the arm left it. WorkError: the driver is gone.
+        """
+        # Until the arm stands, and the smoothed force is that of where it stands.
+        time.sleep(_STANDS_SECONDS)
+        self._order(order="retreat")
+        self.wait("started", seconds=5.0)
+        return self.wait("reached", "stopped", "paused", seconds=600.0)
+
+    def acknowledge(self) -> None:
+        """A person has seen the stop."""
+        self._order(order="acknowledge")
+        self.wait("acknowledged", seconds=5.0)
+
+    def resume(self) -> dict[str, Any]:
+        """Go on after a pause, to the end of the trajectory."""
+        self._order(order="resume")
+        self.wait("resumed", seconds=5.0)
+        return self.wait("reached", "stopped", "paused", seconds=600.0)
+
+    def gripper(self, close: bool) -> None:
+        """Close or open the gripper."""
+        self._order(order="gripper", close=close)
+        self.wait("gripper", seconds=10.0)
+
+    def stop(self) -> None:
+        """Stop now."""
+        self._order(order="stop")
+
+    def wait(self, *kinds: str, seconds: float) -> dict[str, Any]:
+        """Return the next event of one of ``kinds``.
+
+        Raises:
+            LimberError: the driver refused or failed, or its process ended.
+        """
+        end = time.monotonic() + seconds
+        with self._news:
+            while True:
+                while self._events:
+                    event = self._events.pop(0)
+                    kind = event["event"]
+                    if kind in kinds:
+                        return event
+                    if kind == "refused":
+                        raise SafetyStop(event["reason"])
+                    if kind == "failed":
+                        raise _ERRORS.get(event.get("code", 3), WorkError)(event["reason"])
+                    if kind in ("warning", "second_channel"):
+                        self.warnings.append(event.get("text") or event["reason"])
+                if self._ended:
+                    raise self._why_it_ended()
+                left = end - time.monotonic()
+                if left <= 0:
+                    raise WorkError(f"The robot's driver says nothing of {' or '.join(kinds)} "
+                                    f"for {seconds:.0f} s.", "A port may be silent.",
+                                    "Look at the robot.")
+                self._news.wait(left)
+
+    def _why_it_ended(self) -> LimberError:
+        try:
+            code = self.process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            code = None
+        if ended_by_deadline(code):
+            return SafetyStop(
+                "The robot was stopped: the controller did not answer its driver for "
+                f"{CALL_SECONDS:g} s, and the driver was ended.", "Its connection carries one way "
+                "alone, or not at all.", "Look at the robot, which its own watchdog has stopped; "
+                "check the cable and the network before connecting again.")
+        return WorkError("The robot's driver has ended.", "Its connection broke.",
+                         "Look at the robot; its own watchdog has stopped it.")
+
+    def abandon(self) -> None:
+        """Close the pipe without a word, as a program does that is killed."""
+        self._closing.set()
+        with self._write_lock:
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+
+    def close(self) -> None:
+        """Stop what moves and end the process."""
+        self._closing.set()
+        with self._write_lock:
+            end_by_closing(self.process)
+
+    def _order(self, **content: Any) -> None:
+        self._write(json.dumps(content))
+
+    def _write(self, line: str) -> None:
+        assert self.process.stdin is not None
+        with self._write_lock:
+            try:
+                self.process.stdin.write(line + "\n")
+                self.process.stdin.flush()
+            except (OSError, ValueError) as error:
+                raise WorkError(f"The robot's driver is gone ({error}).") from error
+
+    def _beat(self) -> None:
+        while not self._closing.wait(_BEAT_SECONDS):
+            try:
+                self._order(order="alive")
+            except WorkError:
+                return
+
+    def _read(self) -> None:
+        for line in self.process.stdout or ():
+            try:
+                content = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            if "samples" in content:
+                rows = np.array([[np.nan if x is None else x for x in row]
+                                 for row in content["samples"]], float)
+                if self._on_samples is not None:
+                    self._on_samples(rows)
+                self._latest = rows[-1]
+                self._sampled.set()
+                continue
+            with self._news:
+                self._events.append(content)
+                self._news.notify_all()
+        with self._news:
+            self._ended = True
+            self._news.notify_all()

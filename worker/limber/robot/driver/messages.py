@@ -1,0 +1,45 @@
+"""What a driver tells its parent, without ever waiting for it."""
+
+import json
+import queue
+import threading
+from typing import Any, TextIO
+
+from limber.robot.driver.real_time import claim_real_time
+
+
+class Words:
+    """What the driver says, written by a thread of its own.
+
+    A program that is slow to read fills its pipe within a third of a second; a loop that waited
+    for it would starve the controller's watchdog.
+
+    Args:
+        out: Where events go, a JSON object a line.
+    """
+
+    def __init__(self, out: TextIO):
+        self._out = out
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="words", daemon=True)
+        self._thread.start()
+
+    def tell(self, **content: Any) -> None:
+        """Send an event; returns at once."""
+        self._lines.put(json.dumps(content))
+
+    def close(self, seconds: float = 2.0) -> None:
+        """Wait until all is said, at most so long."""
+        self._lines.put(None)
+        self._thread.join(seconds)
+
+    def _write(self) -> None:
+        # It shares the interpreter's lock with the loop, which must not wait for it to be run.
+        claim_real_time()
+        while (line := self._lines.get()) is not None:
+            try:
+                self._out.write(line + "\n")
+                self._out.flush()
+            except OSError:
+                # Nobody listens; that the parent is gone the end of the orders tells.
+                return

@@ -1,0 +1,1 @@
+"""A planned path as motion of a robot: joints, times, expected wrenches, retreat."""

@@ -1,0 +1,213 @@
+"""A planned path as motion of a robot: joints, times, expected wrenches, approach and return."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.core.errors import InputError, NoPathError
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, at_places
+from limber.robot.motion.joint_path import JointPath, follow, no_branch
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
+
+_WITHIN = 7.815  # squared deviations that hold 95 % of a vector's draws
+_TURNS = 12  # directions about the branch from which the gripper may come
+_MOST_TRIED = 24  # ways of taking the path that are held against obstacles
+
+Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
+"""What is in the way of flange frames [n, 4, 4] at joint angles [n, 6]; None: nothing."""
+
+
+@dataclass(frozen=True)
+class RobotMotion:
+    """What a robot will do to take a branch along a path.
+
+    Poses are of the gripper's middle in the robot's base frame.
+
+    Attributes:
+        approach: From before the branch to the grasp.
+        path: With the branch held.
+        joints: Of approach and path together, one continuous branch.
+        rotation: Of the gripper at the grasp, branch frame, as a rotation vector [rad].
+    """
+
+    approach: Trajectory
+    path: Trajectory
+    joints: JointPath
+    rotation: np.ndarray
+
+    @property
+    def way_back(self) -> Trajectory:
+        """The path reversed, with what is expected on it."""
+        return self.path.backwards()
+
+    @property
+    def leaving(self) -> Trajectory:
+        """The approach reversed."""
+        return replace(self.approach.backwards(), expected=None)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """One way of taking the path: approach and steps of the gripper's middle, base frame."""
+
+    rotation: np.ndarray
+    approach: np.ndarray
+    steps: np.ndarray
+    path: np.ndarray
+    flange: np.ndarray
+    joints: JointPath
+
+
+def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
+                 speed: float, rotation: np.ndarray | None = None,
+                 blocked: Blocked | None = None) -> RobotMotion:
+    """Turn a path of the grasped piece of branch into motion of the robot.
+
+    Of all directions of approach across the branch and all branches of the inverse kinematics
+    that one is taken which keeps farthest from singularities, and is not blocked.
+
+    Args:
+        predicted: The grasped piece from its rest pose on, and what is felt of it.
+        axis: Direction of the branch at the grasp, branch frame, shape [3].
+        speed: Of the gripper [m/s].
+        rotation: Of the gripper at the grasp, branch frame [rad], shape [3], if it is given.
+
+    Raises:
+        InputError: the speed is over the cell's.
+        NoPathError: no branch of the inverse kinematics carries the motion, or all are blocked;
+            says where and why.
+    """
+    if speed > cell.limits.speed_m_s:
+        raise InputError(f"{speed:g} m/s is over the cell's {cell.limits.speed_m_s:g} m/s.",
+                         "The guard would slow it down and the force would not fit the time.",
+                         "Ask for less, or raise limits.speed_m_s in the cell file.")
+    wanted = across(axis) if rotation is None else [np.asarray(rotation, float)]
+    ways: list[_Way] = []
+    refusal: NoPathError | None = None
+    for turn in wanted:
+        found = _ways(cell, predicted.poses, turn)
+        if isinstance(found, NoPathError):
+            refusal = refusal or found
+        else:
+            ways += found
+    ways.sort(key=lambda way: -way.joints.singularity)
+    for way in ways[:_MOST_TRIED]:
+        met = None if blocked is None else blocked(way.flange, way.joints.joints)
+        if met is None:
+            return _timed(cell, predicted, way, speed)
+        refusal = met if way is ways[0] else refusal
+    assert refusal is not None
+    raise refusal
+
+
+def across(axis: np.ndarray) -> list[np.ndarray]:
+    """Return rotations [rad] of a gripper that comes across a branch along ``axis`` [3].
+
+    The gripper's z is the way it comes, its y lies along the branch.
+    """
+    y = np.asarray(axis, float) / np.linalg.norm(axis)
+    side = np.cross(y, [0.0, 0.0, 1.0])
+    if np.linalg.norm(side) < 0.1:
+        side = np.cross(y, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    found = []
+    for angle in np.arange(_TURNS) * 2 * np.pi / _TURNS:
+        z = Rotation.from_rotvec(angle * y).apply(side)
+        for sign in (1.0, -1.0):
+            frame = np.column_stack([np.cross(sign * y, z), sign * y, z])
+            found.append(Rotation.from_matrix(frame).as_rotvec())
+    return found
+
+
+def _ways(cell: Cell, poses: np.ndarray, rotation: np.ndarray) -> list[_Way] | NoPathError:
+    """Return the ways of taking the grasp along ``poses`` [n, 6], or why there is none."""
+    grip = inverted(matrices(poses[0])) @ matrices(np.r_[poses[0, :3], rotation])
+    held = matrices(poses) @ grip
+    back = held[0].copy()
+    way = held[0, :3, :3] @ np.array(cell.approach.direction)
+    back[:3, 3] -= cell.approach.distance_m * way
+    base = inverted(matrices(np.array(cell.base.pose)))
+    approach = densely(pose_vectors(base @ np.array([back, held[0]])))
+    steps = pose_vectors(base @ held)
+    path = densely(steps)
+    tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
+    flange = matrices(np.vstack([approach, path[1:]])) @ tool
+    found, refusals = follow(cell.arm, flange, joint_limits=cell.joint_limits,
+                             singularity_margin=cell.limits.singularity,
+                             joint_margin=cell.limits.joint_margin_rad)
+    if not found:
+        return no_branch(refusals, flange)
+    return [_Way(rotation, approach, steps, path, flange, joints) for joints in found]
+
+
+def _timed(cell: Cell, predicted: Predicted, way: _Way, speed: float) -> RobotMotion:
+    """Return the motion on a way, with what is expected along it."""
+    limits, steps, path = cell.limits, way.steps, way.path
+    times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
+    # What is predicted stands at the plan's poses: carried to the dense ones by the way between.
+    ways = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
+    dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
+    expected = at_places(predicted, ways, dense).felt(cell, path[0])
+    coming = along(way.approach, speed, limits.acceleration_m_s2)
+    first = len(way.approach)
+    # The last pose of the approach is the first of the path.
+    coming_joints, joints = way.joints.joints[:first], way.joints.joints[first - 1:]
+    return RobotMotion(Trajectory(coming, way.approach, ExpectedWrench.nothing(way.approach),
+                                  coming_joints),
+                       Trajectory(times, path, expected, joints), way.joints, way.rotation)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How well a robot followed a path, from its samples.
+
+    Attributes:
+        peak_force: Greatest force on the branch [N].
+        path_error: Greatest distance of the grasp from the path [m].
+        force_error: Share of the peak force by which the smoothed force differs from the
+            expected one, 95 % of the samples below it; NaN without expected forces.
+        force_within: Share of the samples whose force differs from the expected one by less than
+            5 % of the peak, or lies in the 95 % interval of the two together; NaN likewise.
+    """
+
+    peak_force: float
+    path_error: float
+    force_error: float
+    force_within: float
+
+
+def followed(samples: np.ndarray, path: np.ndarray, force_sigma: float = 0.0) -> Followed:
+    """Compare what a robot did with what was planned and expected.
+
+    Args:
+        samples: As in :data:`limber.robot.driver.link.COLUMNS`.
+        path: [m], branch frame, shape [n, 3].
+        force_sigma: Of the smoothed force: noise, tare and drift of the sensor [N].
+    """
+    force = samples[:, 13:16]
+    # Distance from segments, not from points.
+    start, way = path[:-1], np.diff(path, axis=0)
+    length = np.maximum((way**2).sum(axis=1), 1e-18)
+    nearest = np.full(len(samples), np.inf)
+    for a, step, square in zip(start, way, length, strict=True):
+        part = np.clip((samples[:, 1:4] - a) @ step / square, 0, 1)
+        nearest = np.minimum(nearest, np.linalg.norm(
+            samples[:, 1:4] - a - part[:, None] * step, axis=1))
+    expected = samples[:, 25:28]
+    known = np.isfinite(expected).all(axis=1)
+    peak = float(np.linalg.norm(force, axis=1).max())
+    error = within = float("nan")
+    if known.any():
+        largest = max(float(np.linalg.norm(expected[known], axis=1).max()), 1e-9)
+        off = force[known] - expected[known]
+        size = np.linalg.norm(off, axis=1)
+        error = float(np.quantile(size, 0.95) / largest)
+        covariance = np.nan_to_num(samples[known, 31:37])[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+        covariance = covariance.reshape(-1, 3, 3) + max(force_sigma, 1e-6) ** 2 * np.eye(3)
+        distance = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+        within = float(np.mean((size <= 0.05 * largest) | (distance <= _WITHIN)))
+    return Followed(peak, float(nearest.max()), error, within)

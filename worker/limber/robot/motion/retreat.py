@@ -1,0 +1,94 @@
+"""The way that an arm has come, as it was measured, for a retreat along it."""
+
+import numpy as np
+
+from limber.core.errors import SafetyStop
+from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.robot.motion.start_check import POSITION_M, ROTATION_RAD, different_joints
+from limber.robot.motion.trajectory import Trajectory, along
+from limber.robot.ur.samples import Sample
+
+_APART_M, _APART_RAD = 1e-3, 0.005  # between the places that are kept
+_SAME = 0.3  # of what is bridged at a start: so near, two places of the way are one
+_STANDS = 1e-5  # m and rad, of an arm that has not moved
+_SLOWER = 0.5
+_LEAST_SPEEDS = np.array([1e-3, 1e-2])  # m/s, rad/s
+
+
+class WayBack:
+    """Where an arm was since the gripper closed, or since the motion began."""
+
+    def __init__(self) -> None:
+        self._poses: list[np.ndarray] = []
+        self._joints: list[np.ndarray] = []
+        self._speeds = _LEAST_SPEEDS
+        self._rest: np.ndarray | None = None
+
+    def begin(self, sample: Sample, trajectory: Trajectory) -> None:
+        """A trajectory is followed from ``sample`` on.
+
+        Legs on which the same branch is held, from the same pose of rest, are one way.
+        """
+        rest = None if trajectory.expected is None else trajectory.expected.rest_pose
+        if rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0:
+            self._poses, self._joints, self._speeds = [], [], _LEAST_SPEEDS
+        self._rest = rest
+        self._speeds = np.maximum(self._speeds, trajectory.greatest_speeds)
+        self._keep(sample)
+
+    def note(self, sample: Sample) -> None:
+        """The arm is followed to ``sample``; it is kept where it moved."""
+        last = self._poses[-1]
+        if (length(sample.pose[:3] - last[:3]) > _APART_M
+                or length(turn_between(last, sample.pose)) > _APART_RAD):
+            self._keep(sample)
+
+    def _keep(self, sample: Sample) -> None:
+        self._poses.append(sample.pose.copy())
+        self._joints.append(sample.joints.copy())
+
+    def from_here(self, sample: Sample, acceleration: float) -> Trajectory:
+        """Return the way from ``sample`` back to where it began, half as fast as it came.
+
+        What lies between the first and the last time that the arm was here is left out: a pull
+        that was stopped on its own way back is not pulled out again.
+
+        Args:
+            acceleration: [m/s^2].
+
+        Raises:
+            SafetyStop: there is no way back, the arm left it, or stands otherwise than on it.
+        """
+        if not self._poses:
+            raise SafetyStop("There is no way back.", "Nothing was followed yet.", "")
+        poses = np.array(self._poses)
+        off = np.linalg.norm(poses[:, :3] - sample.pose[:3], axis=1) / POSITION_M
+        # Turns of those alone that are near: a long way has many, and the watchdog waits.
+        for number in np.flatnonzero(off <= max(1.0, float(off.min()))):
+            turn = length(turn_between(poses[number], sample.pose)) / ROTATION_RAD
+            off[number] = max(off[number], turn)
+        nearest = int(off.argmin())
+        if off[nearest] > 1.0:
+            away = length(sample.pose[:3] - poses[nearest, :3])
+            turn = np.degrees(length(turn_between(poses[nearest], sample.pose)))
+            raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees from the way "
+                             "that it came.", "Something has moved it since.",
+                             "Free the branch by hand.")
+        if told := different_joints(sample.joints, self._joints[nearest]):
+            raise SafetyStop(f"The arm does not stand as it came: {'; '.join(told)}.",
+                             "Something has moved it since.", "Free the branch by hand.")
+        if length(sample.pose - poses[0]) < _STANDS:
+            raise SafetyStop("There is no way back.", "The arm stands where it began.", "")
+        # At least to the start: against something stiff a fraction of a millimetre is a way.
+        back = np.vstack([sample.pose, poses[:max(_first_time(off), 1)][::-1]])
+        speed, turn_speed = _SLOWER * self._speeds
+        return Trajectory(along(back, speed, acceleration, turn_speed=turn_speed), back)
+
+
+def _first_time(off: np.ndarray) -> int:
+    """Return the nearest place of a way when it first passed here, from its distances [n]."""
+    near = off <= off.min() + _SAME
+    begin = int(near.argmax())
+    gone = np.flatnonzero(~near[begin:])
+    end = begin + int(gone[0]) if len(gone) else len(off)
+    return begin + int(off[begin:end].argmin())

@@ -1,0 +1,115 @@
+"""Poses over time, for the robot to follow, with the wrench that the model expects at each."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
+from limber.robot.motion.expected_wrench import ExpectedWrench
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the tool is to be when.
+
+    Attributes:
+        times: [s], from 0, ascending, shape [n].
+        poses: Of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
+        expected: What the gripper will feel of the branch at each pose, or None where nothing is
+            predicted.
+        joints: Joint angles for which reach, limits and obstacles were checked at each pose [rad],
+            shape [n, 6]; None where nothing was checked.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    expected: ExpectedWrench | None = None
+    joints: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shaped = (self.times.ndim == 1 and len(self.times) >= 2
+                  and self.poses.shape == (len(self.times), 6))
+        if not shaped or not np.isfinite(self.poses).all() or np.any(np.diff(self.times) <= 0):
+            raise InputError(f"A trajectory of {self.times.shape} times and {self.poses.shape} "
+                             "poses.", "It needs ascending times and one finite pose each.",
+                             "Check the path.")
+        if self.expected is not None and (
+                self.expected.wrenches.shape != self.poses.shape
+                or not all(np.isfinite(part).all() for part in (
+                    self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
+            raise InputError("Expected wrenches that do not fit the poses.",
+                             "Each pose has one of six numbers.", "Check the plan.")
+        if self.joints is not None and (self.joints.shape != self.poses.shape
+                                        or not np.isfinite(self.joints).all()):
+            raise InputError(f"Joint angles of shape {self.joints.shape} for {len(self.poses)} "
+                             "poses, or not finite.", "Each pose has six.", "Check the path.")
+
+    @property
+    def duration(self) -> float:
+        return float(self.times[-1])
+
+    @property
+    def greatest_speeds(self) -> np.ndarray:
+        """Of the tool's centre [m/s] and of its turns [rad/s], shape [2]."""
+        steps = np.diff(self.times)
+        ways = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
+        turns = np.array([length(turn_between(first, second))
+                          for first, second in pairwise(self.poses)])
+        return np.array([(ways / steps).max(), (turns / steps).max()])
+
+    def pose(self, time: float) -> np.ndarray:
+        """Return the pose at a time [s]; the last one afterwards, shape [6]."""
+        k, part = self._place(time)
+        return pose_between(self.poses[k], self.poses[k + 1], part)
+
+    def felt(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return expected wrench [6], its slopes [6, 6] and covariance [6, 6] at a time [s]."""
+        return None if self.expected is None else self.expected.at(*self._place(time))
+
+    def backwards(self) -> "Trajectory":
+        """Return it from its end to its start, as fast, with what is expected on it."""
+        return Trajectory(self.duration - self.times[::-1], self.poses[::-1],
+                          None if self.expected is None else self.expected.reversed(),
+                          None if self.joints is None else self.joints[::-1])
+
+    def _place(self, time: float) -> tuple[int, float]:
+        time = min(max(time, 0.0), self.duration)
+        k = min(int(np.searchsorted(self.times, time, side="right")) - 1, len(self.times) - 2)
+        return k, (time - self.times[k]) / (self.times[k + 1] - self.times[k])
+
+
+def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: float = 0.5,
+          pause: float = 0.0) -> np.ndarray:
+    """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest, shape [n].
+
+    Args:
+        speed, acceleration: Of the tool's centre [m/s], [m/s^2].
+        turn_speed: Greatest angular speed [rad/s].
+        pause: Time added before the start [s].
+    """
+    from limber.robot.ur.kinematics import matrices
+
+    turns = matrices(poses)[:, :3, :3]
+    angles = np.arccos(np.clip((np.einsum("nij,nij->n", turns[1:], turns[:-1]) - 1) / 2, -1, 1))
+    steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
+                       angles * speed / turn_speed)
+    steps = np.maximum(steps, 1e-9)
+    way = np.r_[0.0, np.cumsum(steps)]
+    bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(way, way[-1] - way)))
+    durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
+    return pause + np.r_[0.0, np.cumsum(durations)]
+
+
+def densely(poses: np.ndarray, spacing: float = 0.002, angle: float = 0.02) -> np.ndarray:
+    """Return poses close together along straight lines and turns between ``poses`` [n, 6]."""
+    from scipy.spatial.transform import Rotation
+
+    result = [poses[0]]
+    for first, second in pairwise(poses):
+        way = float(np.linalg.norm(second[:3] - first[:3]))
+        turn = (Rotation.from_rotvec(second[3:]) * Rotation.from_rotvec(first[3:]).inv())
+        count = max(int(np.ceil(max(way / spacing, turn.magnitude() / angle))), 1)
+        result += [pose_between(first, second, part) for part in np.linspace(0, 1, count + 1)[1:]]
+    return np.array(result)

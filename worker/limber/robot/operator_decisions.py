@@ -1,0 +1,119 @@
+"""What the person beside the robot decides: that it moves, what follows a stop, a hand gripper."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from limber.core.errors import InputError, LimberError
+from limber.robot.driver.link import COLUMNS
+
+if TYPE_CHECKING:
+    from limber.core.progress import Progress
+    from limber.robot.cell.cell import Cell
+    from limber.robot.driver.link import RobotLink
+
+AfterStop = Literal["ask", "hold", "retreat"]
+
+_FORCE = slice(COLUMNS.index("smooth_fx_n"), COLUMNS.index("smooth_fx_n") + 3)
+_FORCE_SECONDS = 1.0
+
+
+def require_confirmation(name: str, typed: str | None) -> None:
+    """Let the robot move only when somebody has typed ``name``; asked for at a terminal.
+
+    Raises:
+        InputError: nothing was typed, or something else.
+    """
+    if typed is None and sys.stdin.isatty():
+        typed = input(f"The robot will move. Type {name} to go on: ").strip()
+    if typed != name:
+        raise InputError("Nobody confirmed that the robot may move.", "",
+                         f"Give --confirm {name}, with the workspace free and a hand at the "
+                         "emergency stop.")
+
+
+def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: Progress,
+                      ) -> dict[str, Any]:
+    """After a stop the arm holds, unless ``choice`` or the person at the terminal says retreat.
+
+    Where a retreat does not bring the force below the soft limit, the gripper opens.
+
+    Returns:
+        ``choice``; ``retreated``, whether the arm went back; ``gripper_opened``; ``force_n``, what
+        is left on the branch (None: not known); and ``outcome``, all of it in words.
+    """
+    if choice == "ask" and sys.stdin.isatty():
+        typed = input("The robot has stopped. Type retreat to go back the way it came; anything "
+                      "else holds: ")
+        choice = "retreat" if typed.strip() == "retreat" else "hold"
+    told: dict[str, Any] = {"choice": "hold", "retreated": False, "gripper_opened": False}
+    if choice != "retreat":
+        told |= {"force_n": _force_left(link)}
+        return told | {"outcome": f"The arm holds where it stopped; {_left(told['force_n'])}."}
+    event = _retreated(link)
+    force = _force_left(link)
+    told |= {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
+    went = ("The arm went back the way it came" if told["retreated"] else
+            f"The arm could not go back: {event['reason'].rstrip('.')}")
+    if told["retreated"] and force is not None and force <= cell.limits.soft_force_n:
+        return told | {"outcome": f"{went}; {_left(force)}."}
+    opened, how = _opened(cell, link, progress)
+    told |= {"gripper_opened": opened, "force_n": _force_left(link)}
+    return told | {"outcome": f"{went}; {_left(force)}. {how}; {_left(told['force_n'])}."}
+
+
+def _retreated(link: RobotLink) -> dict[str, Any]:
+    """Return the event that ended a retreat; a refusal is one that stopped it at once."""
+    try:
+        return link.retreat()
+    except LimberError as error:
+        return {"event": "refused", "reason": str(error)}
+    except KeyboardInterrupt:
+        # Ctrl-C stops the arm before anything else.
+        link.stop()
+        raise
+
+
+def _opened(cell: Cell, link: RobotLink, progress: Progress) -> tuple[bool, str]:
+    """Open the gripper; returns whether that was done, and what was done."""
+    if cell.tool.gripper == "none" or (cell.tool.gripper == "by_hand" and not sys.stdin.isatty()):
+        return False, ("The gripper is not opened from here (tool.gripper is "
+                       f"{cell.tool.gripper}): free the branch by hand")
+    try:
+        grip(cell, link, close=False, progress=progress)
+    except LimberError as error:
+        return False, (f"The gripper did not open ({str(error).rstrip('.')}): free the branch by "
+                       "hand")
+    return True, "The gripper was opened"
+
+
+def _force_left(link: RobotLink) -> float | None:
+    """The smoothed force on the branch now [N], or None where the driver does not tell it."""
+    try:
+        force = float(np.linalg.norm(link.wait_for_samples(_FORCE_SECONDS)[_FORCE]))
+    except LimberError:
+        # The driver is gone: what is told says so.
+        return None
+    return force if np.isfinite(force) else None
+
+
+def _left(force: float | None) -> str:
+    return "the force on the branch is not known" if force is None else (
+        f"{force:.1f} N are on the branch")
+
+
+def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> None:
+    """Close or open the gripper; one without a wire by the person at the terminal."""
+    if cell.tool.gripper == "digital_output":
+        link.gripper(close)
+        time.sleep(cell.tool.grip_seconds)
+    elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
+        input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
+    elif cell.tool.gripper == "by_hand":
+        progress.warn(f"The gripper is {'closed' if close else 'opened'} by hand, and here nobody "
+                      "can be asked to: it was taken as done. Run it at a terminal, or state "
+                      "tool.gripper in the cell file.")

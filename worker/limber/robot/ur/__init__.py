@@ -1,0 +1,1 @@
+"""Arms of Universal Robots: kinematics, the RTDE protocol and samples of their state."""

@@ -1,0 +1,271 @@
+"""Forward and inverse kinematics of an arm, its Jacobian, and how far it is from a singularity.
+
+Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
+is turned by 180 degrees about z) and the flange. All functions are vectorised over poses. Poses
+here are homogeneous matrices; :func:`matrices` and :func:`pose_vectors` go between them and the
+``(x, y, z, rotation vector)`` of the rest of Limber.
+"""
+
+import math
+
+import numpy as np
+
+from limber.core.numerics.compiled import compiled, for_kernels
+from limber.core.numerics.rigid_kernels import inverse_of
+from limber.robot.ur.arms import Arm
+
+BRANCH_COUNT = 8
+"""Inverse solutions a pose has at most, whole turns apart."""
+
+
+def forward(arm: Arm, joints: np.ndarray) -> np.ndarray:
+    """Return the flange's frames in the base's.
+
+    Args:
+        joints: Joint angles [rad], shape [..., 6].
+
+    Returns:
+        Homogeneous matrices, shape [..., 4, 4].
+    """
+    joints = np.asarray(joints, float)
+    frames = _forward(arm.table, for_kernels(joints.reshape(-1, 6)))
+    return frames.reshape(*joints.shape[:-1], 4, 4)
+
+
+def link_frames(arm: Arm, joints: np.ndarray) -> np.ndarray:
+    """Return the frames of all six links in the base's, the last of them the flange's.
+
+    Args:
+        joints: Joint angles [rad], shape [..., 6].
+
+    Returns:
+        Homogeneous matrices, shape [..., 6, 4, 4].
+    """
+    joints = np.asarray(joints, float)
+    frames = _link_frames(arm.table, for_kernels(joints.reshape(-1, 6)))
+    return frames.reshape(*joints.shape[:-1], 6, 4, 4)
+
+
+def inverse(arm: Arm, frames: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
+    """Return every joint pose that brings the flange to ``frames``, angles within half a turn.
+
+    The order is fixed, so that one row followed along a path is one continuous branch: bit 2 of
+    its number is the shoulder's side, bit 1 the wrist's, bit 0 the elbow's. Rows that do not exist
+    are NaN.
+
+    Args:
+        frames: Frames of the flange in the base's, shape [..., 4, 4].
+        reference: Angles [..., 6] whose last joint is kept where the wrist is singular and only
+            the sum of two joints is determined; zero where absent.
+
+    Returns:
+        Joint angles [rad], shape [..., 8, 6].
+    """
+    frames = np.asarray(frames, float)
+    flat = for_kernels(frames.reshape(-1, 4, 4))
+    last = np.zeros(len(flat)) if reference is None else np.broadcast_to(
+        np.asarray(reference, float)[..., 5], frames.shape[:-2]).reshape(-1)
+    solutions = _inverse(arm.table, flat, for_kernels(last))
+    return solutions.reshape(*frames.shape[:-2], BRANCH_COUNT, 6)
+
+
+def jacobian(arm: Arm, joints: np.ndarray) -> np.ndarray:
+    """Return the geometric Jacobian of the flange in the base's frame.
+
+    Args:
+        joints: Joint angles [rad], shape [..., 6].
+
+    Returns:
+        Shape [..., 6, 6]: velocity [m/s] over angular velocity [rad/s], a unit joint speed a
+        column.
+    """
+    joints = np.asarray(joints, float)
+    slopes = _jacobian(arm.table, for_kernels(joints.reshape(-1, 6)))
+    return slopes.reshape(*joints.shape[:-1], 6, 6)
+
+
+def singularity_distance(arm: Arm, joints: np.ndarray) -> np.ndarray:
+    """Return how far each joint pose is from the nearest singularity, dimensionless.
+
+    The Jacobian's determinant is a product of three factors, each of which vanishes at one
+    singularity: the wrist's (axes of joints 4 and 6 parallel), the elbow's (arm stretched or
+    folded) and the shoulder's (wrist over the base's axis). The least of them, each scaled to at
+    most about 1.
+
+    Args:
+        joints: Joint angles [rad], shape [..., 6].
+
+    Returns:
+        Shape [..., 3]: wrist, elbow, shoulder.
+    """
+    joints = np.asarray(joints, float)
+    distances = _singularity_distance(arm.table, arm.reach, for_kernels(joints.reshape(-1, 6)))
+    return distances.reshape(*joints.shape[:-1], 3)
+
+
+def matrices(poses: np.ndarray) -> np.ndarray:
+    """Return homogeneous matrices [..., 4, 4] of poses [..., 6] in m and rad."""
+    from scipy.spatial.transform import Rotation
+
+    poses = np.asarray(poses, float)
+    frames = np.zeros((*poses.shape[:-1], 4, 4))
+    turns = Rotation.from_rotvec(poses[..., 3:].reshape(-1, 3)).as_matrix()
+    frames[..., :3, :3] = turns.reshape(*poses.shape[:-1], 3, 3)
+    frames[..., :3, 3] = poses[..., :3]
+    frames[..., 3, 3] = 1.0
+    return frames
+
+
+def pose_vectors(frames: np.ndarray) -> np.ndarray:
+    """Return poses [..., 6] in m and rad of homogeneous matrices [..., 4, 4]."""
+    from scipy.spatial.transform import Rotation
+
+    frames = np.asarray(frames, float)
+    turns = Rotation.from_matrix(frames[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
+    return np.concatenate([frames[..., :3, 3], turns.reshape(*frames.shape[:-2], 3)], axis=-1)
+
+
+def inverted(frames: np.ndarray) -> np.ndarray:
+    """Return the inverses of rigid transforms [..., 4, 4]."""
+    frames = np.asarray(frames, float)
+    result = np.zeros_like(frames)
+    turned = np.swapaxes(frames[..., :3, :3], -1, -2)
+    result[..., :3, :3] = turned
+    result[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, frames[..., :3, 3])
+    result[..., 3, 3] = 1.0
+    return result
+
+
+@compiled
+def _link(table: np.ndarray, joint: int, angle: float) -> np.ndarray:
+    """The frame of one joint in the one before it (classic Denavit-Hartenberg)."""
+    d, a, twist = table[joint]
+    c, s, ct, st = math.cos(angle), math.sin(angle), math.cos(twist), math.sin(twist)
+    return np.array([[c, -s * ct, s * st, a * c], [s, c * ct, -c * st, a * s],
+                     [0.0, st, ct, d], [0.0, 0.0, 0.0, 1.0]])
+
+
+@compiled
+def _forward(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(_link_frames(table, joints)[:, 5])
+
+
+@compiled
+def _link_frames(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    frames = np.empty((len(joints), 6, 4, 4))
+    for n in range(len(joints)):
+        frames[n, 0] = _link(table, 0, joints[n, 0])
+        for k in range(1, 6):
+            frames[n, k] = _product(frames[n, k - 1], _link(table, k, joints[n, k]))
+    return frames
+
+
+@compiled
+def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    result = np.zeros((4, 4))
+    for i in range(4):
+        for j in range(4):
+            for k in range(4):
+                result[i, j] += first[i, k] * second[k, j]
+    return result
+
+
+@compiled
+def _jacobian(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    slopes = np.empty((len(joints), 6, 6))
+    frames = np.empty((7, 4, 4))
+    for n in range(len(joints)):
+        frames[0] = np.eye(4)
+        for k in range(6):
+            frames[k + 1] = _product(frames[k], _link(table, k, joints[n, k]))
+        for k in range(6):
+            axis = frames[k, :3, 2]
+            arm = frames[6, :3, 3] - frames[k, :3, 3]
+            slopes[n, 0, k] = axis[1] * arm[2] - axis[2] * arm[1]
+            slopes[n, 1, k] = axis[2] * arm[0] - axis[0] * arm[2]
+            slopes[n, 2, k] = axis[0] * arm[1] - axis[1] * arm[0]
+            slopes[n, 3:, k] = axis
+    return slopes
+
+
+@compiled
+def _singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) -> np.ndarray:
+    distances = np.empty((len(joints), 3))
+    a2, a3, d5 = table[1, 1], table[2, 1], table[4, 0]
+    for n in range(len(joints)):
+        q2, q3, q4, q5 = joints[n, 1], joints[n, 2], joints[n, 3], joints[n, 4]
+        lever = a2 * math.cos(q2) + a3 * math.cos(q2 + q3) + d5 * math.sin(q2 + q3 + q4)
+        distances[n, 0], distances[n, 1] = abs(math.sin(q5)), abs(math.sin(q3))
+        distances[n, 2] = abs(lever) / reach
+    return distances
+
+
+@compiled
+def _inverse(table: np.ndarray, frames: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Analytic solution after Hawkins, "Analytic inverse kinematics for the UR-5/UR-10 arms".
+
+    Angles come from arc tangents throughout, also where the paper has arc cosines: those lose
+    half of the digits near a singularity.
+    """
+    solutions = np.full((len(frames), 8, 6), np.nan)
+    d4, d5, d6 = table[3, 0], table[4, 0], table[5, 0]
+    a2, a3 = table[1, 1], table[2, 1]
+    for n in range(len(frames)):
+        frame = frames[n]
+        # The wrist's centre seen from above lies d4 beside the plane of the arm.
+        px, py = frame[0, 3] - d6 * frame[0, 2], frame[1, 3] - d6 * frame[1, 2]
+        across = px * px + py * py - d4 * d4
+        if across < 0.0:
+            continue
+        bearing, aside = math.atan2(py, px), math.atan2(math.sqrt(across), d4)
+        for shoulder in range(2):
+            q1 = bearing + math.pi / 2 + (aside if shoulder == 0 else -aside)
+            s1, c1 = math.sin(q1), math.cos(q1)
+            # The flange's axes along the normal of the arm's plane.
+            along_x = frame[0, 0] * s1 - frame[1, 0] * c1
+            along_y = frame[0, 1] * s1 - frame[1, 1] * c1
+            along_z = frame[0, 2] * s1 - frame[1, 2] * c1
+            spread = math.sqrt(along_x * along_x + along_y * along_y)
+            for wrist in range(2):
+                side = 1.0 if wrist == 0 else -1.0
+                q5 = math.atan2(side * spread, along_z)
+                q6 = last[n]
+                if spread > 1e-9:
+                    q6 = math.atan2(-side * along_y, side * along_x)
+                _solve_plane(table, frame, q1, q5, q6, a2, a3, d5,
+                             solutions[n, 4 * shoulder + 2 * wrist:4 * shoulder + 2 * wrist + 2])
+    return solutions
+
+
+@compiled
+def _solve_plane(table: np.ndarray, frame: np.ndarray, q1: float, q5: float, q6: float, a2: float,
+                 a3: float, d5: float, rows: np.ndarray) -> None:
+    """Fill the two elbow solutions ``rows`` [2, 6], with the three parallel joints left over."""
+    end = _product(_link(table, 4, q5), _link(table, 5, q6))
+    middle = _product(inverse_of(_link(table, 0, q1)), _product(frame, inverse_of(end)))
+    # Frame 4 in frame 1: joints 2 to 4 turn about one direction, its z.
+    x, y = middle[0, 3], middle[1, 3]
+    # Frame 4 stands after a twist of a quarter turn: its x axis carries the sum of the angles.
+    total = math.atan2(middle[1, 0], middle[0, 0])
+    far = x * x + y * y
+    cosine = (far - a2 * a2 - a3 * a3) / (2.0 * a2 * a3)
+    if abs(cosine) > 1.0 + 1e-12:
+        return
+    cosine = min(max(cosine, -1.0), 1.0)
+    # (1 - cosine)(1 + cosine) from lengths: no digits are lost near the stretched arm.
+    stretch = (abs(a2) + abs(a3)) ** 2 - far
+    fold = far - (abs(a2) - abs(a3)) ** 2
+    sine = math.sqrt(max(stretch * fold, 0.0)) / (2.0 * abs(a2 * a3))
+    for elbow in range(2):
+        s3 = sine if elbow == 0 else -sine
+        q3 = math.atan2(s3, cosine)
+        q2 = math.atan2(y, x) - math.atan2(a3 * s3, a2 + a3 * cosine)
+        rows[elbow, 0], rows[elbow, 1], rows[elbow, 2] = _half_turn(q1), _half_turn(q2), q3
+        rows[elbow, 3] = _half_turn(total - q2 - q3)
+        rows[elbow, 4], rows[elbow, 5] = q5, _half_turn(q6)
+
+
+@compiled
+def _half_turn(angle: float) -> float:
+    """The same angle within half a turn of zero."""
+    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)

@@ -1,0 +1,209 @@
+"""What is known of the robot at one moment, and a reader that misses none of it.
+
+ur-rtde's own receiver keeps the newest package only, and its getters return the last one for ever
+when the robot is gone. This reader takes the controller's stream from a socket of its own: every
+package arrives in order, with the time when it came, and a broken connection is seen as one.
+"""
+
+import select
+import socket
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import WorkError
+from limber.robot.ur import rtde
+
+RTDE_PORT, DASHBOARD_PORT = 30004, 29999
+_MOST_AT_ONCE = 8
+_NAMES = ("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_speed",
+          "actual_TCP_force", "robot_mode", "safety_mode", "runtime_state",
+          "target_speed_fraction")
+_TOOL = "tcp_offset"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The robot at one step of its controller.
+
+    Attributes:
+        clock: The controller's time [s].
+        arrived: When it came, on this computer's monotonic clock [s].
+        joints, joint_speeds: [rad], [rad/s], shape [6].
+        pose, speed: Of the tool's centre in the base's frame [m, rad], [m/s, rad/s], shape [6].
+        wrench: Of the surroundings on the tool as the controller reports it: the base's axes,
+            about the tool's centre [N, N m], shape [6].
+        robot_mode, safety_mode, runtime_state: The controller's numbers (7, 1 and 2 are well).
+        slider: Speed slider, 0 to 1.
+        tool: Tool that is set in the controller, the flange's frame [m, rad], shape [6]; None where
+            its version does not tell it.
+    """
+
+    clock: float
+    arrived: float
+    joints: np.ndarray
+    joint_speeds: np.ndarray
+    pose: np.ndarray
+    speed: np.ndarray
+    wrench: np.ndarray
+    robot_mode: int
+    safety_mode: int
+    runtime_state: int
+    slider: float
+    tool: np.ndarray | None = None
+
+
+class SampleStream:
+    """The controller's RTDE output, read without loss.
+
+    Args:
+        address: Of the controller.
+        timeout: Longest wait for an answer while connecting [s].
+
+    Raises:
+        WorkError: nothing answers there, or what answers is no RTDE server.
+    """
+
+    def __init__(self, address: str, timeout: float = 2.0):
+        self.address = address
+        self._data = bytearray()
+        self._queue: list[tuple[int, bytes]] = []
+        self._arrived = 0.0
+        try:
+            self._socket = socket.create_connection((address, RTDE_PORT), timeout)
+        except OSError as error:
+            raise WorkError(f"No robot answers at {address} port {RTDE_PORT} ({error}).",
+                            "Nothing is moved without its data.",
+                            "Check that it is on, its address and the network.") from error
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._handshake(timeout)
+        except (OSError, ValueError) as error:
+            self._socket.close()
+            raise WorkError(f"{address} port {RTDE_PORT} does not answer as a robot ({error}).",
+                            "It accepted the connection, but speaks no RTDE.",
+                            "Check the address; restart the controller if it is one.") from error
+
+    def _handshake(self, timeout: float) -> None:
+        if self._ask(rtde.VERSION_REQUEST, struct.pack(">H", 2), timeout) != b"\1":
+            raise ValueError("protocol version 2 refused")
+        self.version = struct.unpack(">4I", self._ask(rtde.CONTROL_VERSION, b"", timeout))
+        self.rate = 125.0 if self.version[0] <= 3 else 500.0
+        names: tuple[str, ...] = _NAMES
+        if rtde.output_types([_TOOL], self.version) != ["NOT_FOUND"]:
+            names = (*_NAMES, _TOOL)
+        reply = self._ask(rtde.OUTPUT_SETUP,
+                          struct.pack(">d", self.rate) + ",".join(names).encode(), timeout)
+        if not reply or reply[0] == 0 or b"NOT_FOUND" in reply:
+            raise ValueError(f"outputs refused: {reply[1:].decode('ascii', 'replace')}")
+        self._recipe = rtde.Recipe.of(reply[0], names, rtde.OUTPUT_TYPES)
+        if self._ask(rtde.START, b"", timeout) != b"\1":
+            raise ValueError("data was not started")
+        self._socket.setblocking(False)
+
+    def _ask(self, command: int, body: bytes, timeout: float) -> bytes:
+        self._socket.sendall(rtde.frame(command, body))
+        end = time.monotonic() + timeout
+        while True:
+            while self._queue:
+                kind, reply = self._queue.pop(0)
+                if kind == command:
+                    return reply
+            left = end - time.monotonic()
+            if left <= 0 or not select.select([self._socket], [], [], left)[0]:
+                raise ValueError(f"no answer in {timeout:g} s")
+            self._fill()
+
+    def _fill(self) -> None:
+        chunk = self._socket.recv(65536)
+        if not chunk:
+            raise ConnectionError("the robot closed the connection")
+        self._arrived = time.monotonic()
+        self._data += chunk
+        self._queue += rtde.split_frames(self._data)
+
+    def read(self, timeout: float, beside: Sequence[socket.socket] = ()) -> list[Sample]:
+        """Return the next samples, waiting at most ``timeout`` [s] for the first.
+
+        After a delay they come a few at a time, so that who reads them can act in between.
+
+        Args:
+            beside: Other connections: what comes there ends the wait as well, without samples.
+
+        Raises:
+            ConnectionError: the robot is gone.
+        """
+        if not self._queue:
+            ready = select.select([self._socket, *beside], [], [], timeout)[0]
+            if self._socket in ready:
+                try:
+                    self._fill()
+                except (OSError, ValueError) as error:
+                    raise ConnectionError(f"connection to {self.address} lost: {error}") from error
+        taken, self._queue = self._queue[:_MOST_AT_ONCE], self._queue[_MOST_AT_ONCE:]
+        return [self._sample(body) for kind, body in taken if kind == rtde.DATA]
+
+    def skip(self) -> None:
+        """Drop what has come so far."""
+        while select.select([self._socket], [], [], 0)[0]:
+            self._fill()
+        self._queue.clear()
+
+    def _sample(self, body: bytes) -> Sample:
+        values = self._recipe.unpacked(body[1:])
+        return Sample(
+            clock=values["timestamp"], arrived=self._arrived, joints=np.array(values["actual_q"]),
+            joint_speeds=np.array(values["actual_qd"]), pose=np.array(values["actual_TCP_pose"]),
+            speed=np.array(values["actual_TCP_speed"]),
+            wrench=np.array(values["actual_TCP_force"]), robot_mode=values["robot_mode"],
+            safety_mode=values["safety_mode"], runtime_state=values["runtime_state"],
+            slider=values["target_speed_fraction"],
+            tool=np.array(values[_TOOL]) if _TOOL in values else None)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+class Dashboard:
+    """The controller's dashboard: what it is, and the second way to stop it.
+
+    Raises:
+        WorkError: it does not answer.
+    """
+
+    def __init__(self, address: str, timeout: float = 2.0):
+        self.address = address
+        try:
+            self._socket = socket.create_connection((address, DASHBOARD_PORT), timeout)
+            self._file = self._socket.makefile("r", encoding="utf-8", errors="replace")
+            self._file.readline()
+        except OSError as error:
+            raise WorkError(f"The dashboard of {address} does not answer ({error}).",
+                            "It is the second way to stop the robot.",
+                            "Check the network; the e-Series can forbid it in its settings.",
+                            ) from error
+
+    def ask(self, command: str) -> str:
+        """Return the reply to a command.
+
+        Raises:
+            ConnectionError: there is none.
+        """
+        try:
+            self._socket.sendall(f"{command}\n".encode())
+            return self._file.readline().strip()
+        except OSError as error:
+            raise ConnectionError(f"dashboard of {self.address}: {error}") from error
+
+    def stop(self) -> None:
+        """Send the stop, and wait for nothing."""
+        self._socket.sendall(b"stop\n")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._file.close()
+        self._socket.close()

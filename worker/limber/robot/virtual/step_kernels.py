@@ -1,0 +1,93 @@
+"""What the virtual robot computes at every step, compiled: flange pose and speed, servo, and the
+wrench of the branch in its gripper.
+"""
+
+import numpy as np
+
+from limber.core.numerics.compiled import compiled
+from limber.core.numerics.rigid_kernels import inverse_of, rotation_vector
+from limber.robot.ur.kinematics import _forward, _jacobian
+
+_FARTHEST = 0.03  # m over which a change of the tangent is led on
+
+
+@compiled
+def tool_state(table: np.ndarray, joints: np.ndarray, speeds: np.ndarray, tool: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the tool's pose [6], its speed [6] (base frame) and the flange's frame [4, 4].
+
+    Args:
+        table: Denavit-Hartenberg table, shape [6, 3].
+        joints, speeds: [rad], [rad/s], shape [6].
+        tool: Frame of the tool in the flange's, shape [4, 4].
+    """
+    row = joints.reshape(1, 6)
+    flange = _forward(table, row)[0]
+    slopes = _jacobian(table, row)[0]
+    tip = flange @ tool
+    motion = slopes @ speeds
+    lever = tip[:3, 3] - flange[:3, 3]
+    motion[0] += motion[4] * lever[2] - motion[5] * lever[1]
+    motion[1] += motion[5] * lever[0] - motion[3] * lever[2]
+    motion[2] += motion[3] * lever[1] - motion[4] * lever[0]
+    pose = np.empty(6)
+    pose[:3] = tip[:3, 3]
+    pose[3:] = rotation_vector(tip)
+    return pose, motion, flange
+
+
+@compiled
+def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain: float,
+               lookahead: float, step: float, largest: float) -> tuple[np.ndarray, np.ndarray]:
+    """One step of servoj: a spring of ``gain`` [1/s^2] to the target, damped by ``lookahead`` [s].
+
+    The controller's own law is not published. This one has its known traits: a target that moves
+    steadily is followed ``lookahead`` seconds behind, more gain follows more closely, and a short
+    lookahead with a high gain overshoots.
+
+    Returns:
+        New joints [6] and speeds [6]; accelerations stay within ``largest`` [rad/s^2].
+    """
+    new_speeds = np.empty(6)
+    new_joints = np.empty(6)
+    # Implicit in the speed, so that any gain is stable at 125 Hz as well.
+    damping = 1.0 + step * gain * lookahead + step * step * gain
+    for k in range(6):
+        wanted = (speeds[k] + step * gain * (target[k] - joints[k])) / damping
+        change = min(max(wanted - speeds[k], -largest * step), largest * step)
+        new_speeds[k] = speeds[k] + change
+        new_joints[k] = joints[k] + step * new_speeds[k]
+    return new_joints, new_speeds
+
+
+@compiled
+def led_on(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, ways: np.ndarray,
+           bends: np.ndarray, patch: np.ndarray, compliance: float) -> np.ndarray:
+    """Return the wrench [6] of a held branch near where it was solved.
+
+    Args:
+        frame, wrench, stiffness: Where it was solved [4, 4], the wrench there [6] and its
+            derivative to position and rotation [6, 6].
+        ways, bends: Ways [m], shape [n, 3], and by how much the stiffness changes over each,
+            shape [n, 6, 6]; the first that leads somewhere counts first.
+        patch: Frame of the held patch if nothing gave way, shape [4, 4].
+        compliance: What the patch stays behind by [m/N].
+    """
+    change = np.empty(6)
+    change[:3] = patch[:3, 3] - frame[:3, 3]
+    change[3:] = rotation_vector(patch @ inverse_of(frame))
+    at, felt = change.copy(), np.zeros(6)
+    # The stiffness is that of the way that the patch goes, which the force tells.
+    for _ in range(2 if compliance > 0.0 and len(ways) > 0 else 1):
+        secant, left = stiffness.copy(), at[:3].copy()
+        for way, bend in zip(ways, bends):  # noqa: B905 (no strict in a kernel)
+            square = (way * way).sum()
+            most = _FARTHEST / np.sqrt(square)
+            part = min(max((left * way).sum() / square, -most), most)
+            secant += 0.5 * part * bend
+            left -= part * way
+        yielding = np.eye(6)
+        yielding[:, :3] += compliance * secant[:, :3]
+        felt = np.linalg.solve(yielding, wrench + secant @ change)
+        at[:3] = change[:3] - compliance * felt[:3]
+    return felt

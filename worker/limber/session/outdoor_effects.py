@@ -1,0 +1,110 @@
+"""What loads outdoors do to the held branch, worked out beside the frames in a process of its own.
+
+It takes seconds: meanwhile the branch is moved on. The answer is of the branch as its folder has
+it, with the moduli and the loads that the session had when it was asked.
+"""
+
+from concurrent.futures import CancelledError, Future
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.processes import Pool
+from limber.core.progress import Progress
+from limber.mechanics.loads.gust_loads import Gusts, Turbulence, WindRecord, blown, with_peak
+from limber.mechanics.loads.load_effects import load_effects
+from limber.mechanics.loads.outdoor import Outdoors
+from limber.session.event_writer import Events
+from limber.session.opening import load_held
+from limber.session.protocol import Effects
+from limber.session.session_branch import HeldBranch
+from limber.session.settings import SessionSettings
+from limber.store import Branch
+from limber.store.loading import known_damping
+
+
+class EffectsTeller:
+    """Answers one question at a time.
+
+    Args:
+        folder, settings: Of the session.
+        events: Where answers go.
+    """
+
+    def __init__(self, folder: Path, settings: SessionSettings, events: Events):
+        self._folder, self._settings, self._events = folder, settings, events
+        self._pool: Pool | None = None
+        self._asked: Future | None = None
+
+    def ask(self, question: Effects, held: HeldBranch) -> None:
+        """Have a question answered: its ``reply``, or its ``error``, comes when that is known.
+
+        Raises:
+            InputError: another one is being answered, no load acts, the weight is off, or gusts
+                are asked for without a wind.
+        """
+        if self._asked is not None and not self._asked.done():
+            raise InputError("The effects of loads are being worked out.",
+                             "One question is answered at a time.", "Wait for its reply.")
+        loads, gusts = held.outdoors(), gusts_of(question)
+        loads = replace(loads, wind=blown(loads.wind, gusts))
+        # It stays for the next question: most of the first one's time is its beginning.
+        self._pool = self._pool or Pool(1, name="the effects of loads")
+        self._asked = self._pool.submit(effects_of, self._folder, self._settings, held.young,
+                                        loads, gusts, question)
+        self._asked.add_done_callback(partial(self.tell, question))
+
+    def close(self) -> None:
+        """Give up what is being answered."""
+        if self._pool is not None:
+            self._pool.close()
+
+    def tell(self, question: Effects, asked: Future) -> None:
+        """Tell what came of a question."""
+        about: dict[str, Any] = {"id": question.id, "command": question.command}
+        try:
+            told = asked.result()
+        except (Cancelled, CancelledError):
+            return
+        except LimberError as error:
+            self._events.say(event="error", **about, message=str(error))
+        except Exception as error:
+            # As all that a command sets off: the branch is still held.
+            self._events.say(event="error", **about, message=f"{type(error).__name__}: {error}")
+        else:
+            self._events.say(event="reply", **about, **told)
+
+
+def gusts_of(question: Effects) -> Gusts | None:
+    """Return the gusts that a question is about.
+
+    Raises:
+        InputError: its record is none of a wind.
+    """
+    if question.gust_record is not None:
+        return WindRecord.checked(np.array(question.gust_record.time_s),
+                                  np.array(question.gust_record.speed_m_s), "gust_record")
+    return None if question.gust is None else Turbulence(
+        question.gust, question.gust_length_m, question.gust_time_s)
+
+
+def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads: Outdoors,
+               gusts: Gusts | None, question: Effects, progress: Progress) -> dict[str, Any]:
+    """Return what loads do to a branch with these moduli at its control points [Pa].
+
+    Raises:
+        LimberError: it cannot be loaded, or finds no rest.
+    """
+    held = load_held(folder, settings, progress)
+    held.set_young(young)
+    outdoors, peak = held.set_outdoors(loads), None
+    if gusts is not None:
+        outdoors, peak = with_peak(outdoors, gusts, known_damping(Branch.read(folder), progress))
+    _, told = load_effects(
+        outdoors, strain_limit=question.strain_limit, deviation=held.young_deviation,
+        most=question.most if question.limit_load else None, progress=progress)
+    return told | {"gusts": peak}

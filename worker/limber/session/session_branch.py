@@ -1,0 +1,326 @@
+"""The branch of a session with all that holds and loads it, and its equilibria in full.
+
+Nothing here knows of clients, threads or files: :mod:`limber.session.worker` brings the wishes and
+publishes the answers.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.mechanics.grasp import RADIAN, Grasp, pose_between
+from limber.mechanics.loads.loaded_branch import LoadedBranch
+from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics.solve import solve_static
+from limber.mechanics.strain import carried_strain
+from limber.reduced.reduced_model import as_control_points
+from limber.session.frame_buffer import HeldAt
+from limber.session.protocol import GRASP_LIMIT, Load
+
+FULL_STEP = 0.05
+"""Longest way to the wanted poses that the full model goes before it shows a frame, as part of the
+branch's extent."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A state of the branch, whichever model it is from.
+
+    Attributes:
+        displacement: Of all nodes from where the branch hangs [m], shape [node_count, 3].
+        grasps: What is held, with forces.
+        energy: Potential of strain and weight above the hanging branch [J].
+        kinetic_energy: [J]. time: Of a motion [s].
+        is_converged: An equilibrium was found, or the step was.
+        is_reached: The grasps are where they were asked to be.
+        is_reduced: From the reduced model. is_trusted: Within what the model knows.
+        message: Why there is no equilibrium.
+    """
+
+    displacement: np.ndarray
+    grasps: tuple[HeldAt, ...] = ()
+    energy: float = 0.0
+    kinetic_energy: float = 0.0
+    time: float = 0.0
+    is_converged: bool = True
+    is_reached: bool = True
+    is_reduced: bool = False
+    is_trusted: bool = True
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A grasp: its patch, where it is and where it is wanted [m, rad]."""
+
+    grasp: Grasp
+    pose: np.ndarray
+    goal: np.ndarray
+
+
+class HeldBranch:
+    """A branch, what holds it and what hangs on it.
+
+    Args:
+        loaded: The branch as it hangs, with its targets.
+        skeleton: Its axes, for wind, snow and cuts.
+        young_deviation: Standard deviation of log E, where something has told it.
+    """
+
+    def __init__(self, loaded: LoadedBranch, skeleton: Skeleton | None = None,
+                 young_deviation: float | None = None):
+        self.loaded, self._skeleton = loaded, skeleton
+        self.young_deviation = young_deviation
+        self._outdoors: Outdoors | None = None
+        self.model = model = loaded.model
+        self.displacement = np.zeros_like(model.mesh.nodes)
+        self.weights, self.young = as_control_points(model)
+        faces = model.mesh.surface_faces()
+        self.surface, compact = np.unique(faces, return_inverse=True)
+        self.faces = compact.reshape(-1, 3)
+        self.grasps: dict[int, Held] = {}
+        self.gravity_on = model.hanging is not None
+        self._hung: np.ndarray | None = None
+        self._weather: np.ndarray | None = None
+        self._is_gone = np.zeros(len(model.mesh.tets), bool)
+        self._count = 0
+        self._last: Answer | None = None
+        self._strains = _AtVertices(model, self.surface)
+        self._carried = carried_strain(model)
+
+    def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
+             mode: Literal["clamped", "pinned"]) -> int:
+        """Hold a patch where it is now; return the number of the grasp.
+
+        Args:
+            vertex: Of the surface; or ``point`` [m] on the branch as it hung at the start.
+            radius: Of the patch [m], on the branch as it hung; 0 takes one node.
+
+        Raises:
+            InputError: too many grasps, nothing is there, or the base or another grasp is.
+        """
+        if len(self.grasps) >= GRASP_LIMIT:
+            raise InputError(f"There are {GRASP_LIMIT} grasps already.",
+                             "A frame has room for no more.", "Release one.")
+        return self.hold(Grasp.at(self.model.mesh, self._place(vertex, point), radius, mode))
+
+    def hold(self, grasp: Grasp) -> int:
+        """Hold a patch that is known already; as :meth:`grab`."""
+        self.model.equations([*(held.grasp for held in self.grasps.values()), grasp])
+        pose = grasp.pose_of(self.model.mesh.nodes, self.displacement)
+        if grasp.mode == "pinned":
+            pose[3:] = 0.0
+        self._count += 1
+        self.grasps[self._count] = Held(grasp, pose, pose)
+        return self._count
+
+    def release(self, number: int | None) -> None:
+        """Let go of a grasp, or of all.
+
+        Raises:
+            InputError: there is no such grasp.
+        """
+        if number is None:
+            self.grasps.clear()
+        else:
+            del self.grasps[self.number(number)]
+
+    def number(self, number: int | None) -> int:
+        """Return the number of a grasp that there is, of the first if none is named.
+
+        Raises:
+            InputError: there is none, or not that one.
+        """
+        if not self.grasps:
+            raise InputError("Nothing is held.", "A move needs a grasp.", "Send a grasp first.")
+        number = min(self.grasps) if number is None else number
+        if number not in self.grasps:
+            raise InputError(f"There is no grasp {number}.",
+                             f"There are {sorted(self.grasps)}.", "")
+        return number
+
+    def aim(self, number: int | None, pose: np.ndarray) -> None:
+        """Say where a grasp (the first, if not named) is wanted [m, rad]."""
+        number = self.number(number)
+        held = self.grasps[number]
+        if held.grasp.mode == "pinned":
+            pose = np.concatenate([pose[:3], held.pose[3:]])
+        self.grasps[number] = replace(held, goal=pose)
+
+    def set_gravity(self, on: bool) -> None:
+        """Let the branch bear its weight, or not: without it, it rises from where it hangs.
+
+        Raises:
+            InputError: it was loaded without weight, so there is none to switch on.
+        """
+        if on and self.model.hanging is None:
+            raise InputError("The branch has no weight.", "The session was started without it.",
+                             "Start it without --no-gravity.")
+        self.gravity_on = on
+
+    def set_young(self, young: np.ndarray) -> None:
+        """Set Young's modulus at the control points [Pa]; the branch hangs as it was scanned.
+
+        Raises:
+            InputError: another number of values.
+        """
+        if young.shape != self.young.shape:
+            raise InputError(f"{young.size} moduli.",
+                             f"The branch has {len(self.young)} control points.", "")
+        self.young = young
+        self.model = self.model.with_young(self.weights @ young)
+        self._carried = carried_strain(self.model)
+
+    def set_loads(self, loads: list[Load]) -> None:
+        """Hang dead loads on the branch, instead of those before.
+
+        Raises:
+            InputError: a place is not on the branch.
+        """
+        forces = np.zeros_like(self.model.mesh.nodes)
+        for load in loads:
+            place = self._place(load.vertex, load.point)
+            forces[np.linalg.norm(self.model.mesh.nodes - place, axis=1).argmin()] += load.force_n
+        self._hung = forces if loads else None
+
+    def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
+        """Let wind, snow and fruit act, and cut off what lies beyond places, instead of before.
+
+        What is cut off keeps its shape and hangs on without weight: only what is left counts.
+
+        Raises:
+            InputError: a place is off the branch, or its axes are not known.
+        """
+        if self._skeleton is None:
+            raise InputError("The branch has no axes.", "Wind, snow and cuts go by them.",
+                             "Make it from a scan (limber reconstruct).")
+        made = LoadedOutdoors(self.model, self._skeleton, loads)
+        self._outdoors = loads
+        forces = made.dead_forces
+        self._weather = forces if forces.any() else None
+        self._is_gone = made.is_gone
+        return made
+
+    def outdoors(self) -> Outdoors:
+        """Return the wind, snow, fruit and cuts that act.
+
+        Raises:
+            InputError: there are none, or the branch's weight is switched off.
+        """
+        if self._outdoors is None:
+            raise InputError("There is neither wind nor snow, fruit or a cut.", "",
+                             "Send `outdoors` first.")
+        if not self.gravity_on and self.model.hanging is not None:
+            raise InputError("The branch's weight is switched off.",
+                             "What loads do is told of a branch that hangs.", "Switch it on.")
+        return self._outdoors
+
+    def vertices_gone(self) -> np.ndarray:
+        """Return the surface's vertices that are cut off, numbers [k]."""
+        kept = np.unique(self.model.mesh.tets[~self._is_gone])
+        return np.flatnonzero(~np.isin(self.surface, kept))
+
+    @property
+    def loads(self) -> np.ndarray | None:
+        """Forces on the nodes besides what the hanging branch carries [N], None where there are
+        none, shape [node_count, 3]."""
+        acting = [forces for forces in (self._hung, self._weather) if forces is not None]
+        if not self.gravity_on and self.model.hanging is not None:
+            acting.append(-self.model.mass_load[:, None] * self.model.gravity)
+        return sum(acting, np.zeros(3)) if acting else None
+
+    def sag(self, answer: Answer) -> float:
+        """Return how far what moved most along gravity has come down [m], of what is left."""
+        size = float(np.linalg.norm(self.model.gravity))
+        down = self.model.gravity / size if size else np.array([0.0, 0.0, -1.0])
+        left = np.unique(self.model.mesh.tets[~self._is_gone])
+        moved = answer.displacement[left] @ down
+        return float(moved[np.abs(moved).argmax()])
+
+    def way(self, number: int) -> float:
+        """Return how far a grasp is from where it is wanted [m]; turns count as lengths."""
+        held = self.grasps[number]
+        move = held.goal - held.pose
+        return float(np.linalg.norm(move[:3])
+                     + RADIAN * self.model.extent * np.linalg.norm(move[3:]))
+
+    def put(self, number: int, pose: np.ndarray, displacement: np.ndarray) -> None:
+        """Note that a grasp is at a pose now, with the branch displaced so."""
+        self.grasps[number] = replace(self.grasps[number], pose=pose)
+        self.displacement = displacement
+
+    def solve(self) -> Answer:
+        """Go towards the wanted poses with the full model, a short way at most.
+
+        Where there is no equilibrium the branch stays where it was.
+        """
+        longest = max((self.way(number) for number in self.grasps), default=0.0)
+        part = min(1.0, FULL_STEP * self.model.extent / max(longest, 1e-12))
+        goals = {number: held.goal if part == 1.0 else pose_between(held.pose, held.goal, part)
+                 for number, held in self.grasps.items()}
+        grasps = [held.grasp for held in self.grasps.values()]
+        result = solve_static(
+            self.model, grasp=grasps or None,
+            pose=np.array(list(goals.values())) if grasps else None,
+            nodal_forces=self.loads, start=self.displacement)
+        if result.converged:
+            self.displacement = result.displacement
+            self.grasps = {number: replace(held, pose=goals[number])
+                           for number, held in self.grasps.items()}
+        forces = np.reshape(result.reaction_force, (-1, 3))
+        torques = np.reshape(result.reaction_torque, (-1, 3))
+        if not result.converged:
+            return replace(self._last or Answer(self.displacement), is_converged=False,
+                           is_reached=False, is_trusted=False, message=result.message)
+        held = tuple(HeldAt(number, self.grasps[number].pose, force, torque)
+                     for number, force, torque in zip(self.grasps, forces, torques, strict=False))
+        self._last = Answer(self.displacement, held, result.energy,
+                            is_reached=part == 1.0, is_trusted=part == 1.0)
+        return self._last
+
+    def positions(self, answer: Answer) -> np.ndarray:
+        """Return the surface's positions [m], shape [vertex_count, 3]."""
+        return self.model.mesh.nodes[self.surface] + answer.displacement[self.surface]
+
+    def target_positions(self, answer: Answer) -> np.ndarray:
+        """Return where the targets are [m], shape [t, 3]."""
+        return self.loaded.target_positions(answer.displacement)
+
+    def strain(self, answer: Answer) -> tuple[np.ndarray, float, np.ndarray]:
+        """Return strain about the vertices [v], the largest of all, and where it is [m]."""
+        strains = self.model.largest_principal_strains(answer.displacement, self._carried)
+        strains[self._is_gone] = 0.0
+        worst = int(strains.argmax())
+        corners = self.model.mesh.tets[worst, :4]
+        place = (self.model.mesh.nodes[corners] + answer.displacement[corners]).mean(axis=0)
+        return self._strains(strains), float(strains[worst]), place
+
+    def _place(self, vertex: int | None, point: tuple[float, float, float] | None) -> np.ndarray:
+        if vertex is None:
+            return np.asarray(point, float)
+        if vertex >= len(self.surface):
+            raise InputError(f"There is no vertex {vertex}.",
+                             f"The surface has {len(self.surface)}.", "")
+        return self.model.mesh.nodes[self.surface[vertex]]
+
+
+class _AtVertices:
+    """Takes values of tetrahedra to the surface's vertices: the largest about each."""
+
+    def __init__(self, model: BranchModel, surface: np.ndarray):
+        tets = model.mesh.tets
+        place = np.full(model.mesh.node_count, -1)
+        place[surface] = np.arange(len(surface))
+        vertex = place[tets].ravel()
+        tet = np.repeat(np.arange(len(tets)), tets.shape[1])[vertex >= 0]
+        vertex = vertex[vertex >= 0]
+        order = np.argsort(vertex, kind="stable")
+        self._tets = tet[order]
+        self._starts = np.searchsorted(vertex[order], np.arange(len(surface)))
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        return np.maximum.reduceat(values[self._tets], self._starts)

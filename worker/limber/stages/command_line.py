@@ -1,0 +1,249 @@
+"""Options of a command line from a settings model, and the command line from settings.
+
+A field's description is its option's help, its default the option's. ``bool`` fields become
+``--name/--no-name``, ``tuple[float, float, float]`` takes three values, a tuple of such tuples may
+be given several times. What a field's ``json_schema_extra`` may say beside that: ``argument``
+(given without its name), ``short`` (a short option), ``switch`` (no ``--no-name``), ``metavar``.
+"""
+
+import functools
+import re
+import types
+import typing
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+from pydantic import BaseModel
+
+from limber.core.settings import Settings, checked_settings
+
+
+class GroupedOption(click.Option):
+    """An option that stands under a title in the help; experts' options only in --help-all."""
+
+    def __init__(self, *declarations: Any, group: str = "running", expert: bool = False,
+                 **attributes: Any):
+        super().__init__(*declarations, **attributes)
+        self.group, self.expert = group, expert
+
+
+class DescribedArgument(click.Argument):
+    """An argument with a help text that stands under a title."""
+
+    def __init__(self, *declarations: Any, description: str, group: str, **attributes: Any):
+        super().__init__(*declarations, **attributes)
+        self.description, self.group = description, group
+
+
+class GroupedCommand(click.Command):
+    """A command whose help shows options under titles, and experts' options on demand."""
+
+    def __init__(self, *args: Any, **attributes: Any):
+        super().__init__(*args, **attributes)
+        self.params.append(GroupedOption(
+            ["--help-all"], is_flag=True, is_eager=True, expose_value=False,
+            callback=_show_all, help="Show this message with the options for experts, and exit."))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options title by title."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        hidden = 0
+        for param in self.get_params(ctx):
+            if isinstance(param, DescribedArgument):
+                sections.setdefault(param.group, []).append(
+                    (param.make_metavar(ctx), param.description))
+                continue
+            if getattr(param, "expert", False) and not ctx.meta.get(_ALL):
+                hidden += 1
+                continue
+            record = param.get_help_record(ctx)
+            if record is not None:
+                sections.setdefault(getattr(param, "group", "running"), []).append(record)
+        # What is about running stands last in every command.
+        running = sections.pop("running", [])
+        for title, records in {**sections, "running": running}.items():
+            if records:
+                with formatter.section(title.capitalize()):
+                    formatter.write_dl(records)
+        if hidden:
+            formatter.write_paragraph()
+            formatter.write_text(f"{hidden} more for experts: --help-all")
+
+
+_ALL = "limber.help_all"
+
+
+def _show_all(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        ctx.meta[_ALL] = True
+        click.echo(ctx.get_help())
+        ctx.exit()
+
+
+def options_of(command: click.Command) -> frozenset[str]:
+    """Return the options that a command has, as they are typed."""
+    return frozenset(flag for param in command.params if isinstance(param, click.Option)
+                     for flag in (*param.opts, *param.secondary_opts))
+
+
+def without_foreign_options(text: str, own: Collection[str]) -> str:
+    """Return a message without what names options that are not among ``own``.
+
+    For a command that runs others: of its user's options theirs are none. Brackets and sentences
+    that name such an option are left out.
+    """
+    def is_foreign(part: str) -> bool:
+        return not {*_OPTION.findall(part)} <= {*own}
+    text = _BRACKETS.sub(lambda found: "" if is_foreign(found[0]) else found[0], text)
+    return " ".join(part for part in _SENTENCE_END.split(text) if not is_foreign(part))
+
+
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+_BRACKETS = re.compile(r"\s*\([^()]*\)")
+_SENTENCE_END = re.compile(r"(?<=[.?!])\s+")
+
+
+def settings_options(model: type[BaseModel], name: str = "settings", *,
+                     without: Collection[str] = ()) -> Callable[[Callable], Callable]:
+    """Add one option for each field of a model; the function gets ``name=model(...)``.
+
+    Args:
+        model: The model.
+        name: Of the function's argument.
+        without: Fields that get no option and keep their defaults.
+
+    Raises:
+        InputError: when the command is called with values that the model refuses.
+    """
+    def wrap(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def body(*args: Any, **options: Any) -> Any:
+            given = {field: options.pop(f"{name}__{field}") for field in model.model_fields
+                     if field not in without}
+            values = {field: value for field, value in given.items() if value is not None}
+            return function(*args, **{name: checked_settings(model, values)}, **options)
+        for field_name, field in reversed(model.model_fields.items()):
+            if field_name in without:
+                continue
+            body = _parameter(model, field_name, field, f"{name}__{field_name}")(body)
+        return body
+    return wrap
+
+
+def command_line(*models: Settings) -> list[str]:
+    """Return the arguments that give a command these values; defaults are left out."""
+    arguments: list[str] = []
+    options: list[str] = []
+    for model in models:
+        for name, field in type(model).model_fields.items():
+            value = getattr(model, name)
+            if not field.is_required() and value == field.get_default(call_default_factory=True):
+                continue
+            if (field.json_schema_extra or {}).get("argument"):
+                arguments.append(str(value))
+            else:
+                options += _typed(name, field, value)
+    return [*options, "--", *arguments] if arguments else options
+
+
+def _typed(name: str, field: Any, value: Any) -> list[str]:
+    """An option as it is typed."""
+    flag = "--" + name.replace("_", "-")
+    if isinstance(value, bool):
+        return [flag if value else f"--no-{flag[2:]}"]
+    if not isinstance(value, tuple):
+        return [flag, str(value)]
+    kinds = typing.get_args(_plain_type(field.annotation)[0])
+    if kinds[-1] is not Ellipsis:
+        return [flag, *map(str, value)]
+    if typing.get_origin(kinds[0]) is tuple:
+        return [text for item in value for text in (flag, *map(str, item))]
+    return [flag, ",".join(map(str, value))]
+
+
+def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) -> Callable:
+    extra = field.json_schema_extra or {}
+    kind, optional = _plain_type(field.annotation)
+    grouped = issubclass(model, Settings)
+    group = model.group_of(name) if grouped else "options"
+    if extra.get("argument"):
+        return click.argument(destination, cls=DescribedArgument, metavar=name.upper(),
+                              type=_click_type(kind), required=field.is_required(),
+                              description=field.description or "", group=group)
+    hidden = field.is_required() or optional
+    default = None if hidden else field.get_default(call_default_factory=True)
+    flag = "--" + name.replace("_", "-")
+    flags = [extra["short"], flag] if "short" in extra else [flag]
+    common = {"cls": GroupedOption, "default": None, "required": field.is_required(),
+              "group": group,
+              "expert": grouped and model.is_expert(name),
+              "help": _help(name, field, kind, default)}
+    if "metavar" in extra:
+        common["metavar"] = extra["metavar"]
+    if kind is bool and extra.get("switch"):
+        return click.option(*flags, destination, is_flag=True,
+                            **common | {"help": field.description})
+    if kind is bool:
+        return click.option(f"{flag}/--no-{flag[2:]}", destination, **common)
+    if typing.get_origin(kind) is tuple:
+        return _tuple_option([*flags, destination], typing.get_args(kind), common)
+    return click.option(*flags, destination, type=_click_type(kind), **common)
+
+
+def _tuple_option(names: list[str], items: tuple, common: dict[str, Any]) -> Callable:
+    if items[-1] is Ellipsis and typing.get_origin(items[0]) is tuple:
+        parts = typing.get_args(items[0])
+        return click.option(*names, nargs=len(parts), type=parts[0], multiple=True, **common)
+    if items[-1] is Ellipsis:
+        # Given twice it adds up: the last one alone would drop the others without a word.
+        return click.option(*names, callback=_listed, multiple=True,
+                            **{"metavar": "A,B,...", **common})
+    if len(items) == 3:
+        common = {"metavar": "X Y Z", **common}
+    return click.option(*names, nargs=len(items), type=items[0], **common)
+
+
+def _click_type(kind: Any) -> Any:
+    if typing.get_origin(kind) is Literal:
+        return click.Choice(typing.get_args(kind))
+    return click.Path(path_type=Path) if kind is Path else kind
+
+
+def _listed(_ctx: click.Context, _param: click.Parameter, texts: tuple[str, ...]) -> Any:
+    return tuple(part.strip() for text in texts for part in text.split(",")) or None
+
+
+def _plain_type(annotation: Any) -> tuple[Any, bool]:
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        kinds = [kind for kind in typing.get_args(annotation) if kind is not type(None)]
+        return kinds[0], len(kinds) < len(typing.get_args(annotation))
+    return annotation, False
+
+
+def _help(name: str, field: Any, kind: Any, default: Any) -> str:
+    """A field's description, then its default and range as they are typed."""
+    told = []
+    if default is not None and default != ():
+        if kind is bool:
+            shown = name if default else f"no_{name}"
+            told.append(f"default: --{shown.replace('_', '-')}")
+        elif isinstance(default, tuple):
+            # Lists of any length are typed with commas, vectors with spaces.
+            between = "," if typing.get_args(kind)[-1] is Ellipsis else " "
+            told.append(f"default: {between.join(map(_shown, default))}")
+        else:
+            told.append(f"default: {_shown(default)}")
+    told += _bounds(field)
+    return f"{field.description or ''}  [{'; '.join(told)}]" if told else field.description or ""
+
+
+def _bounds(field: Any) -> list[str]:
+    words = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+    return [f"{word} {_shown(float(limit))}" for key, word in words.items()
+            for part in field.metadata if (limit := getattr(part, key, None)) is not None]
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,1 @@
+"""Stages that estimate Young's modulus and use it."""

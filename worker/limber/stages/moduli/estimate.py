@@ -1,0 +1,273 @@
+"""Young's modulus along the branch, from pulls."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.files.atomic import file_digest
+from limber.core.json_values import plain
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.estimation.settings import EstimateSettings
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from limber.estimation.estimated_branch import Subject
+    from limber.estimation.fit import Estimate
+
+
+EVALUATIONS = ".estimate-evaluations.jsonl"
+"""Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
+_BASES = ".reduced-*.npz"
+"""Beside them too: bases of reduced models, from which the next estimate starts."""
+
+
+class EstimateOptions(RunOptions):
+    """How an estimate is run."""
+
+    groups: ClassVar[Groups] = {"input": ("bag", "cell"), "running": ("resume", "follow", "pace")}
+
+    bag: Path | None = Field(
+        None, description="Import this recording first (MCAP, rosbag2, RTDE log) as the pull of "
+        "its name, and estimate from it; `limber import-pull` where more has to be said.")
+    cell: Path | None = Field(
+        None, description="With --bag: cell file of the robot, which says where its base stands "
+        "and how well gripper and force sensor are known.")
+    resume: bool = Field(False, json_schema_extra={"switch": True}, description=(
+        "Start at the best that a stopped run found; otherwise what it left behind does not "
+        "count."))
+    follow: bool = Field(
+        False, description="Estimate frame by frame while a pull is recorded, or replay one.",
+        json_schema_extra={"switch": True})
+    pace: float = Field(1.0, ge=0, description="Speed of a replay; 0: as fast as it goes.")
+
+
+def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
+             resume: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Estimate Young's modulus from the pulls of a branch folder.
+
+    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. Stopped by Ctrl-C it keeps the
+    best so far in ``estimate.json`` (``converged`` is then false).
+
+    Args:
+        branch_folder: Of the branch.
+        settings: What the result depends on.
+        force: Estimate again even if nothing has changed.
+        resume: Start at the best that a stopped run of the same estimate found. It ends at the
+            same moduli to the fit's tolerance, not to the last digit; without it nothing that a
+            stopped or killed run left behind counts.
+        progress: Called as it goes.
+
+    Returns:
+        DESIGN's keys and ``warnings``.
+
+    Raises:
+        InputError: no pulls, or pulls that cannot tell Young's modulus.
+        WorkError: the simulation finds no equilibrium, or the fit ends at no result (it did not
+            converge, or at a bound, or the data leave the moduli open); nothing is written.
+        Cancelled: after the best so far was kept.
+    """
+    branch = Branch.open(branch_folder)
+    with branch.writing("limber estimate"):
+        return _estimate(branch, settings, force=force, resume=resume, progress=progress)
+
+
+def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
+              progress: Progress) -> dict[str, Any]:
+    from limber.estimation.fit import fit_branch, judge_model, require_result
+    from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.estimation.summary import details, summary
+    from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
+
+    names = pull_names(branch, settings)
+    subject = load_subject(branch, settings)
+    digests = {"mesh geometry": subject.mesh.geometry_digest(),
+               "pulls": pulls_digest(branch, names)}
+    if not force and branch.is_current("estimate", settings, digests=digests):
+        stored = branch.manifest.stages["estimate"].result
+        if not stored.get("stopped"):
+            return stored
+    warnings: list[str] = []
+    heard = progress.keeping(warnings)
+    pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
+    log_path = branch.folder / EVALUATIONS
+    if force or not resume:
+        log_path.unlink(missing_ok=True)
+    bases = _finished_bases(branch)
+    log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
+    found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
+                       progress=heard.part(0.2, 0.9))
+    found.warnings = warnings
+    if not found.stopped:
+        require_result(found)
+        judge_model(found, subject, pulls[0].entry.grasp, settings,
+                    axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None,
+                    cloud=_cloud(branch), progress=heard.part(0.9, 0.98))
+        if settings.hold_out:
+            _foretell_others(branch, names, subject, found, settings, heard)
+    result = summary(found, settings)
+    earlier = branch.manifest.stages.get("estimate")
+    if found.stopped and earlier is not None and not earlier.result.get("stopped"):
+        raise Cancelled("The estimate was stopped.",
+                        "The finished estimate of an earlier run is kept.",
+                        "Run it again when there is time for it.")
+    with branch.stage("estimate", settings, digests=digests) as stage:
+        full = result | details(found, subject, pulls)
+        stage.path("estimate.json").write_text(
+            json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        if not found.stopped:
+            subject.mesh.with_data(cell_data={
+                "young": subject.young(found.values),
+                "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
+                "density": np.full(subject.mesh.tet_count, found.values.density),
+            }).write(stage.path("mesh.vtu"))
+        stage.result.update(result | {"bases": bases | _bases(branch.folder)})
+    if found.stopped:
+        raise Cancelled("The estimate was stopped.",
+                        f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
+                        "estimate.json, not in the mesh.",
+                        "Run it again with --resume to start from there.")
+    log.forget()
+    return stage.result
+
+
+def _bases(folder: Path) -> dict[str, str]:
+    """Bases of reduced models in a folder: file name to checksum."""
+    return {path.name: file_digest(path) for path in sorted(folder.glob(_BASES))}
+
+
+def _finished_bases(branch: Branch) -> dict[str, str]:
+    """Bases that finished estimates left; others are removed, since a killed run wrote them."""
+    entry = branch.manifest.stages.get("estimate")
+    known = entry.result.get("bases", {}) if entry else {}
+    kept = {}
+    for name, digest in _bases(branch.folder).items():
+        if known.get(name) == digest:
+            kept[name] = digest
+        else:
+            (branch.folder / name).unlink()
+    return kept
+
+
+def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
+           training_count: int = 60, progress: Progress = SILENT) -> dict[str, Any]:
+    """Estimate frame by frame from the first pull that is named (or the only one).
+
+    A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
+    replayed at ``pace`` times its own speed (0: as fast as it goes). Writes
+    ``estimate-online.json`` with the estimate after every frame; `limber estimate` afterwards
+    gives the final word.
+
+    Raises:
+        InputError: no such pull, or one without markers.
+    """
+    from limber.estimation.online.follow import follow as follow_pull
+    from limber.store.loading import load_subject
+
+    branch = Branch.open(branch_folder)
+    name, where = _followed(branch, settings)
+    subject = load_subject(branch, settings)
+    result, history = follow_pull(
+        where, name, subject, settings, pace=pace,
+        training_count=training_count, progress=progress,
+        axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
+    with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
+        stage.path("estimate-online.json").write_text(
+            json.dumps(plain(result | {"history": history}), indent=1), encoding="utf-8")
+        stage.result.update(result)
+    return stage.result
+
+
+def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Callable[[], Path]]:
+    """The pull to follow, and what tells its folder; one that is being recorded is not in the
+    manifest, and stands elsewhere than when it has ended.
+    """
+    from limber.store.loading import pull_names
+
+    name = settings.pull[0] if settings.pull else None
+    if name is not None and branch.growing(f"pulls/{name}") is not None:
+        return name, lambda: branch.growing(f"pulls/{name}") or branch.folder / "pulls" / name
+    if name is None or not (branch.folder / "pulls" / name / "pull.toml").is_file():
+        name = pull_names(branch, settings)[0]
+    folder = branch.path(f"pulls/{name}")
+    return name, lambda: folder
+
+
+def _cloud(branch: Branch) -> np.ndarray | None:
+    from limber.geometry.io.clouds import read_cloud
+
+    if not branch.has("cloud.ply"):
+        return None
+    cloud = read_cloud(branch.path("cloud.ply"))
+    # Leaves say nothing of axes and radii.
+    return cloud.points[cloud.attributes.get("leaf", np.zeros(len(cloud))) == 0]
+
+
+def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
+                     settings: EstimateSettings, progress: Progress) -> None:
+    """Score the branch's pulls that this estimate was not asked to use."""
+    from limber.estimation.fit import foretell
+    from limber.store.loading import known_pulls, load_pulls
+
+    for name in [name for name in known_pulls(branch) if name not in names]:
+        try:
+            pull = load_pulls(branch, [name], subject, settings)[0]
+            foretell(pull, subject, found, settings)
+        except LimberError as error:
+            progress.warn(
+                f"{name}, which the estimate did not use, could not be scored: {error}")
+
+
+def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    if options.bag is not None:
+        settings = _with_bag(inputs.branch_folder, options.bag, options.cell, settings, progress)
+    elif options.cell is not None:
+        raise InputError("--cell is given without --bag.", "A pull that is in the folder says for "
+                         "itself how well its robot is known.", "Leave --cell out.")
+    if options.follow:
+        return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
+    return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,
+                    progress=progress)
+
+
+def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: EstimateSettings,
+              progress: Progress) -> EstimateSettings:
+    """Bring a recording in; the estimate's pulls are those asked for and this one."""
+    import re
+
+    from limber.recordings.settings import ImportSettings
+    from limber.stages.pulls.import_pull import import_pull
+
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", bag.stem).strip("-.") or "bag"
+    import_pull(branch_folder, bag, name, ImportSettings(cell=None if cell is None else str(cell)),
+                progress=progress.part(0.0, 0.05))
+    return settings.model_copy(update={"pull": tuple(dict.fromkeys((*settings.pull, name)))})
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    from limber.results.report.tables import cause_rows, held_out_rows, modulus_rows
+
+    tables = [("Young's modulus", modulus_rows(result, None))]
+    if causes := cause_rows(result):
+        tables.append(("What makes it unsure, largest first", causes))
+    if held_out := held_out_rows(result):
+        tables.append(("Pulls foretold by a fit that did not see them: RMS errors", held_out))
+    return tables
+
+
+STAGE = StageDescription(
+    "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
+    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
+    tables=_tables)

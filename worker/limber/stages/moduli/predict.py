@@ -1,0 +1,66 @@
+"""Where a branch rests under another load, with its estimated modulus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.json_values import plain
+from limber.core.progress import SILENT, Progress
+from limber.estimation.settings import PredictSettings
+from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.recordings.recording import PullEntry
+
+
+def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progress = SILENT,
+            ) -> dict[str, Any]:
+    """Simulate the branch at rest under another load than the recorded one; writes nothing.
+
+    Returns:
+        See :func:`limber.estimation.prediction.predict_rest`.
+
+    Raises:
+        InputError: no load, nothing estimated yet, or no such pull.
+        WorkError: the branch finds no equilibrium under the load.
+    """
+    from limber.estimation.estimate_file import read_estimate
+    from limber.estimation.prediction import predict_rest, require_one_load
+    from limber.store.loading import load_estimated_subject
+
+    require_one_load(settings)
+    branch = Branch.read(branch_folder)
+    known = read_estimate(branch.require("estimate.json", "estimate"))
+    entry = _entry(branch, settings.pull)
+    subject = load_estimated_subject(branch, known, gravity=settings.gravity)
+    down = np.array(branch.gravity) / np.linalg.norm(branch.gravity)
+    return plain(predict_rest(known, subject, entry, down, settings, progress))
+
+
+def _entry(branch: Branch, name: str | None) -> PullEntry:
+    from limber.recordings.recording import read_entry
+    from limber.store.loading import known_pulls
+
+    names = known_pulls(branch)
+    if not names or (name is not None and name not in names):
+        raise InputError(f"{branch.folder} has no pull {name or ''}.",
+                         f"It has {', '.join(names)}." if names else "It has none.",
+                         "Bring one in with `limber import-pull`.")
+    return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
+
+
+def run(inputs: BranchInputs, settings: PredictSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return predict(inputs.branch_folder, settings, progress=progress)
+
+
+STAGE = StageDescription(
+    "predict", 80, run, BranchInputs, PredictSettings, NoOptions,
+    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"))

@@ -1,0 +1,129 @@
+"""Young's modulus and damping from a free swing; no robot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.core.errors import InputError, WorkError
+from limber.core.json_values import plain
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.estimation.settings import EstimateSettings, SwingSettings
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.estimation.vibration.free_swing import SwingFit
+    from limber.recordings.recording import Pull
+
+
+def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
+          progress: Progress = SILENT) -> dict[str, Any]:
+    """Estimate one level of Young's modulus, and damping, from a branch that is let go.
+
+    The modulus keeps its pattern along the branch. Writes ``swing.json``, and the modulus into
+    ``mesh.vtu``.
+
+    Raises:
+        InputError: no such swing, or nothing swings in it. WorkError: the fit does not converge.
+    """
+    from limber.estimation.forward.forward_model import under_its_weight
+    from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
+    from limber.recordings.recorded_grasp import grasp_on
+    from limber.store.loading import load_subject, pulls_digest
+
+    branch = Branch.open(branch_folder)
+    with branch.writing("limber swing"):
+        pull = _pull(branch, settings.pull)
+        subject = load_subject(branch, EstimateSettings(
+            poisson=settings.poisson, density=settings.density, gravity=settings.gravity))
+        digests = {"mesh geometry": subject.mesh.geometry_digest(),
+                   "pulls": pulls_digest(branch, [pull.name])}
+        if not force and branch.is_current("swing", settings, digests=digests):
+            return branch.manifest.stages["swing"].result
+        about = present(pull.entry.swing, "record of how the branch was let go")
+        seen = present(pull.observations, "observation of the swing")
+        rest = np.array(pull.entry.rest_points_m)
+        warnings: list[str] = []
+        model = under_its_weight(subject.model, pull.entry).with_young(
+            subject.mesh.cell_data["young"])
+        found = fit_swing(
+            model, grasp_on(subject.mesh, pull.entry.grasp),
+            SwingSeen(seen.times, seen.positions - rest, rest,
+                      about.start, pull.wrenches[0, :3], about.load_mass_kg, about.noise_m,
+                      about.registration_m),
+            periods=settings.periods, density_sigma=settings.density_sigma,
+            progress=progress.keeping(warnings).part(0.0, 0.95))
+        if not found.converged:
+            raise WorkError("The fit of the swing did not converge.",
+                            f"What is left over is {100 * found.relative_residual:.0f} % of the "
+                            "largest displacement.",
+                            "Check load, mass and density; or fit fewer --periods.")
+        young = found.factor * model.young
+        result = _summary(found, young, pull, warnings)
+        with branch.stage("swing", settings, digests=digests) as stage:
+            figure = {"times_s": found.times, "seen_m": found.seen,
+                      "simulated_m": found.simulated}
+            stage.path("swing.json").write_text(json.dumps(
+                plain(result | figure), allow_nan=False) + "\n", encoding="utf-8")
+            subject.mesh.with_data(cell_data={
+                "young": young, "poisson": model.poisson, "density": model.density,
+            }).write(stage.path("mesh.vtu"))
+            stage.result.update(result)
+        return stage.result
+
+
+def _pull(branch: Branch, wanted: str | None) -> Pull:
+    from limber.recordings.recording import read_entry, read_pull
+    from limber.store.loading import known_pulls
+
+    swings = [name for name in known_pulls(branch)
+              if read_entry(branch.path(f"pulls/{name}/pull.toml")).motion == "swing"]
+    if wanted is None and len(swings) == 1:
+        wanted = swings[0]
+    if wanted not in swings:
+        raise InputError(
+            f"{branch.folder} has no swing {wanted or ''}.",
+            f"It has {', '.join(swings)}." if swings else "It has none.",
+            "Name one with --pull; bring one in with `limber import-pull --motion swing --weight`.")
+    pull = read_pull(branch.path(f"pulls/{wanted}"))
+    if pull.entry.swing is None or pull.observations is None or pull.entry.rest_points_m is None:
+        raise InputError(f"{wanted}: pull.toml lacks [swing] or rest_points_m, or no markers.",
+                         "How it was let go and where its markers are at rest must be known.",
+                         "Bring it in with `limber import-pull --motion swing`.")
+    return pull
+
+
+def _summary(found: SwingFit, young: np.ndarray, pull: Pull, warnings: list[str],
+             ) -> dict[str, Any]:
+    level = float(young.mean())
+    return {
+        "pull": pull.name, "young_pa": level,
+        "young_interval_pa": (level / found.factor * found.factor_interval).tolist(),
+        "young_factor": found.factor, "mesh_factor": found.mesh_factor,
+        "release_s": found.release, "release_deviation_s": found.release_deviation,
+        "damping_mass_per_s": found.damping[0], "damping_stiffness_s": found.damping[1],
+        "damping_mass_interval_per_s": found.damping_interval[0].tolist(),
+        "damping_stiffness_interval_s": found.damping_interval[1].tolist(),
+        "damping_ratio": found.damping_ratio,
+        "damping_ratio_interval": found.damping_ratio_interval.tolist(),
+        "frequency_hz": found.frequency, "residual_m": found.residual,
+        "relative_residual": found.relative_residual, "independent_readings": found.readings,
+        "forward_count": found.forward_count, "window_s": list(found.window),
+        "converged": found.converged, "warnings": warnings}
+
+
+def run(inputs: BranchInputs, settings: SwingSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return swing(inputs.branch_folder, settings, force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "swing", 75, run, BranchInputs, SwingSettings, RunOptions, key="swing",
+    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"))

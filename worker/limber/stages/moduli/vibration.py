@@ -1,0 +1,182 @@
+"""Young's modulus and damping from how a branch rings: accelerometer, strain gauge or video track.
+
+RECORD is a table of times and one column or more of accelerations, strains or displacements in any
+unit, or a C3D file of markers. The branch is plucked and left to itself. Its frequencies tell one
+level of Young's modulus, as sure as its density and radii are; the pattern along the branch stays.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError, WorkError
+from limber.core.files.atomic import file_digest
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs, RunOptions, argument
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.estimation.vibration.ringing import Ringing
+    from limber.mechanics.model import BranchModel
+
+_MESH_DEVIATION = 0.02
+"""Of Young's modulus: what quadratic tetrahedra of the usual size are too stiff by, at most."""
+_CLOSE = 1.15
+"""Modes within this ratio of the first may be the one that is seen: two planes of bending."""
+_ROUNDS = 8
+
+
+class VibrationInputs(BranchInputs):
+    """A branch folder, and the record."""
+
+    groups: ClassVar[Groups] = {"input": ("record",)}
+
+    record: Path = argument("Table of times and readings (CSV), or C3D.")
+
+
+class VibrationSettings(Settings):
+    """What is known beside the record."""
+
+    groups: ClassVar[Groups] = {"record": ("start", "sensor"),
+                                "known": ("density_sigma", "radius_sigma")}
+
+    start: float | None = Field(None, description="When the branch is left to itself, on the "
+                                "record's clock [s]; by default where it moves most.")
+    sensor: tuple[float, float, float, float] | None = Field(
+        None, description="Place [m] and mass [kg] of a sensor that swings with the branch.",
+        json_schema_extra={"metavar": "X Y Z KG"})
+    density_sigma: float = Field(0.1, ge=0, le=1, description="Standard deviation of the wood's "
+                                 "density, as a share of it.")
+    radius_sigma: float = Field(0.02, ge=0, le=1, description="Standard deviation of the scan's "
+                                "radii as a whole, as a share of them.")
+
+
+def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
+              force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Estimate one level of Young's modulus, and damping, from a record of free ringing.
+
+    Writes ``vibration.json``, and the modulus into ``mesh.vtu``.
+
+    Returns:
+        ``young_pa`` (mean of the branch) with ``young_interval_pa`` (95 %) and ``young_factor``;
+        ``frequencies_hz``, ``frequency_deviations_hz``, ``damping_ratios`` and
+        ``damping_ratio_deviations`` of the record; ``model_frequencies_hz`` with that modulus;
+        ``left_over``; ``damping_mass_per_s`` (0) and ``damping_stiffness_s``, which give the first
+        vibration its damping.
+
+    Raises:
+        InputError: the record cannot be read, or does not ring. WorkError: no modulus has such a
+            frequency.
+    """
+    from limber.estimation.vibration.ringing import identify, read_record
+    from limber.store.loading import load_branch, load_mesh
+
+    if not Path(record).is_file():
+        raise InputError(f"There is no file {record}.", "A record of how the branch rings was "
+                         "expected.", "Check the path.")
+    rung = read_record(Path(record))
+    for text in rung.warnings:
+        progress.warn(text)
+    branch = Branch.open(branch_folder)
+    with branch.writing("limber vibration"):
+        mesh = load_mesh(branch)
+        digests = {"record": file_digest(record), "mesh geometry": mesh.geometry_digest()}
+        if not force and branch.is_current("vibration", settings, digests=digests):
+            return branch.manifest.stages["vibration"].result
+        seen = identify(rung.times, rung.values, settings.start)
+        progress(0.3, "modulus of that frequency")
+        model = load_branch(branch, progress=progress).model
+        told = young_of(_with_sensor(model, settings), seen, settings)
+        young = told["young_factor"] * model.young
+        result = _summary(seen, told, float(young.mean()))
+        with branch.stage("vibration", settings, digests=digests) as stage:
+            stage.path("vibration.json").write_text(
+                json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            mesh.with_data(cell_data={"young": young, "poisson": model.poisson,
+                                      "density": model.density}).write(stage.path("mesh.vtu"))
+            stage.result.update(result)
+        return stage.result
+
+
+def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> dict[str, Any]:
+    """Return the factor on the modulus that gives a model the record's first frequency.
+
+    Returns:
+        ``young_factor``, ``deviation`` (of its logarithm) and ``model_frequencies_hz``.
+
+    Raises:
+        WorkError: none does.
+    """
+    from limber.mechanics.dynamics.modes import lowest_modes
+
+    wanted, factor, last = float(seen.frequencies[0]), 1.0, None
+    for _ in range(_ROUNDS):
+        found = lowest_modes(model.with_young(factor * model.young), 3).frequencies
+        way = np.log(wanted / found[0])
+        if abs(way) < 1e-5:
+            break
+        # Weight stiffens a branch too, or softens it: the slope is not quite one half.
+        slope = 0.5 if last is None else np.clip(
+            (np.log(found[0]) - last[1]) / (np.log(factor) - last[0]), 0.1, 2.0)
+        last = np.log(factor), np.log(found[0])
+        factor *= float(np.exp(way / slope))
+    else:
+        raise WorkError(f"No modulus gives the branch a first frequency of {wanted:.3g} Hz.",
+                        "Its weight or what hangs on it does not fit the record.",
+                        "Check density, --sensor and the record's unit of time.")
+    slope = 0.5 if last is None else slope
+    near = found[found < _CLOSE * found[0]]
+    # Which of two planes of bending was seen is not known where the record does not part them.
+    is_parted = len(seen.frequencies) > 1 and seen.frequencies[1] < _CLOSE * wanted
+    planes = 0.0 if is_parted else float(np.log(near[-1] / near[0])) / np.sqrt(3.0)
+    deviation = np.sqrt((seen.frequency_deviations[0] / wanted / slope) ** 2
+                        + (planes / slope) ** 2 + settings.density_sigma**2
+                        + (2 * settings.radius_sigma) ** 2 + _MESH_DEVIATION**2)
+    return {"young_factor": factor, "deviation": float(deviation), "model_frequencies_hz": found}
+
+
+def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel:
+    from limber.mechanics.added_masses import PointMass
+
+    if settings.sensor is None:
+        return model
+    x, y, z, mass = settings.sensor
+    away = float(np.linalg.norm(model.mesh.nodes - np.array([x, y, z]), axis=1).min())
+    if not (mass > 0 and away < 0.1):
+        raise InputError(f"A sensor of {mass:g} kg, {1e3 * away:.0f} mm off the branch.",
+                         "It has a mass and sits on the branch.", "Check --sensor X Y Z KG.")
+    return model.with_point_masses([*model.point_masses, PointMass((x, y, z), mass)])
+
+
+def _summary(seen: Ringing, told: dict[str, Any], level: float) -> dict[str, Any]:
+    from limber.core.json_values import plain
+
+    spread = 1.96 * told["deviation"]
+    omega = 2 * np.pi * seen.frequencies[0]
+    return plain({
+        "young_pa": level, "young_interval_pa": [level * np.exp(-spread), level * np.exp(spread)],
+        "young_factor": told["young_factor"], "young_deviation": told["deviation"],
+        "frequencies_hz": seen.frequencies, "frequency_deviations_hz": seen.frequency_deviations,
+        "damping_ratios": seen.damping, "damping_ratio_deviations": seen.damping_deviations,
+        "model_frequencies_hz": told["model_frequencies_hz"], "left_over": seen.left_over,
+        "damping_mass_per_s": 0.0, "damping_stiffness_s": float(2 * seen.damping[0] / omega),
+        "start_s": seen.start, "duration_s": seen.duration})
+
+
+def run(inputs: VibrationInputs, settings: VibrationSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return vibration(inputs.branch_folder, inputs.record, settings, force=options.force,
+                     progress=progress)
+
+
+STAGE = StageDescription(
+    "vibration", 76, run, VibrationInputs, VibrationSettings, RunOptions, key="vibration",
+    reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"))

@@ -1,0 +1,1 @@
+"""Stages that bend a branch: pulls, forces and loads."""

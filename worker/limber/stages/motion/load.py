@@ -1,0 +1,209 @@
+"""What wind and gusts, snow, fruit or a pruning cut do to the branch: sag, strain, frequencies."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError
+from limber.core.files.atomic import file_digest
+from limber.core.files.reading import read_json
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.mechanics.loads.gust_loads import Gusts
+    from limber.mechanics.loads.outdoor import Bent
+    from limber.mechanics.model import BranchModel
+
+_Place = tuple[float, float, float]
+_Fruit = tuple[float, float, float, float]
+
+
+class LoadSettings(Settings):
+    """What acts beside the weight that the branch had when it was scanned."""
+
+    groups: ClassVar[Groups] = {
+        "loads": ("wind", "drag", "snow", "fruit", "cut"),
+        "gusts": ("gust", "gust_length", "gust_time", "gust_record"),
+        "limits": ("strain_limit", "limit_load", "most"),
+        "output": ("name",)}
+
+    wind: tuple[float, float, float] | None = Field(
+        None, description="Velocity of the wind, branch frame [m/s].",
+        json_schema_extra={"metavar": "X Y Z"})
+    drag: float = Field(1.1, gt=0, le=5, description="Drag coefficient of a round branch across "
+                        "the wind; leaves are not in it.")
+    gust: float | None = Field(
+        None, gt=0, le=1, description="Gusts: standard deviation of the wind's speed over its "
+        "mean, 0.1 over water to 0.4 in a crown. What follows is then that of the peak, by "
+        "spectrum and peak factor of EN 1991-1-4, annex B.")
+    gust_length: float = Field(
+        27.0, gt=0, le=1000, description="Length of the gusts [m]; that of EN 1991-1-4 2 m above "
+        "open land. Among trees it is about their height.")
+    gust_time: float = Field(600.0, ge=10, le=1e5, description="Time in which that peak is "
+                             "expected [s].")
+    gust_record: Path | None = Field(
+        None, description="Gusts as recorded: a CSV file with time_s and speed_m_s along --wind, "
+        "whose length counts no more.")
+    snow: float = Field(0.0, ge=0, le=1000, description="Snow on the branch's shadow as seen "
+                        "from above [kg/m^2].")
+    fruit: tuple[_Fruit, ...] = Field(
+        (), description="A fruit: place on the branch [m] and mass [kg]; may be given again.",
+        json_schema_extra={"metavar": "X Y Z KG"})
+    cut: tuple[_Place, ...] = Field(
+        (), description="Cut the branch off here [m]; may be given again.",
+        json_schema_extra={"metavar": "X Y Z"})
+    strain_limit: float = Field(
+        0.01, gt=0, lt=1, description="Strain at which the wood is taken to fail.")
+    limit_load: bool = Field(
+        False, description="Also find how many times these loads the branch bears.")
+    most: float = Field(50.0, gt=1, le=1e4, description="Largest number of times that is tried.")
+    name: str | None = Field(
+        None, pattern=r"^[\w-]+$", max_length=60, description="Keep it in the branch folder under "
+        "this name: report and scene then show the branch as it comes to rest.")
+
+
+def load(folder: Path, settings: LoadSettings, *, force: bool = False,
+         progress: Progress = SILENT) -> dict[str, Any]:
+    """Bring the branch to rest under loads.
+
+    With a name it writes ``loads/NAME.json``, and ``frames/load-NAME.pc2``, ``.json`` and ``.npz``:
+    the branch as scanned, and at rest under the loads; what is stored of the same branch and loads
+    is not worked out again, unless ``force``. Without a name it writes nothing.
+
+    Returns:
+        What :func:`~limber.mechanics.loads.load_effects.load_effects` tells (sag, greatest strain
+        and strain along the main path, frequencies; with ``limit_load`` how many times the loads it
+        bears; each with its interval, None where nothing has told how sure the moduli are), and
+        ``frequencies_before_hz``. With gusts all of it is of their peak, and ``gusts`` has what
+        :func:`~limber.mechanics.loads.gust_loads.with_peak` tells.
+
+    Raises:
+        InputError: no load, one off the branch, or gusts without wind. WorkError: it finds no
+            rest under it.
+    """
+    from limber.mechanics.added_masses import PointMass
+    from limber.mechanics.dynamics.modes import lowest_modes
+    from limber.mechanics.loads.gust_loads import blown, with_peak
+    from limber.mechanics.loads.load_effects import load_effects
+    from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
+    from limber.store.loading import known_damping, load_branch, load_skeleton, young_deviation
+
+    gusts = _gusts(settings)
+    wind = blown(settings.wind or (0.0, 0.0, 0.0), gusts)
+    if not (settings.wind or settings.snow or settings.fruit or settings.cut):
+        raise InputError("No load is given.", "Its own weight has bent the scanned branch already.",
+                         "Give --wind, --snow, --fruit or --cut.")
+    if any(not one[3] > 0 for one in settings.fruit):
+        raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
+    # Without a name nothing is stored.
+    branch = (Branch.read if settings.name is None else Branch.open)(folder)
+    inputs = _inputs(branch, settings)
+    if settings.name is not None and not force and branch.is_current(
+            f"load:{settings.name}", settings, **inputs):
+        return read_json(branch.path(f"loads/{settings.name}.json"), "the effects of loads")
+    skeleton = load_skeleton(branch)
+    hanging = load_branch(branch, progress=progress).model
+    _require_near(hanging.mesh.nodes, [one[:3] for one in settings.fruit])
+    loads = Outdoors(wind, settings.drag, settings.snow, tuple(
+        PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
+    outdoors = LoadedOutdoors(hanging, skeleton, loads)
+    told = None
+    if gusts is not None:
+        progress(0.1, "gusts")
+        outdoors, told = with_peak(outdoors, gusts, known_damping(branch, progress))
+    bent, result = load_effects(
+        outdoors, strain_limit=settings.strain_limit, deviation=young_deviation(branch),
+        most=settings.most if settings.limit_load else None, progress=progress.part(0.2, 1.0))
+    result |= {"frequencies_before_hz": lowest_modes(hanging, len(bent.frequencies)).frequencies,
+               "gusts": told}
+    if settings.name is not None:
+        _keep(branch, settings, inputs, hanging, bent, result)
+    return result
+
+
+def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
+    """What the result depends on beside the settings, as the store takes it."""
+    reads = [file for file in ("mesh.vtu", "skeleton.swc", "skeleton.csv", "point_masses.json",
+                               "targets.json", "estimate.json") if branch.has(file)]
+    # Damping and the interval may come from a swing's result alone.
+    told = {key: hashlib.sha256(branch.manifest.stages[key].model_dump_json().encode()).hexdigest()
+            for key in ("estimate", "swing", "vibration") if key in branch.manifest.stages}
+    record = settings.gust_record
+    return {"reads": reads, "digests": told | (
+        {} if record is None else {"gust_record": file_digest(record)})}
+
+
+def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], hanging: BranchModel,
+          bent: Bent, result: dict[str, Any]) -> None:
+    """Write the result, and the branch before and under the loads as frames."""
+    import json
+
+    from limber.core.json_values import plain
+    from limber.mechanics.strain import strain_state
+    from limber.results.motion_files import surface_fields, surface_nodes, write_pc2
+
+    nodes, name = surface_nodes(hanging.mesh), f"frames/load-{settings.name}"
+    ways = np.stack([np.zeros_like(bent.displacement), bent.displacement])
+    states = [strain_state(hanging, way) for way in ways]
+    with branch.stage(f"load:{settings.name}", settings, **inputs) as stage:
+        stage.path(f"loads/{settings.name}.json").write_text(
+            json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_pc2(stage.path(f"{name}.pc2"), hanging.mesh.nodes[nodes] + ways[:, nodes])
+        np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(hanging.mesh, states))
+        stage.path(f"{name}.json").write_text(json.dumps({
+            "frame_count": len(ways), "rate": 1.0,
+            "largest_principal_strains": [float(state.principal_strain[:, -1].max())
+                                          for state in states]}), encoding="utf-8")
+        stage.result.update({key: value for key, value in plain(result).items()
+                             if key != "along"})
+
+
+def _gusts(settings: LoadSettings) -> Gusts | None:
+    """The gusts that were asked for."""
+    from limber.mechanics.loads.gust_loads import Turbulence, WindRecord
+
+    if settings.gust is not None and settings.gust_record is not None:
+        raise InputError("Both --gust and --gust-record are given.", "The record has the gusts.",
+                         "Leave one out.")
+    if settings.gust_record is not None:
+        return WindRecord.read(settings.gust_record)
+    return None if settings.gust is None else Turbulence(
+        settings.gust, settings.gust_length, settings.gust_time)
+
+
+def _require_near(nodes: np.ndarray, places: list[_Place]) -> None:
+    for place in places:
+        distance = float(np.linalg.norm(nodes - np.array(place), axis=1).min())
+        if not distance < 0.1:
+            raise InputError(f"A fruit at {place} m is {distance:.3g} m off the branch.",
+                             "It hangs on the branch.", "Check frame and unit.")
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    limit = result["strain_over_limit"] / max(result["greatest_strain"], 1e-300)
+    return [("Greatest strain along the main path", [
+        ["from [m]", "to [m]", "strain", "of the limit"],
+        *([f"{row['from_m']:.3f}", f"{row['to_m']:.3f}", f"{row['strain']:.5f}",
+           f"{100 * limit * row['strain']:.0f} %"] for row in result["along"])])]
+
+
+def run(inputs: BranchInputs, settings: LoadSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return load(inputs.branch_folder, settings, force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "load", 45, run, BranchInputs, LoadSettings, RunOptions, key="load:{name}",
+    reads=("mesh.vtu", "skeleton.swc"),
+    writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
+    tables=_tables)

@@ -1,0 +1,224 @@
+"""Pull a branch by a pose or a force; writes motion, energy and forces."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import ConvergenceError, InputError
+from limber.core.files.atomic import write_atomically
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.mechanics.settings import SimulateSettings
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch, Stage
+
+if TYPE_CHECKING:
+    from limber.mechanics.dynamics.load_case import SimulatedMotion
+    from limber.mechanics.dynamics.pose_table import PoseTable
+    from limber.mechanics.model import BranchModel
+
+
+KEY = "simulate"
+_MOST_REPLAYED = 120
+"""Frames of a recording that is replayed slowly."""
+
+
+class SimulateInputs(BranchInputs):
+    """A branch folder, and the grasp's way."""
+
+    groups: ClassVar[Groups] = {"motion": ("along", "pull")}
+
+    along: Path | None = Field(
+        None, description="The grasp moves as the poses of a table do, from where it is: a "
+        "recording's robot.csv, or a plan's plans/NAME.csv, which takes --duration.",
+        json_schema_extra={"metavar": "FILE"})
+    pull: str | None = Field(
+        None, description="Replay this recording of the branch: grasped where and held as it was, "
+        "moved as the gripper was; grasp, kind and name of the result are the recording's. What "
+        "was measured can then be seen over it, frame by frame.",
+        json_schema_extra={"metavar": "NAME"})
+
+
+def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
+             along: PoseTable | None = None, key: str = KEY, force: bool = False,
+             progress: Progress = SILENT) -> dict[str, Any]:
+    """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+
+    Args:
+        branch_folder: With a mesh.
+        settings: How to pull.
+        along: The grasp's way instead of a motion of the settings.
+        key: Of its entry in the manifest.
+
+    Returns:
+        The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
+        ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
+
+    Raises:
+        InputError: options that do not fit. ConvergenceError: the branch could not follow; the
+            frames up to there are written.
+    """
+    from limber.mechanics.pull_simulation import (
+        load_case_of,
+        motion_of,
+        require_one_drive,
+        with_masses,
+    )
+    from limber.store.loading import load_grasp_point
+
+    branch = Branch.open(branch_folder)
+    branch.require("mesh.vtu", "reconstruct")
+    require_one_drive(settings, along)
+    digests = {"along": along.digest()} if along else {}
+    reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json")
+             if branch.has(name)]
+    stored = branch.manifest.stages.get(key)
+    if not force and stored and stored.result.get("converged") and branch.is_current(
+            key, settings, reads=reads, digests=digests):
+        return stored.result
+    progress(0.0, "preparing")
+    model = with_masses(_model(branch, settings, progress), settings)
+    case = load_case_of(model, settings, along, load_grasp_point(branch))
+    motion = motion_of(case, settings, progress.part(0.2, 0.9))
+    for message in motion.warnings:
+        progress.warn(message)
+    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
+        result = _write(stage, case.model, settings, motion)
+        stage.result.update(result)
+    progress(1.0, "done")
+    if not motion.converged:
+        raise ConvergenceError(
+            f"The branch could not follow: {motion.message}",
+            f"{result['frame_count']} frames up to the last good state are in"
+            f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
+            "Pull less far, or check units and Young's modulus.")
+    return result
+
+
+def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> BranchModel:
+    from limber.mechanics.materials.materials import RayleighDamping
+    from limber.store.loading import Overrides, load_branch, load_model
+
+    values: Overrides = {
+        "young": settings.young, "material": settings.material,
+        "lumped_mass": settings.lumped_mass,
+        "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
+    if settings.rest_shape:
+        return load_branch(branch, gravity=settings.gravity, progress=progress, **values).model
+    return load_model(branch, gravity=settings.gravity, **values)
+
+
+def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
+           motion: SimulatedMotion) -> dict[str, Any]:
+    from limber.mechanics.strain import strain_state
+    from limber.results.motion_files import (
+        surface_fields,
+        surface_nodes,
+        write_pc2,
+        write_pvd_series,
+    )
+
+    displacement = motion.displacement
+    nodes = surface_nodes(model.mesh)
+    write_pc2(stage.path(f"frames/{settings.name}.pc2"),
+              model.mesh.nodes[nodes] + displacement[:, nodes])
+    if settings.vtu:
+        folder = stage.path(f"frames/{settings.name}/{settings.name}.pvd").parent
+        write_pvd_series(folder, settings.name, model, motion.times, displacement)
+    tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
+                             axis=1).argmax())
+    states = [strain_state(model, moved) for moved in displacement]
+    np.savez_compressed(stage.path(f"frames/{settings.name}.npz"),
+                        **surface_fields(model.mesh, states))
+    frames = {
+        "frame_count": len(displacement), "rate": settings.frame_rate,
+        "times_s": motion.times.tolist(), "energies_j": motion.energy.tolist(),
+        "kinetic_energies_j": motion.kinetic_energy.tolist(),
+        "grasp_forces_n": motion.grasp_force.tolist(),
+        "grasp_torques_nm": motion.grasp_torque.tolist(),
+        "hold_forces_n": motion.hold_forces.tolist(), "min_det_f": motion.min_det_f.tolist(),
+        "converged": motion.converged,
+        "largest_principal_strains": [float(s.principal_strain[:, -1].max()) for s in states],
+        "largest_principal_stresses_pa": [
+            float(s.principal_stress[:, -1].max()) for s in states]}
+    write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
+    return {
+        "converged": motion.converged, "frame_count": len(displacement),
+        "energy_j": float(motion.energy[-1]),
+        "grasp_force_n": motion.grasp_force[-1].tolist(),
+        "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
+        "min_det_f": float(motion.min_det_f.min())}
+
+
+def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    if inputs.pull is not None:
+        settings, replayed = _replay(Branch.open(inputs.branch_folder), inputs, settings)
+        return simulate(inputs.branch_folder, settings, along=replayed,
+                        key=f"replay:{inputs.pull}", force=options.force, progress=progress)
+    along = _poses(inputs.along, settings.duration, progress) if inputs.along else None
+    return simulate(inputs.branch_folder, settings, along=along, force=options.force,
+                    progress=progress)
+
+
+def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
+            ) -> tuple[SimulateSettings, PoseTable]:
+    """Return the settings and the gripper's way of a recording.
+
+    Raises:
+        InputError: there is none of that name, or its gripper does not lead the branch.
+    """
+    from limber.mechanics.dynamics.pose_table import PoseTable
+    from limber.recordings.recording import read_pull
+    from limber.store.loading import known_pulls
+
+    if inputs.along is not None:
+        raise InputError("Both --along and --pull were given.", "Each is a way of the gripper.",
+                         "Give one of them.")
+    if inputs.pull not in known_pulls(branch):
+        raise InputError(f"There is no pull {inputs.pull!r}.",
+                         f"There are: {', '.join(known_pulls(branch)) or 'none'}.",
+                         "Import or record it first.")
+    pull = read_pull(branch.path(f"pulls/{inputs.pull}"))
+    if pull.entry.motion == "swing":
+        raise InputError(f"{inputs.pull} is a free swing.", "No gripper leads the branch there.",
+                         "`limber swing` fits it.")
+    grasp, way = pull.entry.grasp, PoseTable(pull.times, pull.poses)
+    is_static = pull.entry.motion == "quasi_static"
+    told = {"name": inputs.pull, "kind": "static" if is_static else "dynamic", "hold": 0.0,
+            "grasp_point": grasp.point_m, "grasp_radius": grasp.radius_m,
+            "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None}
+    if is_static:
+        # Each frame is an equilibrium of its own, and a recording may last for minutes.
+        told["frame_rate"] = min(settings.frame_rate, _MOST_REPLAYED / way.duration)
+    return settings.model_copy(update=told), way
+
+
+def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
+    from limber.mechanics.dynamics.pose_table import PoseTable
+    from limber.recordings.recording import POSE_COLUMNS
+    from limber.recordings.tables import read_table, robot_stream, time_column, with_columns
+
+    table = read_table(path)
+    timed = time_column(table) is not None
+    rate = None if timed else max(len(table.values) - 1, 1) / duration
+    stream = robot_stream(path, rate_hz=rate)
+    for message in stream.warnings:
+        progress.warn(message)
+    poses = with_columns(stream, POSE_COLUMNS).values
+    if np.isnan(poses[:, 3:]).all():
+        poses[:, 3:] = 0.0  # a table of positions alone
+    known = np.isfinite(poses).all(axis=1)
+    return PoseTable(stream.times[known], poses[known])
+
+
+STAGE = StageDescription(
+    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY,
+    reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"))

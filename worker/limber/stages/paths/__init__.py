@@ -1,0 +1,1 @@
+"""Stages that plan a path and follow it with a robot."""

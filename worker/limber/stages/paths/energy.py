@@ -1,0 +1,89 @@
+"""Energy field over grasp poses."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.planning.settings import EnergySettings
+from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+_MOST_TIMES = 4  # the samples asked for, that --field-error may take
+
+
+def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int | None = None,
+                        force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Stage ``energy``: sample grasp poses and fit the field; writes ``energy.npz``.
+
+    Raises:
+        BranchFolderError: no mesh yet.
+        WorkError: too few poses could be solved.
+    """
+    from limber.planning.field.energy_field import fit_field
+    from limber.planning.field.reduced_grasp import LearntGraspModel
+    from limber.planning.field.refining import refined
+    from limber.planning.field.sampling import energy_inputs, sample_field
+    from limber.store.loading import load_grasp_model
+
+    branch = Branch.open(folder)
+    grasp_model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
+    digests = energy_inputs(grasp_model)
+    if not force and branch.is_current("energy", settings, digests=digests):
+        return branch.manifest.stages["energy"].result
+    with branch.stage("energy", settings, digests=digests) as stage:
+        if settings.forward == "reduced":
+            grasp_model = LearntGraspModel.learnt(grasp_model, progress=progress.part(0.0, 0.02))
+        progress(0.0, "rest state")
+        sampled = sample_field(grasp_model, settings, workers=workers,
+                               progress=progress.part(0.02, 0.7))
+        field = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius,
+                          progress=progress.part(0.7, 0.8))
+        if settings.field_error is not None:
+            sampled, field = refined(grasp_model, sampled, field, settings.field_error / 100.0,
+                                     _MOST_TIMES * settings.samples, workers=workers,
+                                     progress=progress.part(0.8, 1.0))
+            off = 100.0 * field.errors["energy_error"]
+            if off > settings.field_error:
+                progress.warn(
+                    f"The energy field is off by {off:.2g} %, over the {settings.field_error:g} % "
+                    f"of --field-error, with {len(field.samples.poses)} poses: ask for more "
+                    "--samples, or a smaller --deflection.")
+        samples, reasons = sampled.samples, sampled.reasons
+        rejected = len(samples.rejected_poses)
+        if rejected > 0.2 * settings.samples:
+            progress.warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); "
+                          "paths keep away from them.")
+        field.write(stage.path("energy.npz"), {
+            "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
+            "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,
+            "arc_length_m": np.array(grasp_model.reach.arc_length)})
+        stage.result.update(
+            sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
+            taut_count=sampled.taut_count,
+            energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
+            forward=settings.forward,
+            reduced_count=int(present(samples.reduced, "mark of reduced samples").sum()),
+            errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
+            chart_stretch=field.chart.stretch,
+            chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,
+            max_energy_j=float(samples.energies.max()),
+            max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
+            rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
+    progress(1.0, "energy field fitted")
+    return branch.manifest.stages["energy"].result
+
+
+def run(inputs: BranchInputs, settings: EnergySettings, options: ParallelOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return sample_energy_field(inputs.branch_folder, settings, workers=options.workers,
+                               force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "energy", 90, run, BranchInputs, EnergySettings, ParallelOptions, key="energy",
+    reads=("mesh.vtu", "skeleton.swc"), writes=("energy.npz",))

@@ -1,0 +1,443 @@
+"""Follow a planned path with a robot; without --arm a dry run that moves nothing."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError, SafetyStop, WorkError
+from limber.core.files.reading import read_columns, read_text
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
+from limber.stages.inputs import BranchInputs, required
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.mechanics import BranchModel, Grasp, StaticResult
+    from limber.planning.constraints.chance import YoungDoubt
+    from limber.planning.field.grasp_model import GraspModel
+    from limber.robot.cell.cell import Cell
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.driver.live_force import LiveForce
+    from limber.robot.motion.execution import RobotMotion
+    from limber.robot.motion.expected_wrench import Predicted
+    from limber.robot.motion.trajectory import Trajectory
+
+_SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
+# a branch by 3 micrometres
+_MOST_POSES = 120
+_TARE_SECONDS = 1.0
+_BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
+
+
+class ExecuteInputs(BranchInputs):
+    """A branch folder, one of its plans and the robot's cell."""
+
+    groups: ClassVar[Groups] = {"input": ("name", "cell")}
+
+    name: str = Field("path", description="Name of the plan.")
+    cell: Path = required("The robot's cell file.", "cell.toml")
+
+
+class ExecuteSettings(Settings):
+    """How the path is followed."""
+
+    groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation", "gravity")}
+
+    speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
+    hold: float = Field(2.0, ge=0, le=3600, description="Time at the path's end [s].")
+    gripper_rotation: tuple[float, float, float] | None = Field(
+        None, description="Rotation vector of the gripper at the grasp, branch frame [rad]; "
+        "without it the way across the branch that keeps farthest from singularities.")
+    gravity: bool = Field(True, description="Predict forces of the branch with its weight.")
+
+
+class ExecuteOptions(Settings):
+    """Dry run, or motion."""
+
+    groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop")}
+
+    arm: bool = Field(False, description="Move the robot. Without it: a dry run.",
+                      json_schema_extra={"switch": True})
+    confirm: str | None = Field(
+        None, description="The plan's name, typed: the robot moves. Without it the name is asked "
+        "for at the terminal.")
+    after_stop: AfterStop = Field(
+        "ask", description="What to do after a stop; ask: at the terminal, else hold.")
+
+
+def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
+            options: ExecuteOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Check a plan for a robot, and with ``arm`` follow it.
+
+    The branch's force along the path is solved anew on the full model; the guard stops where the
+    measured one differs from it. Armed, the robot approaches the branch, the gripper closes, the
+    path is followed, held and gone back, the gripper opens and the robot leaves.
+
+    Returns:
+        ``armed``, ``reached``, ``stop_reason``, ``after_stop`` (as
+        :func:`limber.robot.operator_decisions.retreat_if_chosen` returns it), ``peak_force_n``,
+        ``path_error_m`` (None in a dry run) and what was computed: duration, predicted peak force,
+        distances from singularities and joint limits, where the robot has to stand.
+
+    Raises:
+        InputError: plan, cell and branch do not belong together, or nobody confirmed.
+        NoPathError: the arm cannot follow the path; says where and why.
+        SafetyStop: it was stopped; the log is in the folder all the same.
+    """
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.cell.compatibility import check_branch, check_plan, require_payload
+
+    branch, cell = Branch.open(folder), read_cell(cell_file)
+    if warning := check_branch(cell, branch.uuid, folder):
+        progress.warn(warning)
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
+    told = _told(branch, name)
+    if warning := check_plan(told.get("robot"), cell):
+        progress.warn(warning)
+    settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
+    if options.arm:
+        require_payload(cell)
+    from limber.robot.motion.execution import robot_motion
+    from limber.robot.motion.expected_wrench import Predicted
+    from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
+    from limber.store.loading import load_grasp_model
+
+    progress(0.02, "inverse kinematics")
+    model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
+    # The plan's own turn of the gripper is the one that was checked against obstacles.
+    rotation = settings.gripper_rotation or (told.get("robot") or {}).get("gripper_rotation")
+    asked = {"speed": settings.speed, "rotation": rotation,
+             "blocked": blocked_by(cell, cell_obstacles(cell, Path(cell_file).parent))}
+    planned = _planned(branch, name, model.rest_position)
+    if np.isfinite(planned).all():
+        # By the plan's own poses: whether the arm reaches them is known at once, forces are not.
+        at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
+        robot_motion(cell, at_once, model.reach.axis, **asked)
+    progress(0.05, "forces along the path")
+    predicted = _predicted(branch, model, planned[:, :3], progress)
+    progress(0.4, "inverse kinematics")
+    motion = robot_motion(cell, predicted, model.reach.axis, **asked)
+    result = _summary(cell, motion)
+    _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
+    if not options.arm:
+        _write_preview(branch, name, settings, cell, motion)
+        return result | {"armed": False, "reached": None, "stop_reason": None,
+                         "after_stop": None, "peak_force_n": None, "path_error_m": None}
+    require_confirmation(name, options.confirm)
+    return _armed(branch, cell, name, settings, options, motion, result, progress)
+
+
+def _told(branch: Branch, name: str) -> dict[str, Any]:
+    """What a plan's file says of the robot that it was made for and of its check in motion, as far
+    as it says it in the way of this program."""
+    from limber.planning.plan_file import read_plan_summary
+
+    file = f"plans/{name}.json"
+    found = read_plan_summary(branch.path(file)) if branch.has(file) else {}
+    return {key: found[key] for key in ("robot", "in_motion") if isinstance(found.get(key), dict)}
+
+
+def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSettings, cell: Cell,
+                        progress: Progress) -> tuple[ExecuteSettings, Cell]:
+    """Return settings and cell with the pace at which the plan keeps its limits in motion."""
+    if checked is None:
+        return settings, cell
+    speed, acceleration = checked["speed_m_s"], checked["acceleration_m_s2"]
+    if settings.speed > speed:
+        progress.warn(f"The plan keeps its limits with the branch's inertia up to "
+                      f"{1e3 * speed:.1f} mm/s, and is followed no faster; plan with a higher "
+                      "--speed if it shall be.")
+    limits = cell.limits.model_copy(update={
+        # The plan's law spends that share of it along the way, the robot's all.
+        "acceleration_m_s2": min(cell.limits.acceleration_m_s2, np.sqrt(0.5) * acceleration)})
+    return (settings.model_copy(update={"speed": min(settings.speed, speed)}),
+            cell.model_copy(update={"limits": limits}))
+
+
+def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progress: Progress,
+               ) -> Predicted:
+    """What the model predicts from rest to the path's end, through ``positions`` [n, 3].
+
+    The grasp goes through the plan's positions turned as the branch would turn by itself, close
+    enough that straight lines between stretch nothing; the wrench is that of the branch clamped so.
+    """
+    from limber.mechanics import Grasp, follow_poses
+    from limber.mechanics.sensitivities import grasp_slopes
+    from limber.planning.field.grasp_model import refusal
+    from limber.robot.motion.expected_wrench import Predicted
+    from limber.stages.paths.plan_uncertainty import estimated_doubt
+    from limber.stages.pulls.record_path import GRASP_RADIUS_M
+
+    doubt = estimated_doubt(branch, model)
+    if doubt is None:
+        progress.warn("How uncertain Young's modulus is, is not known (no estimate): the interval "
+                      "of the predicted force leaves it out.")
+    positions = _closely(positions)
+    clamped = Grasp.gripping(model.mesh, model.grasp.centre, GRASP_RADIUS_M)
+    firm = model.model.gripped(clamped)
+    poses, wrenches, stiffness, covariances = [], [], [], []
+    state = held = model.rest.displacement
+    for number, position in enumerate(positions):
+        free = model.follow(position[None], state)[0]
+        reason = refusal(free)
+        if reason is None:
+            state = free.displacement
+            pose = np.r_[position, model.pose(state)[3:]]
+            result = follow_poses(firm, clamped, pose[None], start=held)[0]
+            reason = refusal(result)
+        if reason is not None:
+            raise WorkError(f"Pose {number + 1} of {len(positions)} has no believable solution "
+                            f"({reason}).", "Its force is not known, so it is not taken there.",
+                            "Plan a gentler path.")
+        held = result.displacement
+        poses.append(pose)
+        wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
+        stiffness.append(grasp_slopes(firm, clamped, held).wrench)
+        covariances.append(np.zeros((3, 3)) if doubt is None
+                           else _by_young(firm, clamped, result, doubt))
+        progress(0.05 + 0.35 * number / len(positions), "forces along the path")
+    return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
+                     np.array(covariances))
+
+
+def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, doubt: YoungDoubt,
+              ) -> np.ndarray:
+    """Covariance of the force for what is not known of Young's modulus [N^2], shape [3, 3]."""
+    from limber.mechanics.sensitivities import static_sensitivities
+
+    slopes = static_sensitivities(model, result, grasp, None, shares=doubt.shares.T)
+    scaled = slopes.reaction_force * doubt.deviations
+    return scaled @ doubt.correlation @ scaled.T
+
+
+def _force_sigma(cell: Cell, samples: np.ndarray) -> float:
+    """Of the smoothed force by the sensor's noise and what it has drifted since its tare [N]."""
+    from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
+
+    minutes = (samples[-1, 0] - samples[0, 0] + _BEFORE_PATH_SECONDS) / 60.0
+    return float(np.hypot(cell.sensor.force_sigma_n / np.sqrt(INDEPENDENT_READINGS),
+                          cell.sensor.drift_n_per_minute * minutes))
+
+
+def _closely(positions: np.ndarray) -> np.ndarray:
+    """Return positions [n, 3] with more between them, on a smooth line that hardly overshoots."""
+    from scipy.interpolate import Akima1DInterpolator
+
+    kept = np.r_[True, np.linalg.norm(np.diff(positions, axis=0), axis=1) > 1e-9]
+    positions = positions[kept]
+    places = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    spacing = max(_SPACING, places[-1] / _MOST_POSES)
+    wanted = np.concatenate([
+        np.linspace(a, b, max(int(np.ceil((b - a) / spacing)), 1) + 1)[:-1]
+        for a, b in pairwise(places)] + [places[-1:]])
+    return Akima1DInterpolator(places, positions, method="makima")(wanted)
+
+
+def _planned(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
+    """Return the way of the grasp from rest to the path's end [m, rad], shape [n, 6].
+
+    Rotations are the branch's own; NaN where the table has none. Approach and path as planned; a
+    path without a planned approach is led up to straight.
+    """
+    from limber.recordings.recording import POSE_COLUMNS
+
+    whole = branch.has(f"plans/{name}-motion.csv")
+    path = branch.require(f"plans/{name}-motion.csv" if whole else f"plans/{name}.csv", "plan")
+    table = read_columns(path, ("x_m", "y_m", "z_m"), "the table of a path")
+    nothing = np.full(len(table["x_m"]), np.nan)
+    planned = np.column_stack([table.get(column, nothing) for column in POSE_COLUMNS])
+    if whole:
+        rows = csv.DictReader(read_text(path, "the table of a motion").splitlines())
+        planned = planned[[row.get("phase") != "return" for row in rows]]
+    if len(planned) < 2:
+        raise InputError(f"{path} has {len(planned)} points.", "That is no path.", "Plan again.")
+    # The grasped piece at rest is where it is and not turned.
+    start = np.r_[rest, np.zeros(3)]
+    way = float(np.linalg.norm(planned[0, :3] - rest))
+    leading = start + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
+        planned[0] - start)
+    return np.vstack([leading, planned]) if way > 1e-4 else planned
+
+
+def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
+    peak = float(np.linalg.norm(forces, axis=1).max())
+    if peak >= cell.limits.soft_force_n:
+        raise InputError(
+            f"The path needs {peak:.3g} N, the soft limit is {cell.limits.soft_force_n:.3g} N.",
+            "The guard would pause on the way.",
+            "Plan with a lower --max-force, or raise limits.soft_force_n in the cell file.")
+    box = cell.workspace
+    if box is not None:
+        outside = np.any((poses[:, :3] < box.low_m) | (poses[:, :3] > box.high_m), axis=1)
+        if outside.any():
+            place = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
+            raise InputError(f"The path leaves the workspace at ({place}) m.",
+                             "The guard would stop there.", "Plan inside it, or correct the cell.")
+
+
+def _summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
+    steps = np.concatenate([motion.approach.times,
+                            motion.approach.duration + motion.path.times[1:]])
+    felt = motion.path.expected
+    assert felt is not None
+    largest = np.linalg.eigvalsh(felt.covariance[:, :3, :3])[:, -1].max()
+    return {
+        "robot": cell.arm.name, "duration_s": 2 * (motion.approach.duration + motion.path.duration),
+        "pose_count": len(motion.path.times),
+        "predicted_peak_force_n": float(np.linalg.norm(felt.wrenches[:, :3], axis=1).max()),
+        "predicted_force_sigma_n": float(np.sqrt(max(largest, 0.0))),
+        "singularity_distance": motion.joints.singularity,
+        "joint_limit_margin_rad": motion.joints.limit_margin,
+        "joint_speed_share": motion.joints.speed_share(cell.arm, steps),
+        "gripper_rotation": motion.rotation, "start_pose_base": motion.approach.poses[0],
+        "start_joints_rad": motion.joints.joints[0]}
+
+
+def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: Cell,
+                   motion: RobotMotion) -> None:
+    """What the robot would do, for the viewport: poses in the branch's frame, joints, forces."""
+    from limber.robot.ur.kinematics import matrices, pose_vectors
+
+    base = matrices(np.array(cell.base.pose))
+    rows = []
+    begin = 0.0
+    first = len(motion.approach.times)
+    for trajectory, joints in ((motion.approach, motion.joints.joints[:first]),
+                               (motion.path, motion.joints.joints[first - 1:])):
+        poses = pose_vectors(base @ matrices(trajectory.poses))
+        assert trajectory.expected is not None
+        rows.append(np.column_stack([begin + trajectory.times, poses, joints,
+                                     trajectory.expected.wrenches[:, :3]]))
+        begin += trajectory.duration + 0.5
+    header = ("t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,"
+              "fx_n,fy_n,fz_n")
+    lines = [header, *(",".join(f"{x:.7g}" for x in row) for row in np.vstack(rows))]
+    with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
+        stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
+                                                               encoding="utf-8")
+        stage.result.update(model=cell.robot.model, base_pose=list(cell.base.pose))
+
+
+def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
+           options: ExecuteOptions, motion: RobotMotion, summary: dict[str, Any],
+           progress: Progress) -> dict[str, Any]:
+    from limber.robot.driver.link import COLUMNS, RobotLink
+    from limber.robot.driver.live_force import LiveForce
+    from limber.robot.motion.execution import followed
+    from limber.robot.ur.kinematics import matrices
+
+    log = f"executions/{name}/samples.csv"
+    with branch.writing(f"the execution of {name}"):
+        stream = branch.stream(log)
+        batches: list[np.ndarray] = []
+        try:
+            stream.append(",".join(COLUMNS))
+
+            live = LiveForce(branch.folder, f"Following {name}", cell.limits.soft_force_n)
+
+            def take(rows: np.ndarray) -> None:
+                batches.append(rows)
+                for row in rows:
+                    stream.append(",".join("" if np.isnan(x) else f"{x:.7g}" for x in row))
+                live.take(rows)
+            with live, RobotLink(cell, take) as link:
+                event, on_path = _steps(cell, link, motion, settings, options, batches, live,
+                                        progress)
+                warnings = list(link.warnings)
+        finally:
+            stream.close()
+        for warning in warnings:
+            progress.warn(warning)
+        samples = np.concatenate(batches)[on_path[0]:on_path[1]] if on_path else None
+        base = matrices(np.array(cell.base.pose))
+        path = (base @ matrices(motion.path.poses))[:, :3, 3]
+        found = (followed(samples, path, _force_sigma(cell, samples))
+                 if samples is not None and len(samples) else None)
+        reached = event["event"] == "reached"
+        result = summary | {
+            "armed": True, "reached": reached,
+            "stop_reason": None if reached else event["reason"],
+            "after_stop": event.get("after_stop"),
+            "peak_force_n": found.peak_force if found else None,
+            "path_error_m": found.path_error if found else None,
+            "force_error_of_peak": found.force_error if found else None,
+            "force_within_share": found.force_within if found else None}
+        with branch.stage(f"execute:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
+            stage.adopt(log)
+            from limber.core.json_values import plain
+
+            stage.path(f"executions/{name}/report.json").write_text(
+                json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
+            stage.result.update(result)
+    if not reached:
+        raise SafetyStop(f"The robot was stopped: {event['reason']}.",
+                         f"{event['after_stop']['outcome']} Its log is in executions/{name}.",
+                         "Look at the branch and the robot before anything moves; plan again from "
+                         "where it is.", result=result)
+    return result
+
+
+def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSettings,
+           options: ExecuteOptions, batches: list[np.ndarray], live: LiveForce,
+           progress: Progress) -> tuple[dict[str, Any], tuple[int, int] | None]:
+    """Go through approach, grasp, path, return and leaving; stops at the first that stops."""
+    progress(0.5, "taring: keep the gripper free")
+    live.at("taring")
+    link.wait_for_samples()
+    link.tare(_TARE_SECONDS)
+    on_path: tuple[int, int] | None = None
+    legs: list[tuple[str, Trajectory]] = [
+        ("approach", motion.approach), ("path", motion.path), ("return", motion.way_back),
+        ("leaving", motion.leaving)]
+    event: dict[str, Any] = {}
+    for number, (title, trajectory) in enumerate(legs):
+        progress(0.55 + 0.1 * number, title)
+        live.at(title)
+        begin = sum(map(len, batches))
+        event = _followed_to_its_end(link, trajectory)
+        if title == "path":
+            on_path = (begin, sum(map(len, batches)))
+        if event["event"] != "reached":
+            after = retreat_if_chosen(cell, link, options.after_stop, progress)
+            return event | {"after_stop": after}, on_path
+        if title == "approach":
+            grip(cell, link, close=True, progress=progress)
+        elif title == "path":
+            time.sleep(settings.hold)
+        elif title == "return":
+            grip(cell, link, close=False, progress=progress)
+    return event, on_path
+
+
+def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:
+    try:
+        return link.follow(trajectory)
+    except KeyboardInterrupt:
+        # Ctrl-C stops the arm before anything else.
+        link.stop()
+        raise
+
+
+def run(inputs: ExecuteInputs, settings: ExecuteSettings, options: ExecuteOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return execute(inputs.branch_folder, inputs.name, inputs.cell, settings, options,
+                   progress=progress)
+
+
+STAGE = StageDescription(
+    "execute", 110, run, ExecuteInputs, ExecuteSettings, ExecuteOptions, key="execute:{name}",
+    reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
+    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"))

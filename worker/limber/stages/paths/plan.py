@@ -1,0 +1,320 @@
+"""Paths to a goal: RRT* and deformation-aware D-RRT*, compared.
+
+The field serves to search. Every energy, force and strain that is reported comes from the finite
+elements along the found paths; how far the field was off is reported beside them.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import BranchFolderError, Cancelled, InputError, NoPathError
+from limber.core.files.atomic import file_digest
+from limber.core.json_values import plain
+from limber.core.present import present
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.planning.settings import PlanSettings
+from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch, Stage
+
+if TYPE_CHECKING:
+    from limber.planning.constraints.limits import Limits
+    from limber.planning.field.grasp_model import GraspModel
+    from limber.planning.goals.regions import Region
+    from limber.planning.make_plan import PlannedMotion
+    from limber.planning.plan_file import Way
+    from limber.planning.timing import Pace
+    from limber.robot.cell.cell import Cell
+
+
+_MOST_NODES = 2000  # of a search tree in its file; those that carry the most others stay
+_SETPOINT_RATE = 125.0  # [Hz] of poses in time, where no robot says its own
+_FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
+_COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
+            "strain")
+_MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx_n", "fy_n", "fz_n",
+                   "tx_nm", "ty_nm", "tz_nm", "energy_j", "strain")
+
+
+class PlanInputs(BranchInputs):
+    """A branch folder, and the plan's name."""
+
+    groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
+
+    cell: Path | None = Field(None, description=(
+        "The robot's cell file: its workspace, force limit and obstacles hold, and its arm must "
+        "reach all of the way."))
+    name: str = Field("path", description="Name of the plan's files.")
+
+
+def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
+         cell_file: Path | None = None, workers: int | None = None, force: bool = False,
+         progress: Progress = SILENT) -> dict[str, Any]:
+    """Plan paths on the branch's energy field.
+
+    Writes ``plans/NAME.json``, csv files of both paths, the whole motion, its poses at the
+    controller's rate and the search trees, and the frames.
+
+    Raises:
+        BranchFolderError: no energy field, or one of another geometry or material.
+        InputError: a name that is none, a start that is not allowed, or two goals.
+        NoPathError: no path; the message says why.
+        Cancelled: the best so far was kept, where there was one and no finished plan of the name.
+    """
+    from limber.planning.constraints.limits import Limits
+    from limber.planning.field.energy_field import EnergyField
+    from limber.planning.field.sampling import energy_inputs, is_sampled_on
+    from limber.planning.make_plan import plan_motion
+    from limber.planning.plan_file import whole_motion
+    from limber.planning.timing import Pace
+    from limber.stages.paths.plan_cell import reached_by, require_taken
+    from limber.stages.paths.plan_uncertainty import young_doubt
+    from limber.store.loading import known_damping, load_grasp_model
+
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
+            ("-baseline", "-bound", "-motion", "-setpoints", "-trees")):
+        raise InputError(f"--name {name!r} cannot name a plan.",
+                         "It becomes part of file names; -baseline, -bound, -motion, -setpoints "
+                         "and -trees are its own files.",
+                         "Use letters, digits, dash, dot and underscore.")
+    branch = Branch.open(folder)
+    field_path = branch.require("energy.npz", "energy")
+    energy_stage = branch.manifest.stages["energy"]
+    grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
+                                   progress=progress)
+    field = EnergyField.read(field_path)
+    if not is_sampled_on(energy_stage.reads, field.rest, grasp_model):
+        raise BranchFolderError(
+            "The energy field is of another mesh, material, weight or of other targets.",
+            "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
+            "Run `limber energy` again.")
+    digests = energy_inputs(grasp_model)
+    grasp_model = grasp_model.damped(known_damping(branch))
+    digests = digests | {"damping": repr(grasp_model.model.damping)}
+    stiffer = _stiffer(branch) if settings.max_stress else 1.0
+    digests = digests | {"stiffer": f"{stiffer:.6f}"}
+    asked = Limits.of(settings, stiffer)
+    doubt = None if settings.confidence is None else young_doubt(branch, grasp_model, asked)
+    in_cell = None
+    if cell_file is not None:
+        in_cell = _InCell.of(branch, cell_file, settings, asked, progress)
+        digests = digests | {"cell": file_digest(cell_file)}
+    key = f"plan:{name}"
+    reads = ["energy.npz"]
+    earlier = branch.manifest.stages.get(key)
+    finished = earlier is not None and not earlier.result.get("stopped")
+    if not force and earlier is not None and finished and branch.is_current(
+            key, settings, reads=reads, digests=digests):
+        return earlier.result
+    if in_cell is not None:
+        in_cell.check_goal(settings)
+    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
+        limits = asked if in_cell is None else in_cell.limits
+        pace = Pace(settings.speed, settings.acceleration)
+        if in_cell is not None:
+            pace = in_cell.slowed(pace)
+        found = plan_motion(field, grasp_model, settings, limits=limits,
+                            region=None if in_cell is None else in_cell.region, doubt=doubt,
+                            pace=pace, workers=workers, progress=progress)
+        if found.summary["stopped"]:
+            progress = progress.to_the_end()
+        if found.summary["stopped"] and finished:
+            raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
+                            "Run it again when there is time for it.")
+        pace = found.pace
+        motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
+        if in_cell is not None:
+            progress(0.95, "inverse kinematics")
+            if settings.second_arm:
+                require_taken(in_cell.cell, np.array(found.summary["target_end_m"]))
+            found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
+                                                limits.obstacles, pace.speed)
+        progress(0.95, "writing")
+        rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
+        found.summary["setpoint_rate_hz"] = rate
+        stage.path(f"plans/{name}-setpoints.csv").write_text(_setpoints(motion, pace, rate),
+                                                             encoding="utf-8")
+        _write(stage, name, limits, pace, motion, grasp_model, found)
+        stage.result.update(found.summary)
+    result = branch.manifest.stages[key].result
+    if result["stopped"]:
+        gap = result["certificate"]["gap_percent"]
+        near = "how far above the best possible is not known" if gap is None else (
+            f"at most {gap:.2g} % above the best possible")
+        raise Cancelled("The search was stopped.",
+                        f"Its best path so far ({near}), checked on the full model, is plan "
+                        f"{name}.", "Run it again to have the bound closed.")
+    progress(1.0, "planned")
+    return result
+
+
+@dataclass(frozen=True)
+class _InCell:
+    """A cell, and the limits that hold in it."""
+
+    cell: Cell
+    limits: Limits
+    region: Region | None
+
+    @classmethod
+    def of(cls, branch: Branch, path: Path, settings: PlanSettings, limits: Limits,
+           progress: Progress) -> _InCell:
+        from limber.stages.paths.plan_cell import cell_for, cell_obstacles, limits_in, region_of
+
+        cell = cell_for(branch, path, progress)
+        return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)),
+                   region_of(cell, settings))
+
+
+    def slowed(self, pace: Pace) -> Pace:
+        """Return the pace, no faster than the cell allows."""
+        most = self.cell.limits
+        return replace(pace, speed=min(pace.speed, most.speed_m_s),
+                       acceleration=min(pace.acceleration, most.acceleration_m_s2))
+
+    def check_goal(self, settings: PlanSettings) -> None:
+        """Raise NoPathError where the goal that is given lies inside an obstacle."""
+        from limber.planning.constraints.obstacles import closest
+
+        goal = settings.goal or settings.tip_goal
+        hit = goal and closest(self.limits.obstacles, np.array([goal], float))
+        if hit:
+            raise NoPathError(f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
+                              "Nothing can be brought there.",
+                              "Choose another goal, or correct the obstacle in the cell file.")
+
+
+def _stiffer(branch: Branch) -> float:
+    """Return how many times Young's modulus may be the estimate, by its widest interval.
+
+    Raises:
+        InputError: an interval has no upper end.
+    """
+    if "estimate" not in branch.manifest.stages:
+        return 1.0
+    result = branch.manifest.stages["estimate"].result
+    highest = np.array(result["young_interval_pa"], float)[:, 1]
+    share = highest / np.array(result["young_pa"], float)
+    if not np.isfinite(share).all():
+        raise InputError("--max-stress is given, and the estimate says not how stiff the branch "
+                         "may be at most.", "A stiffer branch bears more stress at the same pose.",
+                         "Record another pull, or limit --max-strain instead.")
+    return float(np.max(share, initial=1.0))
+
+
+def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
+           grasp_model: GraspModel, found: PlannedMotion) -> None:
+    from limber.mechanics.strain import strain_state
+    from limber.planning.plan_file import limits_of_motion, plan_text, way_of
+    from limber.results.motion_files import surface_fields, write_pc2
+
+    names = tuple(target.name for target in grasp_model.branch.targets)
+    baseline, plan = (way_of(path.solved, names, pace=pace,
+                             field_energies=found.field.energy(path.solved.poses[:, :3]))
+                      for path in (found.baseline, found.plan))
+    stage.path(f"plans/{name}.json").write_text(plan_text(
+        found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace),
+        encoding="utf-8")
+    stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
+    stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
+    stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")
+    stage.path(f"plans/{name}-trees.csv").write_text(_trees_table(found), encoding="utf-8")
+    if found.to_go is not None:
+        found.to_go.write(stage.path(f"plans/{name}-bound.npz"))
+    displacements = found.plan.solved.displacements
+    vertices = np.unique(grasp_model.mesh.surface_faces())
+    frames = grasp_model.mesh.nodes[vertices] + displacements[:, vertices]
+    write_pc2(stage.path(f"frames/{name}.pc2"), frames, 0.0, 1.0)
+    stage.path(f"frames/{name}.json").write_text(json.dumps(plain({
+        "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
+        "energies_j": plan.energies, "forces_n": plan.force_sizes, "path": name})) + "\n",
+        encoding="utf-8")
+    # What the scene can colour the surface by, at the vertices and in the order of the frames.
+    model, mesh = grasp_model.model, grasp_model.mesh
+    states = [strain_state(model, u) for u in displacements]
+    np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
+
+
+def _table(way: Way) -> str:
+    from limber.planning.cost import arc_lengths
+
+    along = arc_lengths(way.poses[:, :3])
+    return _csv(_COLUMNS, np.column_stack(
+        [along, way.poses, way.energies, way.force_sizes, way.strains]))
+
+
+def _motion_table(motion: Way) -> str:
+    targets = [f"{name}_{axis}_m" for name in motion.targets for axis in "xyz"]
+    times = present(motion.times, "time of the motion")
+    forces = present(motion.forces, "force of the motion")
+    torques = present(motion.torques, "torque of the motion")
+    rows = np.column_stack([times, motion.poses, forces, torques,
+                            motion.energies, motion.strains, *motion.targets.values()])
+    return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
+
+
+def _setpoints(motion: Way, pace: Pace, rate: float) -> str:
+    """Return the grasp's poses every 1 / ``rate`` [s], and last at the motion's end."""
+    from limber.planning.timing import poses_at, time_law
+
+    phases = present(motion.phases, "phase of the motion")
+    end = phases.count("approach") + phases.count("path") - 1
+    law = time_law(motion.poses[:, :3], pace, (end,))
+    instants = np.arange(int(np.ceil(law.duration * rate)) + 1) / rate
+    return _csv(_MOTION_COLUMNS[:7], np.column_stack(
+        [instants, poses_at(motion.poses, law, instants, (end,))]))
+
+
+def _trees_table(found: PlannedMotion) -> str:
+    """A row a node: its tree, its position, and the row of that tree that it hangs on, -1: none."""
+    lines = ["planner,x_m,y_m,z_m,parent"]
+    for planner, tree in found.trees.items():
+        small = tree.pruned(_MOST_NODES)
+        lines += [f"{planner},{x:.6g},{y:.6g},{z:.6g},{parent}"
+                  for (x, y, z), parent in zip(small.nodes, small.parents, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | None = None) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow((*columns, *(() if phases is None else ("phase",))))
+    for number, row in enumerate(rows):
+        writer.writerow([*(f"{value:.9g}" for value in row),
+                         *(() if phases is None else (phases[number],))])
+    return text.getvalue()
+
+
+def run(inputs: PlanInputs, settings: PlanSettings, options: ParallelOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return plan(inputs.branch_folder, settings, name=inputs.name, cell_file=inputs.cell,
+                workers=options.workers,
+                force=options.force, progress=progress)
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    from limber.results.report.tables import comparison_rows
+
+    return [("Both paths, on the full model", comparison_rows(result))]
+
+
+STAGE = StageDescription(
+    "plan", 100, run, PlanInputs, PlanSettings, ParallelOptions, key="plan:{name}",
+    reads=("mesh.vtu", "energy.npz"),
+    writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
+            "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
+            "plans/{name}-bound.npz", "frames/{name}.pc2", "frames/{name}.json",
+            "frames/{name}.npz"),
+    tables=_tables)

@@ -1,0 +1,193 @@
+"""What a robot's cell asks of a plan: its workspace, its obstacles, and that the arm reaches."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.core.errors import InputError, NoPathError
+from limber.core.present import present
+from limber.core.progress import Progress
+from limber.geometry.io.surfaces import usable_surface
+from limber.geometry.surface.surface import Surface
+from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
+from limber.planning.goals.regions import Ball, Region, View
+from limber.planning.plan_file import Way
+from limber.planning.settings import PlanSettings
+from limber.robot.cell.arm_shape import rods_of
+from limber.robot.cell.cell import BoxEntry, Cell, read_cell
+from limber.robot.cell.compatibility import check_branch
+from limber.robot.motion.execution import Blocked, robot_motion
+from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.ur.arms import arm_named
+from limber.robot.ur.kinematics import inverse, inverted, matrices
+from limber.store import Branch
+
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_TURNS = 200  # directions from which a second arm may take a target
+_ROD_SPACING = 0.02  # [m] of points along a part of gripper or arm
+_POSE_SPACING = 0.01  # [m] that a part goes at most between poses that are looked at
+_BETWEEN = 0.006  # [m] by which parts are thicker for what lies between both
+_LARGE = 20.0  # [m] an obstacle that is larger is in another unit
+
+
+def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
+    """Return the cell of a file, checked to be this branch's.
+
+    Raises:
+        InputError: it cannot be read, or is another branch's.
+    """
+    cell = read_cell(path)
+    if warning := check_branch(cell, branch.uuid, branch.folder):
+        progress.warn(warning)
+    return cell
+
+
+def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
+    """Return the cell's obstacles; files of meshes lie in ``folder``.
+
+    Raises:
+        InputError: a mesh cannot be read, has holes, or is in another unit.
+    """
+    found: list[Obstacle] = []
+    for number, entry in enumerate(cell.obstacles):
+        name = entry.name or f"obstacle {number + 1}"
+        if isinstance(entry, BoxEntry):
+            frame = matrices(np.array(entry.pose))
+            found.append(Box(name, 0.5 * np.array(entry.size_m), frame[:3, 3], frame[:3, :3].T))
+            continue
+        path = folder / entry.file
+        surface, _ = usable_surface(Surface.read(path, scale=_UNITS[entry.unit]), path)
+        size = float(np.ptp(surface.vertices, axis=0).max())
+        if size > _LARGE:
+            raise InputError(f"The obstacle {path} is {size:.0f} m long.",
+                             "No branch's cell is that large: its unit is another one.",
+                             'Say unit = "mm" or "cm" in the cell file.')
+        found.append(Solid(name, surface))
+    return tuple(found)
+
+
+def region_of(cell: Cell, settings: PlanSettings) -> Region | None:
+    """Return what the settings ask of the cell: its camera's view or its second arm's reach."""
+    if settings.in_view:
+        return _view_of(cell)
+    if not settings.second_arm or cell.second_arm is None:
+        return None
+    arm = arm_named(cell.second_arm.model)
+    shoulder = (matrices(np.array(cell.second_arm.base_pose)) @ [0.0, 0.0, arm.d[0], 1.0])[:3]
+    x, y, z = map(float, shoulder)
+    return Ball((x, y, z), arm.reach)
+
+
+def require_taken(cell: Cell, place: np.ndarray) -> None:
+    """Raise NoPathError where the second arm can take nothing at ``place`` [3] from any side."""
+    entry = cell.second_arm
+    assert entry is not None
+    arm = arm_named(entry.model)
+    turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
+    frames = np.tile(np.eye(4), (_TURNS, 1, 1))
+    frames[:, :3, :3], frames[:, :3, 3] = turns, place
+    flange = inverted(matrices(np.array(entry.base_pose))) @ frames @ inverted(
+        matrices(np.array(entry.grasp_pose)))
+    if np.isnan(inverse(arm, flange)).any(axis=-1).all():
+        where = ", ".join(f"{x:.3f}" for x in place)
+        raise NoPathError(f"The second arm ({arm.name}) cannot take the target at ({where}) m.",
+                          f"None of {_TURNS} directions has inverse kinematics there.",
+                          "Put the arm nearer or farther, or give a --target-box.")
+
+
+def _view_of(cell: Cell) -> View | None:
+    """Return what the cell's camera sees; None without one that stands still."""
+    camera = cell.camera
+    if camera is None or camera.mount != "branch":
+        return None
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    return View(matrices(np.array(camera.pose)),
+                (-cx / fx, (camera.width - cx) / fx, -cy / fy, (camera.height - cy) / fy),
+                camera.range_m)
+
+
+def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...]) -> Limits:
+    """Return limits with the cell's workspace, force and obstacles besides.
+
+    Raises:
+        InputError: the two workspaces have nothing in common.
+    """
+    box = cell.workspace
+    return limits.with_cell(None if box is None else np.array(box.low_m),
+                            None if box is None else np.array(box.high_m),
+                            cell.limits.soft_force_n, obstacles)
+
+
+def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obstacle, ...],
+               speed: float) -> dict[str, Any]:
+    """Return how the cell's robot takes the gripper along approach and path, at a speed [m/s].
+
+    Raises:
+        NoPathError: no continuous branch of the inverse kinematics carries it, or the gripper
+            meets an obstacle; says where.
+    """
+    there = np.array(motion.phases) != "return"
+    forces = present(motion.forces, "force of the motion")
+    predicted = Predicted.of_forces(motion.poses[there], forces[there])
+    found = robot_motion(cell, predicted, axis, speed=speed, blocked=blocked_by(cell, obstacles))
+    return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
+            "gripper_rotation": found.rotation,
+            "duration_s": found.approach.duration + found.path.duration,
+            "singularity_distance": found.joints.singularity,
+            "joint_limit_margin_rad": found.joints.limit_margin}
+
+
+def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...]) -> Blocked:
+    """Return what tells where gripper or arm would be inside an obstacle."""
+    def blocked(flange: np.ndarray, joints: np.ndarray) -> NoPathError | None:
+        return None if not obstacles else _in_the_way(cell, obstacles, flange, joints)
+    return blocked
+
+
+def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
+                joints: np.ndarray) -> NoPathError | None:
+    """Return the error that names what is deepest in an obstacle, None where nothing is.
+
+    Args:
+        flange: Frames in the robot's base, shape [n, 4, 4].
+        joints: The same by angles [rad], shape [n, 6].
+    """
+    base = matrices(np.array(cell.base.pose))
+    arm = rods_of(cell.arm, joints)
+    parts = [(f"The arm's {name}", arm.starts[:, k], arm.ends[:, k], float(arm.radii[k]))
+             for k, name in enumerate(arm.names)]
+    parts += [("The gripper", *(flange[:, :3, :3] @ np.array(end) + flange[:, :3, 3]
+                                for end in (part.start_m, part.end_m)), part.radius_m)
+              for part in cell.tool.parts]
+    looked = _apart(np.stack([end for part in parts for end in part[1:3]], axis=1))
+    worst: tuple[float, str, str, np.ndarray] | None = None
+    for what, starts, ends, radius in parts:
+        length = float(np.linalg.norm(ends[0] - starts[0]))
+        share = np.linspace(0.0, 1.0, int(np.ceil(length / _ROD_SPACING)) + 1)[:, None]
+        places = starts[looked, None] + share * (ends - starts)[looked, None]
+        places = places.reshape(-1, 3) @ base[:3, :3].T + base[:3, 3]
+        hit = closest(obstacles, places, radius + _BETWEEN)
+        if hit and (worst is None or hit[1] > worst[0]):
+            worst = hit[1], what, hit[0], hit[2]
+    if worst is None:
+        return None
+    depth, what, name, where = worst
+    return NoPathError(
+        f"{what} would be inside {name}, by up to {1e3 * depth:.1f} mm, at "
+        f"({', '.join(f'{x:.3f}' for x in where)}) m.",
+        "So it is where the arm keeps farthest from singularities, and every other way of "
+        "holding the branch that was tried is blocked as well.",
+        "Choose another way for the branch, another place for the robot's base, or correct the "
+        "obstacle in the cell file.")
+
+
+def _apart(places: np.ndarray) -> np.ndarray:
+    """Return the numbers of poses between which no place [n, k, 3] goes farther than what is
+    looked at."""
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)
+    gone = np.r_[0.0, np.cumsum(steps)]
+    chosen = np.searchsorted(gone, np.arange(0.0, gone[-1], _POSE_SPACING))
+    return np.unique(np.r_[0, chosen, len(places) - 1])

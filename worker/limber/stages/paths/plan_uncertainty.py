@@ -1,0 +1,58 @@
+"""What a plan is told of how uncertain Young's modulus is."""
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.estimation.estimate_file import read_estimate
+from limber.mechanics.materials.young_field import young_weights
+from limber.planning.constraints.chance import YoungDoubt
+from limber.planning.constraints.limits import Limits
+from limber.planning.field.grasp_model import GraspModel
+from limber.store import Branch
+
+_INTERVAL = 2 * 1.96  # standard deviations in an interval of 95 %
+
+
+def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungDoubt:
+    """Return the moduli's distribution by the branch's estimate, for a plan with limits.
+
+    Raises:
+        InputError: there is no limit, no estimate, or one without intervals.
+    """
+    if not limits.asked():
+        raise InputError("--confidence is given without a limit.",
+                         "It is the probability with which limits are kept.",
+                         "Give --max-force, --max-strain or another limit as well.")
+    doubt = estimated_doubt(branch, grasp_model)
+    if doubt is None:
+        raise InputError("--confidence is given, and nothing is estimated.",
+                         "How uncertain Young's modulus is comes from `limber estimate`.",
+                         "Import a pull and estimate, or leave --confidence away.")
+    return doubt
+
+
+def estimated_doubt(branch: Branch, grasp_model: GraspModel) -> YoungDoubt | None:
+    """Return the moduli's distribution by the branch's estimate; None where there is none.
+
+    Deviations are those of the stated intervals, all that is not known included; correlations those
+    of the fit. Control points of one group have one modulus.
+
+    Raises:
+        InputError: the estimate has no interval.
+    """
+    if not branch.has("estimate.json"):
+        return None
+    found = read_estimate(branch.require("estimate.json", "estimate"))
+    interval = np.array(found["young_interval_pa"], float)
+    if not (np.isfinite(interval).all() and (interval > 0.0).all()):
+        raise InputError("The estimate has no interval for some control points.",
+                         "How uncertain Young's modulus is there is not known.",
+                         "Record another pull and estimate again.")
+    points = np.array(found["control_points_m"], float)
+    covariance = np.array(found["covariance"], float)[np.ix_(found["groups"], found["groups"])]
+    size = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    correlation = np.clip(covariance / np.outer(size, size), -1.0, 1.0)
+    weights = young_weights(grasp_model.mesh, points) * np.array(
+        found.get("young_mesh_pa") or found["young_pa"], float)
+    return YoungDoubt(weights / weights.sum(axis=1, keepdims=True),
+                      np.log(interval[:, 1] / interval[:, 0]) / _INTERVAL, correlation)

@@ -1,0 +1,1 @@
+"""Stages that record, import, simulate and suggest pulls."""

@@ -1,0 +1,146 @@
+"""Bring a recording of a pull into the branch folder."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError
+from limber.core.files.atomic import file_digest
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.recordings.settings import ImportSettings
+from limber.stages.inputs import BranchInputs, RunOptions, argument, required
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.recordings.importing import BranchFrame, RobotKnown
+
+_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+
+class ImportInputs(BranchInputs):
+    """A branch folder, a recording, and the name it gets."""
+
+    groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",),
+                               "simulation": ("swing",)}
+
+    source: Path = argument("Marker CSV, C3D, PLY or RGB-D folder, force table, MCAP, rosbag2, "
+                            "RTDE log.")
+    name: str = required("Name of the pull.", "pull-1")
+    swing: bool = Field(
+        False, description="The branch is let go, without a robot. Markers with --weight or --load "
+        "become a pull for `limber swing`; other records (accelerometer, strain gauge, a video's "
+        "track, markers of a plucked branch) go through `limber vibration` at once.",
+        json_schema_extra={"switch": True})
+
+
+def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
+                force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Bring a recording into ``pulls/NAME`` of a branch folder.
+
+    Returns:
+        ``pull``, ``kind`` and what :func:`limber.recordings.importing.import_recording` found.
+
+    Raises:
+        InputError: SOURCE cannot be read as what it is said to be.
+    """
+    from limber.recordings.importing import import_recording, kind_of
+
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
+    kind = kind_of(source) if settings.kind == "auto" else settings.kind
+    settings, robot = _of_cell(settings)
+    branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
+    key, digests = f"pull:{name}", {"source": _digest(source)}
+    for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
+                          ("yolo", settings.yolo_weights), ("cell", settings.cell)):
+        if named and Path(named).is_file():
+            digests[key_of] = _digest(Path(named))
+    if not force and branch.is_current(key, settings, digests=digests):
+        return branch.manifest.stages[key].result
+    with branch.stage(key, settings, digests=digests) as stage:
+        prefix = f"pulls/{name}/"
+        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+            stage.remove(old)
+        folder = stage.path(prefix + "pull.toml").parent
+        stage.result.update(import_recording(kind, source, folder, name, settings,
+                                             _frame(branch, kind, settings), progress,
+                                             robot=robot))
+        stage.result |= {"pull": name, "kind": kind}
+    return stage.result
+
+
+def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | None]:
+    """The settings with the cell's base, and what the cell says of its robot."""
+    if settings.cell is None:
+        return settings, None
+    from limber.recordings.importing import RobotKnown
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.recorder import known_errors, known_noise
+    from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+
+    cell = read_cell(Path(settings.cell))
+    tool = matrices(np.array(cell.tool.grasp_pose))
+
+    def joint_poses(names: tuple[str, ...], angles: np.ndarray) -> np.ndarray:
+        # ROS sends joints in any order, UR's with names like left_shoulder_pan_joint.
+        order = [[k for k, name in enumerate(names) if part in name] for part in _JOINTS]
+        if any(len(found) != 1 for found in order):
+            raise InputError(f"Joints are called {', '.join(names)}.",
+                             f"A UR arm's are {', '.join(_JOINTS)}.",
+                             "Record poses or TF, or rename the joints.")
+        return pose_vectors(forward(cell.arm, angles[:, [found[0] for found in order]]) @ tool)
+
+    if settings.frame_pose is None:
+        settings = settings.model_copy(update={"frame_pose": cell.base.pose})
+    return settings, RobotKnown(joint_poses, known_noise(cell),
+                                lambda seconds: known_errors(cell, seconds))
+
+
+def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:
+    from limber.recordings.importing import BranchFrame
+    from limber.store.loading import load_mesh
+
+    if kind == "force-displacement":
+        return BranchFrame()
+    loaded = settings.weight is not None or settings.load is not None
+    return BranchFrame(branch.manifest.alignment, branch.gravity,
+                       load_mesh(branch).nodes if loaded or branch.has("mesh.vtu") else None)
+
+
+def _digest(path: Path) -> str:
+    if path.is_file():
+        return file_digest(path)
+    joined = hashlib.sha256()
+    for file in sorted(path.rglob("*")):
+        if file.is_file():
+            joined.update(file.relative_to(path).as_posix().encode() + file_digest(file).encode())
+    return joined.hexdigest()
+
+
+def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    if inputs.swing and settings.weight is None and settings.load is None:
+        # Nothing is known of what bent it: its frequencies tell the modulus, no positions do.
+        from limber.stages.moduli.vibration import VibrationSettings, vibration
+
+        told = vibration(inputs.branch_folder, inputs.source, VibrationSettings(),
+                         force=options.force, progress=progress)
+        return told | {"kind": "ringing"}
+    if inputs.swing:
+        settings = settings.model_copy(update={"motion": "swing"})
+    return import_pull(inputs.branch_folder, inputs.source, inputs.name, settings,
+                       force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
+    writes=("pulls/{name}/",))

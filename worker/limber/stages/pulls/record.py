@@ -1,0 +1,343 @@
+"""Record a pull with a robot, under the guard, into a recording that survives a kill."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
+from limber.stages.inputs import BranchInputs, required
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.robot.cell.cell import Cell
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.motion.execution import Blocked
+    from limber.robot.motion.trajectory import Trajectory
+    from limber.robot.recorder import MarkerStream, PullRecorder
+    from limber.store import Stream
+
+_TARE_SECONDS = 1.0
+_SETTLE_SECONDS = 0.5  # until the branch rests in the closed gripper
+
+
+class RecordInputs(BranchInputs):
+    """A branch folder, the robot's cell and the recording's name."""
+
+    groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
+
+    cell: Path = required("The robot's cell file.", "cell.toml")
+    name: str = Field("pull-1", description="Name of the recording.")
+
+
+class RecordSettings(Settings):
+    """A predefined pull, out and back.
+
+    A branch that is pulled far sideways without following its arc is stretched: its force then
+    rises steeply, and the guard pauses.
+    """
+
+    groups: ClassVar[Groups] = {
+        "pull": ("direction", "distance", "shape", "waypoints", "suggested", "speed", "cycles",
+                 "pause")}
+
+    direction: tuple[float, float, float] = Field(
+        (1.0, 0.0, 0.0), description="Where to pull, branch frame; its length does not count.")
+    distance: float = Field(0.05, gt=0, le=0.5, description="How far [m].")
+    shape: Literal["arc", "straight"] = Field(
+        "arc", description="arc: as the branch's model goes when it is pulled along --direction, "
+        "the gripper turning with it; straight: a line, the gripper not turned.")
+    waypoints: str | None = Field(
+        None, description="CSV of the gripper's way instead: x_m,y_m,z_m, and rx_rad,ry_rad,rz_rad "
+        "where it turns; branch frame, from where the gripper is.")
+    suggested: bool = Field(
+        False, description="The pull that `limber suggest-pull` found best: its direction and "
+        "distance; the gripper has to be at its place.", json_schema_extra={"switch": True})
+    speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
+    cycles: int = Field(1, ge=1, le=20, description="Times out and back.")
+    pause: float = Field(0.5, ge=0, le=10, description="Standing still at each end [s].")
+
+
+class RecordOptions(Settings):
+    """How a recording is run."""
+
+    groups: ClassVar[Groups] = {"running": ("confirm", "markers", "after_stop", "recover")}
+
+    confirm: str | None = Field(
+        None, description="The recording's name, typed: the robot moves. Without it the name is "
+        "asked for at the terminal.")
+    markers: int | None = Field(
+        None, ge=1, le=65535, description="Port on the robot's address at which a tracker sends "
+        "the points that it sees as JSON lines (the virtual robot's is 63400).")
+    after_stop: AfterStop = Field(
+        "ask", description="What to do after a stop; ask: at the terminal, else hold.")
+    recover: bool = Field(False, description="Move nothing: take over what a killed recording "
+                          "of this name has left.", json_schema_extra={"switch": True})
+
+
+def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
+           options: RecordOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Record a pull.
+
+    The sensor is tared with the gripper empty, the gripper closes, pulls and returns. Every
+    sample of the controller goes into ``robot.csv`` as it comes; a kill or a stop keeps all but
+    the last second.
+
+    Returns:
+        ``ended`` (``reached`` or the reason of a stop), ``after_stop`` (after a stop, as
+        :func:`limber.robot.operator_decisions.retreat_if_chosen` returns it), ``sample_count``,
+        ``seconds``, ``peak_force_n``, ``marker_frames``.
+
+    Raises:
+        InputError: cell and branch do not belong together, or nobody confirmed.
+        SafetyStop: the guard stopped it; what was recorded is in the folder all the same.
+    """
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.cell.compatibility import check_branch, require_payload
+    from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
+
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise InputError(f"--name {name!r} cannot name a recording.",
+                         "It becomes a folder's name.", "Use letters, digits, dash and dot.")
+    branch, cell = Branch.open(folder), read_cell(cell_file)
+    if warning := check_branch(cell, branch.uuid, folder):
+        progress.warn(warning)
+    if options.recover:
+        return _finish(branch, name, settings, {"ended": "recovered after a kill"})
+    if branch.has(f"pulls/{name}/pull.toml"):
+        raise InputError(f"{folder} has a recording {name} already.",
+                         "A recording is never written over.", "Give another --name.")
+    if f"pulls/{name}/robot.csv" in branch.streams():
+        raise InputError(f"A recording {name} was cut off.", "It would be lost.",
+                         "Take it over with --recover, or give another --name.")
+    require_payload(cell)
+    blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
+    require_confirmation(name, options.confirm)
+    with branch.writing(f"the recording {name}"):
+        ended = _recorded(branch, cell, name, settings, options, blocked, progress)
+        result = _finish(branch, name, settings, ended)
+    if ended["ended"] != "reached":
+        raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
+                         f"{ended['after_stop']['outcome']} {result['sample_count']} samples are "
+                         f"in pulls/{name}.",
+                         "Look at the branch and the robot before anything moves.", result=result)
+    return result
+
+
+def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
+              options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.driver.live_force import LiveForce
+    from limber.robot.recorder import MarkerStream, PullRecorder
+
+    tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
+               if options.markers else None)
+    stream = branch.stream(f"pulls/{name}/robot.csv")
+    entry_lines = branch.stream(f"pulls/{name}/pull.toml")
+    marker_lines = branch.stream(f"pulls/{name}/markers.csv") if options.markers else None
+    recorders: list[PullRecorder] = []
+    try:
+        progress(0.02, "connecting")
+        live = LiveForce(branch.folder, f"Recording {name}", cell.limits.soft_force_n)
+
+        def take(rows: np.ndarray) -> None:
+            if recorders:
+                recorders[0].take(rows)
+            live.take(rows)
+        with live, RobotLink(cell, take) as link:
+            sample = link.wait_for_samples()
+            point = _grasp_point(branch, sample[1:4])
+            recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
+            recorders.append(recorder)
+            # Before the tare: what takes long would be drift.
+            trajectory = _pull(branch, cell, point, sample, settings, blocked,
+                               progress.part(0.02, 0.1))
+            progress(0.1, "taring: keep the gripper free")
+            live.at("taring")
+            tared = link.tare(_TARE_SECONDS)
+            grip(cell, link, close=True, progress=progress)
+            time.sleep(_SETTLE_SECONDS)
+            _write_entry(entry_lines, cell, point, tared, trajectory.duration, tracker,
+                         marker_lines)
+            recorder.close_gripper()
+            live.at("pulling")
+            link.start(trajectory)
+            event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
+            ended = {"ended": "reached" if event["event"] == "reached" else event["reason"],
+                     "warnings": list(link.warnings)}
+            if event["event"] == "reached":
+                # What was seen last comes a little later.
+                time.sleep(0.5)
+                _write_markers(tracker, marker_lines, recorder)
+                grip(cell, link, close=False, progress=progress)
+            else:
+                ended["after_stop"] = retreat_if_chosen(cell, link, options.after_stop, progress)
+            ended |= {"peak_force_n": recorder.peak_force, "sample_count": recorder.count}
+            return ended
+    finally:
+        for lines in (stream, entry_lines, marker_lines):
+            if lines is not None:
+                lines.close()
+                if not (recorders and recorders[0].count):
+                    # No sample came: there is nothing to take over, and the name stays free.
+                    lines.path.unlink(missing_ok=True)
+        if tracker is not None:
+            tracker.close()
+
+
+def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None,
+             recorder: PullRecorder, trajectory: Trajectory, progress: Progress,
+             ) -> dict[str, Any]:
+    """Wait for the end of the motion; markers are written as they come."""
+    begin = time.monotonic()
+    while True:
+        try:
+            return link.wait("reached", "stopped", "paused", seconds=0.05)
+        except LimberError as error:
+            if not isinstance(error, WorkError) or link.process.poll() is not None or \
+                    time.monotonic() - begin > 3 * trajectory.duration + 30:
+                raise
+        except BaseException:
+            # Ctrl-C stops the arm before anything else.
+            link.stop()
+            raise
+        _write_markers(tracker, lines, recorder)
+        progress(0.15 + 0.8 * min((time.monotonic() - begin) / trajectory.duration, 1.0),
+                 "pulling", force_n=recorder.peak_force)
+
+
+def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
+                   recorder: PullRecorder) -> None:
+    if tracker is None or lines is None:
+        return
+    for clock, points in tracker.read():
+        if recorder.first is not None and clock >= recorder.first:
+            lines.append(",".join([f"{clock - recorder.first:.6f}",
+                                   *(f"{value:.6g}" for value in points.ravel())]))
+
+
+def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
+          settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
+    """The motion of the gripper from where a sample of the robot has it."""
+    from limber.robot.ur.kinematics import matrices
+    from limber.stages.pulls.record_path import (
+        suggested_pull,
+        there_and_back,
+        way_on_arc,
+        way_through,
+    )
+
+    direction, distance = np.array(settings.direction, float), settings.distance
+    if settings.suggested:
+        direction, distance = suggested_pull(branch, point)
+    length = np.linalg.norm(direction)
+    if length < 1e-9 and settings.waypoints is None:
+        raise InputError("--direction 0 0 0.", "It points nowhere.", "Give a direction.")
+    if settings.speed > cell.limits.speed_m_s:
+        raise InputError(f"--speed {settings.speed:g} is over the cell's "
+                         f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
+                         "Ask for less, or raise limits.speed_m_s in the cell file.")
+    gripper, joints = sample[1:7], sample[19:25]
+    here = matrices(gripper)
+    if settings.waypoints is not None:
+        frames = way_through(Path(settings.waypoints), gripper)
+    elif settings.shape == "arc":
+        frames = way_on_arc(branch, point, direction, distance, progress) @ here
+    else:
+        frames = np.array([here, here])
+        frames[1, :3, 3] += distance * direction / length
+    return there_and_back(cell, frames, speed=settings.speed, cycles=settings.cycles,
+                          pause=settings.pause, start=joints, blocked=blocked)
+
+
+def _grasp_point(branch: Branch, gripper: np.ndarray) -> np.ndarray:
+    """The branch's axis nearest to the gripper's middle [3], branch frame [m], shape [3]."""
+    from limber.store.loading import load_skeleton
+
+    skeleton = load_skeleton(branch)
+    nearest, distance = skeleton.nodes[0], np.inf
+    for child, parent in enumerate(skeleton.parent):
+        if parent < 0:
+            continue
+        start, way = skeleton.nodes[parent], skeleton.nodes[child] - skeleton.nodes[parent]
+        part = np.clip((gripper - start) @ way / max(way @ way, 1e-18), 0, 1)
+        off = float(np.linalg.norm(gripper - start - part * way))
+        if off < distance:
+            nearest, distance = start + part * way, off
+    if distance > 0.03:
+        raise InputError(f"The gripper is {1000 * distance:.0f} mm from the branch's axis.",
+                         "It would close on nothing, or the calibration is off.",
+                         "Move it onto the branch, or calibrate again.")
+    return nearest
+
+
+def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
+                 seconds: float, tracker: MarkerStream | None, marker_lines: Stream | None,
+                 ) -> None:
+    """Write ``pull.toml`` first of all: what a kill leaves can be read with it."""
+    from limber.recordings.recording import GraspEntry, PullEntry, entry_text
+    from limber.robot.recorder import known_errors, known_noise
+    from limber.stages.pulls.record_path import GRASP_RADIUS_M
+
+    rest = noise = None
+    if tracker is not None and marker_lines is not None:
+        points, noise = tracker.at_rest()
+        rest = tuple(tuple(map(float, point)) for point in points)
+        names = (f"m{k}_{axis}_m" for k in range(len(rest)) for axis in "xyz")
+        marker_lines.append(",".join(("t_s", *names)))
+    entry = PullEntry(
+        observation="markers" if rest else "none", grasp=GraspEntry(
+            point_m=tuple(map(float, point)), radius_m=GRASP_RADIUS_M),
+        sensor=known_noise(cell, noise),
+        calibration=known_errors(cell, seconds, tare_sigma=tared["sigma"]),
+        rest_points_m=rest,
+        source=f"limber record, {cell.arm.name}, {cell.sensor.kind}; tare within "
+        f"{max(tared['sigma'][:3]):.2g} N")
+    for line in entry_text(entry).splitlines():
+        lines.append(line)
+
+
+def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str, Any],
+            ) -> dict[str, Any]:
+    """Take the streams over into the branch folder."""
+    from limber.recordings.time_series import read_stream
+
+    prefix = f"pulls/{name}/"
+    left = [file for file in branch.streams() if file.startswith(prefix)]
+    if f"{prefix}robot.csv" not in left or f"{prefix}pull.toml" not in left:
+        raise InputError(f"There is no cut-off recording {name}.",
+                         f"Left over are: {', '.join(branch.streams()) or 'none'}.",
+                         "Give the name of one of those.")
+    with branch.stage(f"record:{name}", settings) as stage:
+        for file in left:
+            stage.adopt(file)
+        samples = read_stream(stage.path(f"{prefix}robot.csv"))
+        force = np.linalg.norm(samples.values[:, 6:9], axis=1)
+        markers = 0
+        if f"{prefix}markers.csv" in left:
+            markers = len(read_stream(stage.path(f"{prefix}markers.csv")))
+        stage.result.update(
+            {"pull": name, "sample_count": len(samples), "marker_frames": markers,
+             "seconds": float(samples.times[-1]), "peak_force_n": float(force.max())} | ended)
+    return stage.result
+
+
+def run(inputs: RecordInputs, settings: RecordSettings, options: RecordOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return record(inputs.branch_folder, inputs.cell, inputs.name, settings, options,
+                  progress=progress)
+
+
+STAGE = StageDescription(
+    "record", 55, run, RecordInputs, RecordSettings, RecordOptions, key="record:{name}",
+    reads=("skeleton.swc",), writes=("pulls/{name}/",))

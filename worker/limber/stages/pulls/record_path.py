@@ -1,0 +1,170 @@
+"""The way of a recorded pull: straight, along the arc of the branch, or through given places."""
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.core.errors import InputError, SafetyStop
+from limber.core.files.reading import read_columns, read_json_as
+from limber.core.progress import Progress
+from limber.recordings.recording import POSE_COLUMNS
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.execution import Blocked
+from limber.robot.motion.joint_path import joint_path
+from limber.robot.motion.start_check import different_joints, in_degrees
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
+from limber.store import Branch
+
+GRASP_RADIUS_M = 0.012
+"""Half width of what a gripper takes hold of along the branch."""
+
+_SAME_PLACE_M = 0.01  # from where a suggested pull holds the branch
+_STATES = 12  # of an arc: a chord of 4 mm on a bend of 0.3 m stretches a branch by 7 micrometres
+_NEAR_M = 0.005  # from the gripper, where given places begin
+
+
+_Vector = tuple[float, float, float]
+
+
+class _Pull(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    grasp_point_m: _Vector
+    end_m: _Vector
+    travel_m: float = Field(gt=0, le=0.5)
+
+
+class _Suggested(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    best: _Pull
+
+
+def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
+               progress: Progress) -> np.ndarray:
+    """Return frames [n, 4, 4] that take the held piece from where it is along its arc.
+
+    The arc is where the branch's model goes when a growing force along ``direction`` pulls it, and
+    turns as it turns there. How stiff the branch is does not matter for it, only how its stiffness
+    runs along it, and that a little: with no estimate the arc is of one modulus throughout.
+
+    Args:
+        point: Where the gripper holds, branch frame [m], shape [3].
+        direction: Shape [3].
+        distance: Of the grasp from rest [m].
+
+    Returns:
+        Frames in the branch's that are to be applied to the gripper's, the first the identity.
+
+    Raises:
+        WorkError: no such force moves it so far.
+    """
+    from limber.estimation.gripper_path import force_for_travel
+    from limber.mechanics import Grasp, solve_static
+    from limber.store.loading import load_branch
+
+    progress(0.0, "the arc of the branch")
+    model = load_branch(branch, progress=progress).model
+    grasp = Grasp.at(model.mesh, point, GRASP_RADIUS_M, "pinned")
+    way = np.asarray(direction, float) / np.linalg.norm(direction)
+    size = force_for_travel(model, grasp, way, distance)
+    poses, state = [grasp.rest_pose], None
+    for number, part in enumerate(np.linspace(0, 1, _STATES + 1)[1:]):
+        state = solve_static(model, grasp=grasp, grasp_force=part * size * way,
+                             start=state).require()
+        poses.append(grasp.pose_of(model.mesh.nodes, state.displacement))
+        progress((number + 1) / _STATES, "the arc of the branch")
+    # The force was found to some percent; a bend that is a little longer has the same shape.
+    frames = matrices(np.array(poses))
+    return frames @ inverted(frames[0])
+
+
+def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return direction [3] across the branch and distance [m] of the pull that was found best.
+
+    Args:
+        point: Where the gripper is on the branch, branch frame [m], shape [3].
+
+    Raises:
+        BranchFolderError: none was suggested. InputError: it is to be held elsewhere.
+    """
+    path = branch.require("suggested_pull.json", "suggest-pull")
+    found = read_json_as(path, _Suggested, "a suggested pull").best
+    place = np.array(found.grasp_point_m)
+    away = float(np.linalg.norm(place - point))
+    if away > _SAME_PLACE_M:
+        raise InputError(
+            f"The gripper is {1000 * away:.0f} mm from where the suggested pull holds the branch, "
+            f"({', '.join(f'{x:.3f}' for x in place)}) m.", "Held elsewhere the same way tells "
+            "something else, and strains the branch otherwise.", "Move the gripper there.")
+    # The end lies on the arc, nearer to the root, which is the origin: the pull is across.
+    way, out = np.array(found.end_m) - place, place / max(float(np.linalg.norm(place)), 1e-9)
+    return way - (way @ out) * out, found.travel_m
+
+
+def way_through(path: Path, gripper: np.ndarray) -> np.ndarray:
+    """Return frames [n, 4, 4] of the gripper through the places of a CSV file, branch frame.
+
+    Without columns of rotation the gripper is not turned.
+
+    Raises:
+        InputError: it cannot be read, has one place, or starts too far from ``gripper`` [6].
+    """
+    table = read_columns(path, POSE_COLUMNS[:3], "a table of way-points (x_m, y_m, z_m, and "
+                         "rx_rad, ry_rad, rz_rad where the gripper turns)")
+    poses = np.tile(gripper, (len(table["x_m"]), 1))
+    for column, name in enumerate(POSE_COLUMNS):
+        if name in table:
+            poses[:, column] = table[name]
+    if len(poses) < 2:
+        raise InputError(f"{path} has one way-point.", "That is no way.", "Give two or more.")
+    away = float(np.linalg.norm(poses[0, :3] - gripper[:3]))
+    if away > _NEAR_M:
+        raise InputError(f"The first way-point is {1000 * away:.1f} mm from the gripper.",
+                         f"At most {1000 * _NEAR_M:.0f} mm are bridged.",
+                         "Begin where the gripper is, in the branch's frame.")
+    return matrices(np.vstack([gripper, poses[1:]]))
+
+
+def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int, pause: float,
+                   start: np.ndarray | None = None, blocked: Blocked | None = None) -> Trajectory:
+    """Return the motion through frames of the gripper [n, 4, 4], branch frame, out and back.
+
+    Args:
+        speed: [m/s].
+        pause: Standing still at each end [s].
+        start: Joint angles where the arm is [rad], shape [6].
+
+    Raises:
+        NoPathError: the arm cannot follow it, or is blocked; says where and why.
+        SafetyStop: it could from another configuration than it stands in.
+    """
+    out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
+    flange = matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
+    taken = joint_path(cell.arm, flange, start=start, joint_limits=cell.joint_limits,
+                       singularity_margin=cell.limits.singularity,
+                       joint_margin=cell.limits.joint_margin_rad)
+    if start is not None and (told := different_joints(start, taken.joints[0])):
+        raise SafetyStop(f"The arm cannot go this way as it stands: {'; '.join(told)}.",
+                         "In its own configuration it would come to a limit or a singularity.",
+                         f"Move the joints to {in_degrees(taken.joints[0])} degrees, or choose "
+                         "another way.")
+    met = None if blocked is None else blocked(flange, taken.joints)
+    if met is not None:
+        raise met
+    passed = along(out, speed, cell.limits.acceleration_m_s2,
+                   turn_speed=0.8 * cell.limits.turn_speed_rad_s)
+    # The way back is the way out in time as well, so that speeds fit where it turns.
+    legs = ((passed, out, taken.joints),
+            (passed[-1] - passed[::-1], out[::-1], taken.joints[::-1]))
+    times, poses, joints, begin = [], [], [], 0.0
+    for _ in range(cycles):
+        for leg_times, leg, leg_joints in legs:
+            times.append(begin + leg_times)
+            poses.append(leg)
+            joints.append(leg_joints)
+            # The last pose of a leg is the first of the next, after the pause.
+            begin += float(leg_times[-1]) + max(pause, 0.02)
+    return Trajectory(np.concatenate(times), np.concatenate(poses), joints=np.concatenate(joints))

@@ -1,0 +1,246 @@
+"""Suggest the next pull: where to hold and how far to pull to learn most for the strain it risks.
+
+Pulls of several places, directions and lengths are made on the branch as it is estimated. What each
+would tell of Young's modulus, with the errors of cell and sensors that the last pull stated, is
+compared with the strain it puts the branch to. With ``--plan`` it is also said whether another pull
+is worth it for that plan: whether it would change what the plan may do.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError
+from limber.core.json_values import plain
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.estimation.settings import EstimateSettings
+from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.estimation.estimated_branch import Subject
+    from limber.estimation.next_pull import Cell, ExpectedPull, Known, Suggested
+    from limber.estimation.parameters import Values
+
+FILE = "suggested_pull.json"
+_CONFIDENCE = 0.95  # of plans that were made without one
+_MATTERS = 1.05  # so much more of a limit may be used: then a pull changes what a plan may do
+_USED = 0.95  # of a limit, with the confidence: a plan that comes nearer is held back by it
+
+
+class SuggestPullInputs(BranchInputs):
+    """A branch folder, and a plan in it."""
+
+    groups: ClassVar[Groups] = {"input": ("plan",)}
+
+    plan: str | None = Field(None, description=(
+        "Name of a plan; it is said whether another pull is worth it for this one."))
+
+
+class SuggestPullSettings(Settings):
+    """What a pull may do."""
+
+    groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force", "gravity")}
+
+    fractions: tuple[float, ...] = Field((0.5, 0.67, 0.8, 0.92), min_length=1, description=(
+        "Places on the main path where the branch may be held."))
+    max_strain: float = Field(0.01, gt=0, lt=1, description=(
+        "Largest principal strain that a pull may put the branch to (0.01 is 1 %)."))
+    max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
+    gravity: bool = Field(True, description=(
+        "The branch bears its own weight, and was scanned so."))
+
+
+def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: str | None = None,
+                 workers: int | None = None, force: bool = False, progress: Progress = SILENT,
+                 ) -> dict[str, Any]:
+    """Write ``suggested_pull.json``: the best pull and others, and what each would tell.
+
+    Returns:
+        ``best`` and ``others``, each with ``grasp_fraction``, ``grasp_point_m``, ``end_m``,
+        ``travel_m``, ``peak_strain``, ``peak_force_n``, ``bits``, ``bits_per_percent_strain`` and
+        ``young_deviation`` (of log E at the control points, to be expected after it);
+        ``most_telling``, that of them which tells most; ``young_deviation_now``;
+        ``too_much_count`` and ``failed_count``; ``plan`` with ``worth`` and ``why`` where one is
+        named.
+
+    Raises:
+        InputError: no such plan. WorkError: no pull keeps the limits.
+    """
+    from limber.estimation.next_pull import suggest
+
+    if any(not 0.0 < fraction <= 1.0 for fraction in settings.fractions):
+        raise InputError(f"--fractions {settings.fractions}.",
+                         "Places on the main path are shares of its length.",
+                         "Give numbers over 0 and up to 1.")
+    branch = Branch.open(branch_folder)
+    branch.require("mesh.vtu", "reconstruct")
+    reads = [file for file in ("mesh.vtu", "skeleton.swc", "estimate.json") if branch.has(file)]
+    if plan is not None:
+        branch.require(f"plans/{plan}.json", "plan")
+        reads.append(f"plans/{plan}.json")
+    if not force and branch.is_current("suggest-pull", settings, reads=reads):
+        return branch.manifest.stages["suggest-pull"].result
+    with branch.stage("suggest-pull", settings, reads=reads) as stage:
+        subject, values, known = _state(branch, settings)
+        cell = _cell(branch)
+        most = np.inf if settings.max_force is None else settings.max_force
+        found = suggest(subject, values, known, cell, settings.fractions, max_force=most,
+                        max_strain=settings.max_strain, workers=workers,
+                        progress=progress.part(0.0, 0.8))
+        stage.result.update(_told(found, known))
+        if plan is not None:
+            progress(0.8, "the plan under other moduli")
+            stage.result["plan"] = {"name": plan} | _for_plan(
+                branch, plan, known, known.after(found.pulls[0].information),
+                progress.part(0.8, 1.0))
+        stage.path(FILE).write_text(json.dumps(plain(stage.result), indent=1) + "\n",
+                                    encoding="utf-8")
+    return branch.manifest.stages["suggest-pull"].result
+
+
+def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Values, Known]:
+    """Return the branch, its moduli as far as known, and how well they are known."""
+    from dataclasses import replace
+
+    from limber.estimation.estimate_file import read_estimate
+    from limber.estimation.next_pull import Known
+    from limber.store.loading import load_estimated_subject, load_subject
+
+    if not branch.has("estimate.json"):
+        subject = load_subject(branch, EstimateSettings(gravity=settings.gravity))
+        form = () if subject.field is None else subject.field.names
+        return subject, subject.start, Known.nothing(len(subject.control_points), len(form))
+    found = read_estimate(branch.path("estimate.json"))
+    subject = load_estimated_subject(branch, found, gravity=settings.gravity)
+    values = replace(
+        subject.start, young=np.array(found.get("young_mesh_pa") or found["young_pa"], float),
+        poisson=found["poisson"], density=found.get("density") or subject.start.density,
+        form=tuple(found.get("field_form") or ()))
+    return subject, values, Known.estimated(found)
+
+
+def _cell(branch: Branch) -> Cell:
+    """Return what the last recorded pull says of its cell, and how many frames it has."""
+    from limber.estimation.next_pull import Cell
+    from limber.recordings.recording import read_pull
+    from limber.store.loading import known_pulls
+
+    names = known_pulls(branch)
+    return Cell.of(read_pull(branch.path(f"pulls/{names[-1]}")) if names else None)
+
+
+def _told(found: Suggested, known: Known) -> dict[str, Any]:
+    best, *others = [_entry(pull, known) for pull in found.pulls]
+    most = max(range(len(found.pulls)), key=lambda k: found.pulls[k].bits)
+    return {"best": best, "others": others, "most_telling": [best, *others][most],
+            "young_deviation_now": np.sqrt(np.diag(known.total)),
+            "too_much_count": len(found.too_much), "failed_count": found.failed_count}
+
+
+def _entry(pull: ExpectedPull, known: Known) -> dict[str, Any]:
+    return {"grasp_fraction": pull.choice.fraction, "grasp_point_m": pull.point,
+            "end_m": pull.end, "travel_m": float(np.linalg.norm(pull.end - pull.point)),
+            "peak_strain": pull.peak_strain, "peak_force_n": pull.peak_force, "bits": pull.bits,
+            "bits_per_percent_strain": pull.bits_per_percent,
+            "young_deviation": np.sqrt(np.diag(known.after(pull.information).total))}
+
+
+def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Progress,
+              ) -> dict[str, Any]:
+    """Return whether a pull changes what a plan may do, and why."""
+    from limber.planning.constraints.limits import limits_in_file
+    from limber.planning.path_on_full_model import resolve_path
+    from limber.planning.plan_file import read_plan
+    from limber.stages.paths.plan_uncertainty import estimated_doubt
+    from limber.store.loading import load_grasp_model
+
+    plan = read_plan(branch.path(f"plans/{name}.json"))
+    limits = limits_in_file(plan.summary.get("limits") or {})
+    confidence = branch.manifest.stages[f"plan:{name}"].settings.get("confidence") or _CONFIDENCE
+    if not limits.asked() or plan.motion is None:
+        return {"worth": False, "why": "The plan has no limit: its path would be checked against "
+                "none however well the modulus is known."}
+    gravity = bool(branch.manifest.stages["energy"].settings["gravity"])
+    grasp_model = load_grasp_model(branch, gravity=gravity, progress=progress)
+    doubt = estimated_doubt(branch, grasp_model)
+    if doubt is None:
+        return {"worth": True, "why": "Nothing is estimated: whether the plan keeps its limits is "
+                "not known."}
+    phases = np.array(plan.motion.phases)
+    there = plan.motion.poses[:, :3]
+    path = resolve_path(grasp_model, there[phases == "path"],
+                        np.vstack([there[phases == "approach"], there[phases == "path"][:1]]),
+                        progress.part(0.0, 0.4)).require()
+    exposure = doubt.exposure(grasp_model, path, limits, progress.part(0.4, 1.0))
+    before, then = (exposure.risk(each.total, confidence) for each in (now, after))
+    worth, why = verdict(before, then, confidence)
+    return {"worth": worth, "why": why, "confidence": confidence, "kept_now": before.kept,
+            "kept_after": then.kept, "share_of_limits_now": before.excess,
+            "share_of_limits_after": then.excess}
+
+
+def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
+    """Return whether a pull between two risks is worth it for a plan, and why.
+
+    Risks are :class:`limber.planning.constraints.chance.Risk`.
+    """
+    over = [name for name, share in now.excess.items() if share > 1.0]
+    sure = f"with a confidence of {confidence:g}"
+    if over:
+        still = [name for name in over if after.excess[name] > 1.0]
+        named = ", ".join(over).replace("_", " ")
+        if len(still) < len(over):
+            return True, (f"The plan does not keep {named} {sure}; knowing the modulus as well as "
+                          "after this pull it is expected to.")
+        return True, (f"The plan does not keep {named} {sure}, and is not expected to after one "
+                      "more pull either: plan again with --confidence besides.")
+    gained = {name: now.factors[name] / after.factors[name] for name in now.factors
+              if now.excess[name] > _USED}
+    if not gained:
+        return False, (f"The plan keeps its limits {sure} and none holds it back: knowing the "
+                       "modulus better changes nothing of it.")
+    name, ratio = max(gained.items(), key=lambda item: item[1])
+    words = name.replace("_", " ")
+    if ratio > _MATTERS:
+        return True, (f"The plan keeps its limits {sure}, and {words} holds it back: after this "
+                      f"pull {100 * (ratio - 1):.0f} % more of that could be used.")
+    return False, (f"The plan keeps its limits {sure}; of {words}, which holds it back, this pull "
+                   f"would make only {100 * (ratio - 1):.1f} % more usable.")
+
+
+def run(inputs: SuggestPullInputs, settings: SuggestPullSettings, options: ParallelOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return suggest_pull(inputs.branch_folder, settings, plan=inputs.plan, workers=options.workers,
+                        force=options.force, progress=progress)
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    rows = [["held at", "to [m]", "travel", "strain", "force", "tells", "for each % of strain",
+             "E then known to"]]
+    for pull in [result["best"], *result["others"]][:8]:
+        end = " ".join(f"{x:.3f}" for x in pull["end_m"])
+        rows.append([
+            f"{pull['grasp_fraction']:.2f}", end, f"{1e3 * pull['travel_m']:.0f} mm",
+            f"{100 * pull['peak_strain']:.2g} %", f"{pull['peak_force_n']:.3g} N",
+            f"{pull['bits']:.1f} bit", f"{pull['bits_per_percent_strain']:.1f} bit",
+            " ".join(f"{100 * share:.0f} %" for share in pull["young_deviation"])])
+    tables = [("Pulls, the best first", rows)]
+    if plan := result.get("plan"):
+        worth = "yes" if plan["worth"] else "no"
+        tables.append((f"Worth it for the plan {plan['name']}?", [[worth], [plan["why"]]]))
+    return tables
+
+
+STAGE = StageDescription(
+    "suggest-pull", 78, run, SuggestPullInputs, SuggestPullSettings, ParallelOptions,
+    key="suggest-pull", reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"),
+    writes=("suggested_pull.json",), tables=_tables)

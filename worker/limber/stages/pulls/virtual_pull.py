@@ -1,0 +1,120 @@
+"""Simulate a pull with a known Young's modulus and sensor noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.estimation.settings import VirtualPullSettings
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.estimation.simulated_pull import TrueBranch
+
+
+class VirtualPullInputs(BranchInputs):
+    """A branch folder, and the pull's name."""
+
+    groups: ClassVar[Groups] = {"output": ("name",)}
+
+    name: str = Field("pull-1", description="Name of the pull.")
+
+
+def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
+                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Simulate a pull of a branch and write it as ``pulls/NAME``.
+
+    Returns:
+        ``pull``, ``young_true_pa``, ``young_assumed``, ``control_points_m``, ``frame_count``,
+        ``tet_count`` of the truth's mesh, ``peak_force_n``, ``travel_m``.
+
+    Raises:
+        InputError: the branch has no skeleton, or the settings do not fit it.
+        WorkError: the branch cannot be pulled like that.
+    """
+    from limber.estimation.simulated_pull import simulate_pull, write_depth_frames
+    from limber.recordings.recording import write_pull
+
+    branch = Branch.open(branch_folder)
+    branch.require("skeleton.swc", "reconstruct")
+    key = f"pull:{name}"
+    body = ("mesh.vtu",) if _is_meshed_body(branch) else ()
+    reads = [file for file in ("skeleton.swc", "cloud.ply", "truth/skeleton.swc",
+                               "truth/truth.json", *body) if branch.has(file)]
+    if not force and branch.is_current(key, settings, reads=reads):
+        return branch.manifest.stages[key].result
+    progress(0.02, "meshing the true branch")
+    truth = load_truth(branch, settings)
+    with branch.stage(key, settings, reads=reads) as stage:
+        prefix = f"pulls/{name}/"
+        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+            stage.remove(old)
+        folder = stage.path(prefix + "pull.toml").parent
+        pull, displacements = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
+        write_pull(folder, pull)
+        if settings.camera:
+            write_depth_frames(folder, truth, pull, displacements, settings)
+        reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
+        stage.result.update({
+            "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
+            "young_assumed": truth.is_assumed,
+            "fractions": truth.fractions, "frame_count": len(pull.times),
+            "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
+            "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
+    return stage.result
+
+
+def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
+    """The truth of a branch folder: its generator's, the body that was meshed, or a branch that its
+    scan allows.
+    """
+    from limber.estimation.simulated_pull import true_branch
+    from limber.geometry.generated import read_truth
+    from limber.geometry.io.skeletons import read_swc
+    from limber.store.loading import load_mesh
+
+    known: dict[str, Any] = {}
+    where = "skeleton.swc"
+    if branch.has("truth/truth.json"):
+        told = read_truth(branch.path("truth/truth.json"))
+        known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
+        where = "truth/skeleton.swc"
+    body = load_mesh(branch) if _is_meshed_body(branch) else None
+    found = true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,
+                        body=body, scan=_scan(branch, settings), **known)
+    return replace(found, is_assumed=not known)
+
+
+def _scan(branch: Branch, settings: VirtualPullSettings) -> np.ndarray | None:
+    """The points that a shape is drawn from; None where the truth is known, or no scan is."""
+    from limber.geometry.io.clouds import read_cloud
+
+    known = branch.has("truth/truth.json") or not branch.has("cloud.ply")
+    return None if known or settings.shape == "fitted" else read_cloud(
+        branch.path("cloud.ply")).points
+
+
+def _is_meshed_body(branch: Branch) -> bool:
+    """Whether `limber mesh` made the branch: its own tetrahedra are the truth."""
+    return "mesh" in branch.manifest.stages and branch.has("mesh.vtu") and not branch.has(
+        "truth/truth.json")
+
+
+def run(inputs: VirtualPullInputs, settings: VirtualPullSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return virtual_pull(inputs.branch_folder, inputs.name, settings, force=options.force,
+                        progress=progress)
+
+
+STAGE = StageDescription(
+    "virtual-pull", 60, run, VirtualPullInputs, VirtualPullSettings, RunOptions,
+    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",))

@@ -1,0 +1,1 @@
+"""Stages that write the report, the scene and exports."""

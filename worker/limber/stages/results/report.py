@@ -1,0 +1,85 @@
+"""One self-contained HTML page with figures and tables of all results."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from limber.core.files.atomic import file_digest, require_file
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.stages.inputs import BranchInputs, NoSettings, RunOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+from limber.version import VERSION
+
+
+class ReportInputs(BranchInputs):
+    """A branch folder, and a picture of it."""
+
+    groups: ClassVar[Groups] = {"input": ("picture", "caliper")}
+
+    picture: Path | None = Field(
+        None, description="A PNG to open the page with, such as the render of `limber scene`.")
+    caliper: Path | None = Field(
+        None, description="Diameters that you measured, to hold beside the scan's: a CSV with the "
+        "columns along_m (from the root along the main path) and diameter_mm.")
+
+
+def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Path | None = None,
+                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Write ``report.html`` into a branch folder from whatever stages have been run.
+
+    Args:
+        folder: The branch folder.
+        picture: A render of the scene to put at the top, PNG.
+        caliper_path: Measured diameters, see
+            :func:`limber.geometry.skeleton.qsm_tables.read_calipers`.
+
+    Returns:
+        ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``; ``calipers``,
+        the scan's diameters against the measured ones.
+
+    Raises:
+        InputError: the picture or the measured diameters cannot be used.
+    """
+    from limber.geometry.skeleton.qsm_tables import against_calipers, read_calipers
+    from limber.results.report.page import draw_page
+    from limber.store.loading import load_skeleton
+
+    branch = Branch.open(folder)
+    calipers = [] if caliper_path is None else read_calipers(caliper_path)
+    settings, digests = {"picture": bool(picture)}, _shown(branch, picture, caliper_path)
+    if not force and branch.is_current("report", settings, digests=digests):
+        return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
+    html, page = draw_page(branch, picture=picture, calipers=calipers, progress=progress)
+    with branch.stage("report", settings, digests=digests) as stage:
+        stage.path("report.html").write_text(html, encoding="utf-8")
+        stage.result.update(
+            figure_count=sum(len(section.pictures) for section in page),
+            sections=[section.title for section in page if not section.missing],
+            missing=[section.title for section in page if section.missing])
+        if calipers:
+            stage.result["calipers"] = against_calipers(load_skeleton(branch), calipers)
+    progress(1.0, "written")
+    return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
+
+
+def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> dict[str, str]:
+    """Digests of all that the page is drawn from."""
+    outside = {"picture": picture, "caliper": caliper_path}
+    return {"folder": branch.manifest.content_digest(), "limber": VERSION} | {
+        name: file_digest(require_file(path, f"A {name} file"))
+        for name, path in outside.items() if path is not None}
+
+
+def run(inputs: ReportInputs, _settings: NoSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return write_report(inputs.branch_folder, picture=inputs.picture, caliper_path=inputs.caliper,
+                        force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "report", 110, run, ReportInputs, NoSettings, RunOptions, key="report",
+    writes=("report.html",))

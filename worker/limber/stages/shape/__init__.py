@@ -1,0 +1,1 @@
+"""Stages that make a branch: scan or surface to skeleton and tetrahedra."""

@@ -1,0 +1,250 @@
+"""List the doubtful parts of the skeleton, and edit it: the mesh follows.
+
+EDITS is a JSON list, one object an edit, its places in the coordinates and the unit of the scan's
+file, as the list of doubtful parts gives them:
+
+\b
+  {"do": "move", "at": [x, y, z], "to": [x, y, z]}     put a node elsewhere
+  {"do": "delete", "at": [x, y, z]}                    cut a branch off, from there outwards
+  {"do": "merge", "at": [...], "to": [...]}            up to there it is one with the branch at "to"
+  {"do": "bridge", "at": [...], "to": [...]}           hang the whole branch on another place
+  {"do": "split", "at": [...], "to": [...]}            cut there; the rest hangs on "to"
+  {"do": "root", "at": [x, y, z]}                      here is the root
+  {"do": "radius", "at": [...], "radius": r}           with "to": all along the axes to there
+  {"do": "confirm", "at": [x, y, z]}                   the branch is there, no more doubt
+
+They stay in the branch folder and are applied again by each reconstruct. With --frame branch places
+and radii are in the branch's frame [m]; with --append they come after those that it has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.alignment import Alignment
+from limber.core.constants import FOUND_SKELETON
+from limber.core.errors import InputError
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.stages.inputs import BranchInputs, NoOptions, NoSettings
+from limber.stages.registry import StageDescription
+from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, write_branch
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.geometry.skeleton.doubtful_parts import Doubt
+    from limber.geometry.skeleton.edits import Edit
+    from limber.geometry.skeleton.skeleton import Skeleton
+
+_SHOWN = 30  # doubtful parts in the table; the JSON result has all
+
+
+class SkeletonInputs(BranchInputs):
+    """A branch folder, edits of its skeleton, and where to write the skeleton."""
+
+    groups: ClassVar[Groups] = {"input": ("edits", "frame", "append"), "output": ("output",)}
+
+    edits: Path | None = Field(
+        None, description="Edits (JSON) that take the place of those that the branch has; an "
+        "empty list undoes all.")
+    frame: Literal["scan", "branch"] = Field(
+        "scan", description="Whose coordinates the edits are in: those of the scan's file, or the "
+        "branch's [m].")
+    append: bool = Field(False, description="The edits come after those that the branch has.")
+    output: Path | None = Field(
+        None, description="Also write the skeleton, edits applied, in the scan's coordinates: "
+        ".swc, or .csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
+
+
+def review_skeleton(folder: Path, *, edits_path: Path | None = None,
+                    frame: Literal["scan", "branch"] = "scan", append: bool = False,
+                    output: Path | None = None, progress: Progress = SILENT) -> dict[str, Any]:
+    """List what is doubtful in a branch's skeleton, after edits of it if there are any to make.
+
+    Args:
+        folder: The branch folder.
+        edits_path: Edits to apply to the skeleton as it was found; surface and mesh are made anew.
+        frame: Of the edits' places: the scan file's coordinates, or the branch's frame [m].
+        append: The edits come after those that the branch has, not in their place.
+        output: ``.swc`` or ``.csv`` to write, in the scan file's coordinates and unit.
+        progress: Called as it goes; gets what the user should know.
+
+    Returns:
+        ``doubtful``: a list of ``kind``, ``branch``, ``at`` (in the scan's coordinates), ``at_m``
+        (in the branch's frame), ``length_m``, ``radius_m`` and ``value``; ``edits``, those that
+        are applied; ``mesh``: ``current``, ``out of date`` or ``missing``; ``unit`` of ``at``.
+
+    Raises:
+        InputError: an edit does not fit. MeshingError: what it leaves cannot be meshed. The
+            folder is then as it was.
+    """
+    from limber.geometry.skeleton.doubtful_parts import doubtful_parts
+
+    if edits_path is not None:
+        branch = Branch.open(folder)
+        _remade(branch, _wanted(branch, edits_path, frame, append), progress)
+    branch = Branch.read(folder)
+    skeleton, alignment, mesh = _latest(branch)
+    if mesh == "out of date":
+        progress.warn("This is the skeleton of the last reconstruct, which did not come to a mesh; "
+                      "the mesh is of an earlier one.")
+    if output is not None:
+        _write(skeleton.in_file(alignment), output, branch.manifest.source.get("unit", "m"))
+    applied = _applied(branch)
+    return {"doubtful": [_told(doubt, alignment) for doubt in doubtful_parts(skeleton)],
+            "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
+            "length_m": skeleton.length, "mesh": mesh, "unit": _unit(branch),
+            "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
+            "output": output}
+
+
+def _wanted(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
+    """The edits that the branch shall have, in the coordinates of the scan's file."""
+    from limber.geometry.skeleton.edits import read_edits
+
+    edits = read_edits(path)
+    if frame == "branch":
+        edits = [edit.in_file(branch.manifest.alignment) for edit in edits]
+    return [*_applied(branch), *edits] if append else edits
+
+
+def _applied(branch: Branch) -> list[Edit]:
+    return load_edits(branch) if "edits" in _entry(branch).reads else []
+
+
+def _entry(branch: Branch) -> Any:
+    known = branch.manifest.stages
+    entry = known.get("reconstruct") or known.get("skeleton") or known.get("mesh")
+    if entry is None:
+        branch.require("skeleton.swc", "reconstruct")
+    return entry
+
+
+def _unit(branch: Branch) -> str:
+    return _entry(branch).settings.get("unit", "m")
+
+
+def _latest(branch: Branch) -> tuple[Skeleton, Alignment, str]:
+    """The newest skeleton in the branch's frame, its alignment, and how the mesh stands to it."""
+    from limber.geometry.io.skeletons import read_skeleton
+    from limber.store.loading import load_found_skeleton
+
+    known = branch.manifest.stages
+    made, early = known.get("reconstruct"), known.get("skeleton")
+    if made is None and early is None:
+        path = branch.require("skeleton.swc", "reconstruct")
+        return read_skeleton(path), branch.manifest.alignment, "current"
+    if early is not None and (made is None or not _belong(early, made)):
+        alignment = Alignment.model_validate(early.result["alignment"])
+        return (load_found_skeleton(branch, alignment, early.settings["unit"]), alignment,
+                "missing" if made is None else "out of date")
+    path = branch.require("skeleton.csv", "reconstruct")
+    return read_skeleton(path), branch.manifest.alignment, "current"
+
+
+def _belong(early: Any, made: Any) -> bool:
+    """Whether a kept skeleton and a mesh are of the same scan and settings, edits aside."""
+    def source(entry: Any) -> dict[str, str]:
+        return {name: value for name, value in entry.reads.items() if name != "edits"}
+    # As this version has them: one of both may have been written before a setting was added.
+    return (_settings(early) == _settings(made)) and source(early) == source(made)
+
+
+def _settings(entry: Any) -> Any:
+    from limber.geometry.settings import ReconstructSettings
+
+    return ReconstructSettings.model_validate(entry.settings)
+
+
+def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
+    """Apply edits to the skeleton as it was found; make surface and mesh of what comes out."""
+    from limber.geometry.io.clouds import read_points
+    from limber.geometry.reconstruction import labelled, mesh_skeleton
+    from limber.geometry.skeleton.confidence import shares
+    from limber.geometry.skeleton.edits import edited, edits_text
+    from limber.geometry.skeleton.totals import totals
+    from limber.store.loading import load_found_skeleton, load_masses
+
+    known = branch.manifest.stages
+    made, early = known.get("reconstruct"), known.get("skeleton")
+    if made is None or early is None or not _belong(early, made):
+        raise InputError(
+            f"{branch.folder} has no mesh of the skeleton that would be edited.",
+            "Its last reconstruct failed, or is of an older Limber; the scan is needed again.",
+            "Run `limber reconstruct CLOUD -o NAME.branch --edits FILE`.")
+    settings = _settings(made)
+    alignment = branch.manifest.alignment
+    digests = {name: value for name, value in made.reads.items() if name != "edits"}
+    found = load_found_skeleton(branch, alignment, settings.unit)
+    skeleton = edited(found, [edit.aligned(alignment) for edit in edits])
+    cloud = read_points(branch.require("cloud.ply", "reconstruct"))
+    warnings = list(made.result.get("skeleton_warnings", []))
+    leaves = [mass for mass in load_masses(branch) if mass.get("kind") == "leaf"]
+    with branch.stage("reconstruct", settings, digests=digests | edits_digest(edits)) as stage:
+        meshed = mesh_skeleton(skeleton, settings, progress.keeping(warnings))
+        write_branch(stage, labelled(cloud, skeleton),
+                     replace(meshed, masses=[*meshed.masses, *leaves]))
+        if edits:
+            stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
+        else:
+            stage.remove(EDITS)
+        stage.result.update(made.result | meshed.numbers | totals(
+            skeleton, made.result.get("unlikely_twigs", [])) | {
+            "length_shares": shares(skeleton), "warnings": warnings})
+
+
+def _write(skeleton: Skeleton, path: Path, unit: str) -> None:
+    from limber.geometry.io.skeletons import write_cylinders
+
+    if path.suffix.lower() not in (".swc", ".csv"):
+        raise InputError(f"{path} is neither .swc nor .csv.", "A skeleton is written as one.",
+                         "Name the file so.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix.lower() == ".swc":
+            skeleton.write_swc(path, unit=unit)
+        else:
+            write_cylinders(skeleton, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}).",
+                         "The skeleton goes there.", "Choose another place.") from error
+
+
+def _told(doubt: Doubt, alignment: Alignment) -> dict[str, Any]:
+    return {"kind": doubt.kind, "branch": doubt.branch,
+            "at": np.round(alignment.undo(doubt.at[None])[0], 6), "at_m": doubt.at,
+            "length_m": doubt.length, "radius_m": doubt.radius,
+            "value": None if math.isnan(doubt.value) else doubt.value}
+
+
+def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
+    """Return the doubtful parts as a table."""
+    from limber.results.report.tables import doubt_rows
+
+    doubtful = result["doubtful"]
+    if not doubtful:
+        return []
+    more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
+    return [(f"Doubtful parts, places in the scan's coordinates [{result['unit']}]{more}",
+             doubt_rows(doubtful[:_SHOWN]))]
+
+
+def run(inputs: SkeletonInputs, _settings: NoSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return review_skeleton(inputs.branch_folder, edits_path=inputs.edits, frame=inputs.frame,
+                           append=inputs.append, output=inputs.output, progress=progress)
+
+
+STAGE = StageDescription(
+    "skeleton", 25, run, SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
+    reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
+    writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
+            "point_masses.json", EDITS), tables=tables)

@@ -1,0 +1,86 @@
+"""A generated branch with known truth, scanned as a scanner would."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from limber.core.errors import InputError
+from limber.core.files.atomic import file_digest, write_atomically
+from limber.core.json_values import plain
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.geometry.settings import BranchSpec
+from limber.stages.inputs import NoOptions, argument
+from limber.stages.registry import StageDescription
+
+if TYPE_CHECKING:
+    from limber.geometry.generated import GeneratedBranch
+
+
+class GenerateInputs(Settings):
+    """Where the scan and its truth go."""
+
+    groups: ClassVar[Groups] = {"output": ("folder",)}
+
+    folder: Path = argument("The folder to make.")
+
+
+class GenerateSettings(BranchSpec):
+    """A generated branch and its seed."""
+
+    groups: ClassVar[Groups] = {"shape": ("seed",)}
+
+    seed: int = Field(0, description="Seed of all that is random.")
+
+
+def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
+             progress: Progress = SILENT) -> dict[str, Any]:
+    """Make a branch with known truth and write its scan and the truth into ``folder``.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    from limber.geometry.generated import generate_branch
+
+    progress(0.1, "generating")
+    return write_generated(generate_branch(seed, **settings.model_dump()), folder)
+
+
+def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
+    """Write the scan and the truth: ``cloud.ply``, ``truth_skeleton.swc``, ``truth_surface.ply``
+    and ``truth.json``; returns what was written.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        branch.cloud.write_ply(folder / "cloud.ply")
+        branch.skeleton.write_swc(folder / "truth_skeleton.swc")
+        branch.surface.write_ply(folder / "truth_surface.ply")
+        write_atomically(folder / "truth.json", json.dumps(plain({
+            "seed": branch.seed, "spec": branch.spec, "young_pa": branch.young,
+            "control_points_m": branch.control_points, "fractions": branch.fractions,
+            "cloud_sha256": file_digest(folder / "cloud.ply")}), indent=1) + "\n")
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written to ({error.strerror}).",
+                         "The scan and its truth go there.", "Choose another folder.") from error
+    return {"cloud": str(folder / "cloud.ply"), "point_count": len(branch.cloud),
+            "branch_count": branch.skeleton.branch_count, "length_m": branch.skeleton.length,
+            "young_pa": branch.young, "surface_volume_m3": branch.surface.volume}
+
+
+def run(inputs: GenerateInputs, settings: GenerateSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    spec = BranchSpec(**settings.model_dump(exclude={"seed"}))
+    return generate(inputs.folder, spec, seed=settings.seed, progress=progress)
+
+
+STAGE = StageDescription(
+    "generate", 10, run, GenerateInputs, GenerateSettings, NoOptions)

@@ -1,0 +1,115 @@
+"""Closed surface (STL, PLY, OBJ), a table of sections or a cylinder model to tetrahedra."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from limber.core.files.atomic import file_digest, require_file
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.geometry.settings import MeshSurfaceSettings
+from limber.stages.inputs import RunOptions, argument
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.geometry.surface.surface import Surface
+
+
+class MeshInputs(Settings):
+    """A closed surface, a table of sections or a cylinder model, and the branch folder to make."""
+
+    groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
+
+    surface: Path = argument(
+        "STL, PLY, OBJ or OFF; a CSV of sections along an axis from the end that is held: x, y, "
+        "z, width, height, and perhaps mass_kg, what hangs there; or a cylinder model: .mat of "
+        "TreeQSM or SmartQSM, CSV of rTwig or SimpleForest, MTG, SWC.")
+    output: Path = Field(description="The branch folder to make.",
+                         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
+
+
+def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None = None, *,
+                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Fill a closed surface with tetrahedra and mark base, control points and grasp.
+
+    Args:
+        path: STL, PLY, OBJ or OFF, a CSV of sections, or a cylinder model.
+        folder: The branch folder to make or renew.
+        settings: How.
+        force: Run even if nothing has changed.
+        progress: Called as it goes; gets what the user should know.
+
+    Raises:
+        InputError: the surface cannot be read or is not that of one solid
+            (:func:`limber.geometry.io.surfaces.usable_surface`), or the table is none of
+            sections (:func:`limber.geometry.sections.read_sections`), or the cylinder model
+            cannot be used (:func:`limber.geometry.mesh_skeleton.mesh_model`).
+        MeshingError: fTetWild failed.
+    """
+    from limber.geometry.io.skeletons import write_cylinders
+    from limber.geometry.mesh_skeleton import is_model, mesh_model
+    from limber.geometry.mesh_surface import mesh_body
+    from limber.geometry.sections import mesh_sections, read_sections
+
+    settings = settings or MeshSurfaceSettings()
+    path, drawn = require_file(path, "A surface"), None
+    warnings: list[str] = []
+    has_cylinders = is_model(path)
+    if has_cylinders:
+        progress = progress.keeping(warnings)
+    elif path.suffix.lower() == ".csv":
+        drawn = read_sections(path, settings.unit)
+    else:
+        surface, warnings = _usable(path, settings)
+    branch = Branch.create(folder)
+    digests = {"surface": file_digest(path)}
+    if not force and branch.is_current("mesh", settings, digests=digests):
+        return branch.manifest.stages["mesh"].result
+    for text in list(warnings):
+        progress.warn(text)
+    with branch.stage("mesh", settings, digests=digests) as stage:
+        if has_cylinders:
+            made, masses = mesh_model(path, settings, progress)
+        elif drawn is not None:
+            made, masses = mesh_sections(drawn, settings)
+        else:
+            made, masses = mesh_body(surface, settings, progress), []
+        stage.manifest.alignment = made.alignment
+        stage.manifest.source = {"file": path.name, "unit": settings.unit,
+                                 "sha256": digests["surface"]}
+        made.skeleton.write_swc(stage.path("skeleton.swc"))
+        made.surface.write_ply(stage.path("surface.ply"))
+        made.mesh.write(stage.path("mesh.vtu"))
+        for name in ("point_masses.json", "skeleton.csv"):
+            stage.remove(name)  # of an earlier scan in this folder
+        if has_cylinders:
+            write_cylinders(made.skeleton, stage.path("skeleton.csv"))
+        if masses:
+            stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n",
+                                                       encoding="utf-8")
+        stage.result.update(made.numbers | {"warnings": warnings})
+        progress(1.0, "meshed", tets=made.mesh.tet_count)
+    return branch.manifest.stages["mesh"].result
+
+
+def _usable(path: Path, settings: MeshSurfaceSettings) -> "tuple[Surface, list[str]]":
+    from limber.core.constants import UNIT_METRES
+    from limber.geometry.io.surfaces import usable_surface
+    from limber.geometry.surface.surface import Surface
+
+    return usable_surface(Surface.read(path, scale=UNIT_METRES[settings.unit]), path)
+
+
+def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return mesh_surface(inputs.surface, inputs.output, settings, force=options.force,
+                        progress=progress)
+
+
+STAGE = StageDescription(
+    "mesh", 30, run, MeshInputs, MeshSurfaceSettings, RunOptions, key="mesh",
+    writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"))

@@ -1,0 +1,318 @@
+"""Scan to tetrahedra: skeleton, radii, surface, mesh."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.alignment import Alignment
+from limber.core.constants import FOUND_SKELETON
+from limber.core.errors import Cancelled, InputError, LimberError, WorkError
+from limber.core.files.atomic import file_digest, require_file
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.geometry.settings import ReconstructSettings
+from limber.stages.inputs import RunOptions, argument
+from limber.stages.registry import StageDescription
+from limber.store import Branch, Stage
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from limber.geometry.cloud.cloud import Cloud
+    from limber.geometry.reconstruction import MeshedBranch
+    from limber.geometry.skeleton.checkpoint import FoundSkeleton
+    from limber.geometry.skeleton.edits import Edit
+    from limber.geometry.skeleton.skeleton import Skeleton
+
+SEARCH = f"{FOUND_SKELETON}.npz"
+"""All that the search for the skeleton came to, until there is a mesh: a reconstruct that is
+stopped between goes on from there."""
+EDITS = "edits.json"
+"""The edits that a branch keeps, in the coordinates of the scan's file."""
+
+
+class ReconstructInputs(Settings):
+    """A scan, what is known of it, and the branch folder to make."""
+
+    groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "edits", "camera", "mask"),
+                               "output": ("output",)}
+
+    cloud: Path = argument("A point cloud file, or a folder of them: then each becomes a branch "
+                           "folder in the output folder, and a bad one does not stop the others.")
+    output: Path = Field(
+        description="The branch folder to make; with a folder of scans, where to make them.",
+        json_schema_extra={"short": "-o", "example": "{stem}.branch"})
+    skeleton: Path | None = Field(
+        None, description="Your own skeleton in the cloud's coordinates: SWC, cylinder CSV (ours, "
+        "rTwig's, SimpleForest's), .mat of TreeQSM or SmartQSM, or MTG.")
+    edits: Path | None = Field(
+        None, description="Edits of the skeleton (JSON, see `limber skeleton`); they stay in the "
+        "branch folder and are applied again by each reconstruct without --skeleton.")
+    camera: Path | None = Field(
+        None, description="camera.toml: then CLOUD is a depth image.")
+    mask: Path | None = Field(
+        None, description="With --camera: an image that is over 0 on the branch.")
+
+
+def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
+                skeleton_path: Path | None = None, edits_path: Path | None = None,
+                camera_path: Path | None = None, mask_path: Path | None = None,
+                force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+
+    The skeleton is kept in the scan's own coordinates as soon as it is found
+    (``scan_skeleton.swc`` and ``.csv``), also where a later step fails or the program is killed:
+    the next run with the same scan and settings goes on from there.
+
+    Args:
+        cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
+        folder: The branch folder to make or renew.
+        settings: How.
+        skeleton_path: The user's own skeleton in the scan's coordinates and unit (SWC or
+            cylinder CSV), instead of ours.
+        edits_path: Edits of the skeleton; without them those that the folder has, if the
+            skeleton is not the user's own.
+        camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
+        mask_path: The depth image's mask of the branch.
+        force: Run even if nothing has changed.
+        progress: Called as it goes; gets what the user should know.
+
+    Returns:
+        The stage's result (DESIGN's keys and more).
+
+    Raises:
+        InputError: the scan, the skeleton or the folder cannot be used.
+        WorkError: the work failed; the folder is as it was but for the kept skeleton.
+    """
+    from limber.core.constants import UNIT_METRES
+    from limber.geometry.io.clouds import read_points
+    from limber.geometry.io.depth_images import read_depth
+    from limber.geometry.io.skeletons import read_skeleton
+    from limber.geometry.reconstruction import reconstruct_cloud
+    from limber.geometry.skeleton.edits import edits_text, read_edits
+
+    settings = settings or ReconstructSettings()
+    raw = read_points(cloud_path) if camera_path is None else read_depth(
+        cloud_path, camera_path, mask_path)
+    branch = Branch.create(folder)
+    digests = {"cloud": file_digest(cloud_path)}
+    for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
+        if path is not None:
+            digests[name] = file_digest(require_file(path, f"A {name} file"))
+    if edits_path is not None:
+        edits = read_edits(edits_path)
+    else:
+        edits = [] if skeleton_path is not None else load_edits(branch)
+    digests |= edits_digest(edits)
+    if not force and branch.is_current("reconstruct", settings, digests=digests):
+        return branch.manifest.stages["reconstruct"].result
+    warnings: list[str] = []
+    if edits_path is None and not edits and branch.has(EDITS):
+        progress.keeping(warnings).warn(
+            "The edits of edits.json are not applied: the given skeleton is used as it is.")
+    searched = {name: value for name, value in digests.items() if name != "edits"}
+    known = None if force else load_search(branch, settings, searched)
+    is_kept = known is not None
+
+    def keep(alignment: Alignment, skeleton: Skeleton, found: FoundSkeleton) -> None:
+        nonlocal is_kept
+        with branch.stage("skeleton", settings, digests=searched) as early:
+            _keep_skeleton(early, alignment, skeleton, settings.unit)
+            found.write(early.path(SEARCH))
+        is_kept = True
+    with branch.stage("reconstruct", settings, digests=digests) as stage:
+        own = None if skeleton_path is None else read_skeleton(
+            skeleton_path, scale=UNIT_METRES[settings.unit])
+        try:
+            made = reconstruct_cloud(raw, settings, own=own, edits=edits, eye=_eye(camera_path),
+                                     known=known, keep=keep, progress=progress.keeping(warnings))
+        except LimberError as error:
+            if is_kept and not isinstance(error, Cancelled):
+                progress.warn(
+                    f"The skeleton as it was found is in {branch.folder / FOUND_SKELETON}.swc, "
+                    "in the scan's coordinates: mend it and give it back (--skeleton), or edit it "
+                    "(--edits).")
+            raise
+        stage.manifest.alignment = made.alignment
+        stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
+                                 "sha256": digests["cloud"]}
+        write_branch(stage, made.cloud, made.meshed)
+        stage.remove(SEARCH)
+        if edits:
+            stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
+        elif edits_path is not None:
+            stage.remove(EDITS)
+        if _copy_truth(Path(cloud_path), stage, made.alignment):
+            stage.manifest.source["truth"] = "truth/truth.json"
+        stage.result.update(made.numbers | {"warnings": warnings})
+        progress(1.0, "reconstructed")
+    return branch.manifest.stages["reconstruct"].result
+
+
+def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings | None = None, *,
+                       force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Reconstruct every cloud in a folder into ``folder/NAME.branch``.
+
+    Args:
+        clouds: The folder of scans; files of other kinds in it are passed over.
+        folder: Where the branch folders go.
+        settings: For all of them.
+        force: Run even where nothing has changed.
+        progress: Called as it goes; gets each scan's warnings, with its name, and each failure.
+
+    Returns:
+        ``done`` and ``failed``: name to result, name to message.
+
+    Raises:
+        InputError: there is no scan.
+        WorkError: all of them failed.
+    """
+    from limber.geometry.io.clouds import READERS
+
+    paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in READERS)
+    if not paths:
+        raise InputError(f"{clouds} has no point clouds.",
+                         f"Known are: {' '.join(sorted(READERS))}.", "Name another folder.")
+    done: dict[str, Any] = {}
+    failed: dict[str, str] = {}
+    for number, path in enumerate(paths):
+        part = progress.part(number / len(paths), (number + 1) / len(paths)).named(path.name)
+        try:
+            done[path.name] = reconstruct(path, Path(folder) / f"{path.stem}.branch", settings,
+                                          force=force, progress=part)
+        except Cancelled:
+            raise
+        except LimberError as error:
+            failed[path.name] = str(error)
+            part.warn(str(error))
+    if not done:
+        raise WorkError(f"None of the {len(paths)} scans could be reconstructed.",
+                        next(iter(failed.values())), "See the warnings for each.")
+    return {"done": done, "failed": failed, "done_count": len(done), "failed_count": len(failed)}
+
+
+def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit: str) -> None:
+    """Write a skeleton in the coordinates and the unit of the scan's file."""
+    from limber.geometry.io.skeletons import write_cylinders
+
+    in_file = skeleton.in_file(alignment)
+    in_file.write_swc(stage.path(f"{FOUND_SKELETON}.swc"), unit=unit)
+    write_cylinders(in_file, stage.path(f"{FOUND_SKELETON}.csv"))
+    stage.result.update(node_count=skeleton.node_count, length_m=skeleton.length,
+                        alignment=alignment)
+
+
+def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str, str],
+                ) -> FoundSkeleton | None:
+    """Return what an earlier run of these programs found of a scan, if it came to no mesh.
+
+    Raises:
+        InputError: the file has been changed, its checksum as well.
+    """
+    from limber.geometry.skeleton.checkpoint import FoundSkeleton
+    from limber.store import program_versions
+
+    entry = branch.manifest.stages.get("skeleton")
+    if entry is None or not branch.has(SEARCH) or not branch.is_current(
+            "skeleton", settings, digests=digests):
+        return None
+    if program_versions().items() - entry.programs.items():
+        return None
+    return FoundSkeleton.read(branch.path(SEARCH))
+
+
+def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
+    """Write the files of a branch that has been meshed."""
+    from limber.geometry.io.skeletons import write_cylinders
+
+    cloud.write_ply(stage.path("cloud.ply"))
+    meshed.skeleton.write_swc(stage.path("skeleton.swc"))
+    write_cylinders(meshed.skeleton, stage.path("skeleton.csv"))
+    meshed.surface.write_ply(stage.path("surface.ply"))
+    meshed.mesh.write(stage.path("mesh.vtu"))
+    if meshed.masses:
+        stage.path("point_masses.json").write_text(json.dumps(meshed.masses, indent=1) + "\n")
+    else:
+        stage.remove("point_masses.json")  # of an earlier run: its twigs are in the mesh now
+
+
+def load_edits(branch: Branch) -> list[Edit]:
+    """Return the edits of its skeleton that a branch keeps.
+
+    Raises:
+        InputError: the file has been changed by hand, and is none now.
+    """
+    from limber.geometry.skeleton.edits import read_edits
+
+    return read_edits(branch.path(EDITS)) if branch.has(EDITS) else []
+
+
+def edits_digest(edits: Sequence[Edit]) -> dict[str, str]:
+    """Return what a manifest remembers of edits: nothing of none."""
+    from limber.geometry.skeleton.edits import edits_text
+
+    return {"edits": hashlib.sha256(edits_text(edits).encode()).hexdigest()} if edits else {}
+
+
+def _eye(camera_path: Path | None) -> np.ndarray | None:
+    """Where the depth image's camera stood [m], shape [3]."""
+    if camera_path is None:
+        return None
+    from limber.geometry.cloud.camera import read_camera
+
+    return read_camera(camera_path).origin
+
+
+def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
+    """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
+    from limber.geometry.generated import read_truth
+    from limber.geometry.io.skeletons import read_swc
+    from limber.geometry.surface.surface import Surface
+
+    source = cloud_path.parent / "truth.json"
+    skeleton_path = cloud_path.parent / "truth_skeleton.swc"
+    if not (source.is_file() and skeleton_path.is_file()):
+        return False
+    truth = read_truth(source)
+    if truth.get("cloud_sha256") != file_digest(cloud_path):
+        return False
+    skeleton = read_swc(skeleton_path)
+    skeleton.moved(alignment.apply(skeleton.nodes)).write_swc(stage.path("truth/skeleton.swc"))
+    truth["control_points_m"] = alignment.apply(np.array(truth["control_points_m"])).tolist()
+    stage.path("truth/truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+    surface_path = cloud_path.parent / "truth_surface.ply"
+    if surface_path.is_file():
+        surface = Surface.read(surface_path)
+        Surface(alignment.apply(surface.vertices), surface.faces).write_ply(
+            stage.path("truth/surface.ply"))
+    else:
+        stage.remove("truth/surface.ply")
+    return True
+
+
+def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    if inputs.cloud.is_dir():
+        one = [name for name in ("skeleton", "edits", "camera", "mask") if getattr(inputs, name)]
+        if one:
+            raise InputError(f"{inputs.cloud} is a folder, and --{one[0]} was given.",
+                             "That belongs to one scan.", "Reconstruct that scan by itself.")
+        return reconstruct_folder(inputs.cloud, inputs.output, settings, force=options.force,
+                                  progress=progress)
+    return reconstruct(inputs.cloud, inputs.output, settings, skeleton_path=inputs.skeleton,
+                       edits_path=inputs.edits, camera_path=inputs.camera, mask_path=inputs.mask,
+                       force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
+    writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
+            "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH, EDITS,
+            "truth/"))

@@ -1,0 +1,148 @@
+"""Name a place on the branch (a flower, a fruit) that is followed wherever the branch is moved."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError
+from limber.core.progress import Progress
+from limber.core.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs, RunOptions, argument
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.mechanics.loads.loaded_branch import NamedTarget
+
+FILE = "targets.json"
+
+
+class TargetInputs(BranchInputs):
+    """A branch folder, and the target's name."""
+
+    groups: ClassVar[Groups] = {"input": ("name",)}
+
+    name: str = argument("Name of the target: letters, digits, dash, underscore.")
+
+
+class TargetSettings(Settings):
+    """Where a target is and what it weighs."""
+
+    groups: ClassVar[Groups] = {"input": ("at", "mass", "farthest", "remove")}
+
+    at: tuple[float, float, float] | None = Field(
+        None, description="Where it is on the branch as it hangs, branch frame [m].",
+        json_schema_extra={"metavar": "X Y Z"})
+    mass: float = Field(
+        0.0, ge=0, le=100, description="What it weighs beside the scanned branch [kg]; it hung "
+        "there when the branch was scanned.")
+    farthest: float = Field(
+        0.03, gt=0, description="Farthest that it may be off the branch [m].")
+    remove: bool = Field(False, description="Forget this target.")
+
+
+def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, force: bool = False,
+               ) -> dict[str, Any]:
+    """Write a target into ``targets.json``, in place of one of that name, or take it out.
+
+    One that is there already as wished is left as it is, unless ``force``.
+
+    It keeps the place that was given, and moves and turns with the nearest place of the branch.
+
+    Returns:
+        ``target``, ``position_m``, ``mass_kg``; ``branch_point_m``, the nearest place of the
+        branch, that it hangs on, ``distance_m`` from there; ``targets``, the names of all.
+
+    Raises:
+        InputError: a name that is none, no place or two wishes, a place off the branch, or nothing
+            to remove.
+    """
+    from limber.store.loading import load_mesh, load_targets
+
+    _check_wishes(name, settings)
+    branch = Branch.open(branch_folder)
+    branch.require("mesh.vtu", "reconstruct")
+    key, known = f"target:{name}", load_targets(branch)
+    others = [target for target in known if target.name != name]
+    wished = [] if settings.at is None else [(name, settings.at, settings.mass)]
+    is_there = wished == [(one.name, one.position, one.mass) for one in known if one.name == name]
+    if not force and is_there and branch.is_current(key, settings, reads=["mesh.vtu"]):
+        return branch.manifest.stages[key].result | {
+            "targets": sorted(target.name for target in known)}
+    with branch.stage(key, settings, reads=["mesh.vtu"]) as stage:
+        if settings.remove and len(others) == len(known):
+            raise InputError(
+                f"{branch.folder} has no target {name}.",
+                f"It has {', '.join(target.name for target in others) or 'none'}.",
+                "Nothing was removed.")
+        found = {} if settings.at is None else _placed(
+            load_mesh(branch), name, settings.at, settings)
+        targets = others if settings.at is None else [*others, found.pop("target")]
+        stage.path(FILE).write_text(_text(targets), encoding="utf-8")
+        stage.result.update(
+            {"target": name, **found, "targets": sorted(target.name for target in targets)})
+    return stage.result
+
+
+def _check_wishes(name: str, settings: TargetSettings) -> None:
+    import re
+
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise InputError(f"{name!r} cannot name a target.",
+                         "Names go into files and tables of other programs.",
+                         "Use letters, digits, dash and underscore, 64 at most.")
+    if settings.remove == (settings.at is not None):
+        given = "Both --at and --remove" if settings.remove else "Neither --at nor --remove"
+        raise InputError(f"{given} for target {name}.", "It is set at a place, or removed.",
+                         "Give --at X Y Z, or --remove.")
+    if settings.at is not None and not np.isfinite(settings.at).all():
+        raise InputError(f"Target {name} at {settings.at}.", "A place has three finite numbers.",
+                         "Give --at X Y Z in metres.")
+
+
+def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: TargetSettings,
+            ) -> dict[str, Any]:
+    """Return the target and how it hangs on the branch."""
+    from limber.mechanics.loads.loaded_branch import NamedTarget
+    from limber.mechanics.points import nearest_inside
+
+    place = np.array(at)
+    foot = nearest_inside(mesh, place[None])[0]
+    distance = float(np.linalg.norm(place - foot))
+    if not distance <= settings.farthest:
+        low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+        raise InputError(
+            f"Target {name} is {distance:.3g} m off the branch.",
+            f"The branch reaches from ({_numbers(low)}) to ({_numbers(high)}) m; its nearest place "
+            f"is ({_numbers(foot)}) m, and {settings.farthest:g} m are allowed.",
+            "Check the frame and the unit (metres, branch frame), or widen --farthest.")
+    return {"target": NamedTarget(name, at, settings.mass), "position_m": place,
+            "mass_kg": settings.mass, "branch_point_m": foot, "distance_m": distance}
+
+
+def _numbers(point: np.ndarray) -> str:
+    return ", ".join(f"{value:.3f}" for value in point)
+
+
+def _text(targets: list[NamedTarget]) -> str:
+    from limber.store.loading import TARGETS_FORMAT
+
+    entries = [{"name": target.name, "position_m": list(target.position), "mass_kg": target.mass}
+               for target in sorted(targets, key=lambda target: target.name)]
+    return json.dumps({"format_version": TARGETS_FORMAT, "targets": entries}, indent=1) + "\n"
+
+
+def run(inputs: TargetInputs, settings: TargetSettings, options: RunOptions,
+        _progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return set_target(inputs.branch_folder, inputs.name, settings, force=options.force)
+
+
+STAGE = StageDescription(
+    "target", 35, run, TargetInputs, TargetSettings, RunOptions, key="target:{name}",
+    reads=("mesh.vtu",), writes=("targets.json",))

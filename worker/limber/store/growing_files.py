@@ -1,0 +1,153 @@
+"""Streams: files that grow while something happens, as a recording or a log does.
+
+A stream holds lines. What was appended is handed to the system within a quarter of a second and
+brought to the disk within one: a killed program loses at most that, and so does a power cut. A
+line that was cut off in the middle is cut away when the stream is taken over.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from limber.core.errors import BranchFolderError, InputError, WorkError
+from limber.core.files.atomic import flush_folder, write_atomically
+from limber.core.machine_errors import machine_error
+
+_WRITE_SECONDS = 0.25
+_FLUSH_SECONDS = 0.75
+_TAIL_BYTES = 1 << 16
+
+Shorten = Callable[[Iterator[str]], list[str] | None]
+
+
+class Stream:
+    """Appends lines to a file; a thread writes them, so that who appends never waits for a disk.
+
+    Use it in a ``with``, or close it. A file that is there is gone on with.
+
+    Args:
+        path: The file; its folder is made.
+        shorten: Asked, while nobody else appends, for the lines to keep of those that are there;
+            None keeps all.
+
+    Raises:
+        BranchFolderError: another program appends to it, or it cannot be written.
+    """
+
+    def __init__(self, path: Path, shorten: Shorten | None = None):
+        self.path = Path(path)
+        self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"), timeout=0,
+                              thread_local=False)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+            self.cut_bytes = _cut_torn_line(self.path)
+            kept = shorten(stream_lines(self.path)) if shorten and self.path.exists() else None
+            if kept is not None:
+                write_atomically(self.path, "".join(f"{line}\n" for line in kept))
+            self._file = open(self.path, "ab", buffering=0)
+            flush_folder(self.path.parent)
+        except Timeout as error:
+            raise BranchFolderError(
+                f"Another program is appending to {self.path}.", "Its lines would mix with ours.",
+                "Wait for it to end, or stop it.") from error
+        except OSError as error:
+            self._lock.release()
+            raise BranchFolderError(f"{self.path} cannot be written ({error.strerror}).",
+                                    "It is to grow there.", "Choose another place.") from error
+        self._waiting: list[bytes] = []
+        self._guard = threading.Lock()
+        self._closing = threading.Event()
+        self._error: OSError | None = None
+        self._writer = threading.Thread(target=self._write, name="stream", daemon=True)
+        self._writer.start()
+
+    def append(self, line: str) -> None:
+        """Append one line, given without its end; does not wait.
+
+        Raises:
+            InputError: the text has a line end in it.
+            WorkError: an earlier line could not be written, as on a full disk.
+        """
+        if "\n" in line or "\r" in line:
+            raise InputError("A line of a stream has a line end in it.", "It would be two lines.",
+                             "Append them one by one.")
+        self._raise_error()
+        with self._guard:
+            self._waiting.append(line.encode("utf-8") + b"\n")
+
+    def close(self) -> None:
+        """Bring all that was appended to the disk.
+
+        Raises:
+            WorkError: that could not be done.
+        """
+        self._closing.set()
+        self._writer.join()
+        self._file.close()
+        self._lock.release()
+        self._raise_error()
+
+    def __enter__(self) -> "Stream":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def _write(self) -> None:
+        unflushed = 0.0
+        closing = False
+        while not closing:
+            closing = self._closing.wait(_WRITE_SECONDS)
+            with self._guard:
+                lines, self._waiting = self._waiting, []
+            unflushed = unflushed + _WRITE_SECONDS if lines or unflushed else 0.0
+            try:
+                data = memoryview(b"".join(lines))
+                while data:
+                    data = data[self._file.write(data):]
+                if unflushed >= _FLUSH_SECONDS or closing:
+                    os.fsync(self._file.fileno())
+                    unflushed = 0.0
+            except OSError as error:
+                self._error = error
+                return
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            told = machine_error(self._error, self.path)
+            raise WorkError(f"{self.path} could not be written ({self._error.strerror}).",
+                            f"{told.why if told else ''} What was appended last is lost.".strip(),
+                            told.fix if told else "Make room on the disk.") from self._error
+
+
+def stream_lines(path: Path) -> Iterator[str]:
+    """Read a stream's whole lines, also while it grows; a torn last one is left out."""
+    with open(path, "rb") as stream:
+        for line in stream:
+            if not line.endswith(b"\n"):
+                return
+            yield line[:-1].decode("utf-8", errors="replace")
+
+
+def _cut_torn_line(path: Path) -> int:
+    """Cut away what stands behind the last line end; returns how many bytes that were."""
+    if not path.exists():
+        return 0
+    with open(path, "rb+") as stream:
+        size = end = stream.seek(0, os.SEEK_END)
+        while end > 0:
+            start = max(end - _TAIL_BYTES, 0)
+            stream.seek(start)
+            place = stream.read(end - start).rfind(b"\n")
+            if place >= 0:
+                end = start + place + 1
+                break
+            end = start
+        if end < size:
+            stream.truncate(end)
+            os.fsync(stream.fileno())
+        return size - end

@@ -1,0 +1,338 @@
+"""What stages read from a branch folder, as the values that the packages below take.
+
+The packages know no folder: whatever of a branch's mesh, masses, axes and pulls goes into a
+computation comes through here.
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Annotated, Any, TypedDict, Unpack
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.core.alignment import Alignment
+from limber.core.constants import FOUND_SKELETON, UNIT_METRES
+from limber.core.errors import InputError
+from limber.core.files.reading import read_json_as
+from limber.core.progress import SILENT, Progress
+from limber.estimation.estimated_branch import Subject, observed, subject_of
+from limber.estimation.settings import EstimateSettings
+from limber.geometry.io.skeletons import read_cylinders, read_skeleton, read_swc
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added_masses import HungTwig, PointMass
+from limber.mechanics.loads.loaded_branch import LoadedBranch, NamedTarget, hang, target_masses
+from limber.mechanics.materials.materials import Material, RayleighDamping
+from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
+from limber.planning.field.grasp_model import GraspModel, grasp_model_of
+from limber.recordings.recording import Pull, read_pull
+from limber.recordings.sensor_checks import clean
+from limber.store import Branch
+
+TARGETS_FORMAT = 1
+"""Version of ``targets.json``."""
+
+_Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Vector = tuple[_Coordinate, _Coordinate, _Coordinate]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+
+class _Mass(_Entry):
+    mass_kg: float = Field(ge=0)
+    attached_m: _Vector
+    centre_m: _Vector | None = None
+    inertia_kg_m2: tuple[_Vector, _Vector, _Vector] | None = None
+
+
+class _Target(_Entry):
+    name: str
+    position_m: _Vector
+    mass_kg: float = Field(ge=0)
+
+
+class _Targets(_Entry):
+    format_version: int
+    targets: list[_Target]
+
+
+def load_mesh(branch: Branch) -> TetMesh:
+    """Return the branch's tetrahedra.
+
+    Raises:
+        BranchFolderError: there is no mesh.
+    """
+    return TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
+
+
+def load_skeleton(branch: Branch) -> Skeleton:
+    """Return the branch's axes, with what is known of how sure they are.
+
+    Raises:
+        BranchFolderError: there is no skeleton.
+    """
+    if branch.has("skeleton.csv"):
+        return read_cylinders(branch.path("skeleton.csv"))
+    return read_swc(branch.require("skeleton.swc", "reconstruct"))
+
+
+def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skeleton:
+    """Return the axes as reconstruct found them, before edits, in the frame of ``alignment`` [m].
+
+    Args:
+        unit: Of the scan's file, in which they are kept.
+
+    Raises:
+        BranchFolderError: they are not kept: an older Limber made the branch.
+    """
+    found = read_skeleton(branch.require(f"{FOUND_SKELETON}.csv", "reconstruct"),
+                          scale=UNIT_METRES[unit])
+    return found.moved(alignment.apply(found.nodes / alignment.scale))
+
+
+def load_masses(branch: Branch) -> list[dict[str, Any]]:
+    """Return what reconstruct found beside the mesh: twigs left out of it, and leaves."""
+    if not branch.has("point_masses.json"):
+        return []
+    found = read_json_as(branch.path("point_masses.json"), list[_Mass], "a list of masses")
+    return [mass.model_dump(exclude_unset=True, exclude_none=True) for mass in found]
+
+
+def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
+    """Return what hung on the branch when it was scanned, and its mesh leaves out.
+
+    Twigs and leaves, as stiff bodies that go with the section they grow from; masses that somebody
+    has stated in a table; and targets.
+    """
+    return (*(_hung(mass) for mass in load_masses(branch)), *target_masses(load_targets(branch)))
+
+
+def _hung(mass: dict[str, Any]) -> PointMass:
+    if mass.get("kind") == "table":
+        return PointMass(tuple(mass["attached_m"]), mass["mass_kg"])
+    x, y, z = map(tuple, mass.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))
+    return HungTwig(tuple(mass.get("centre_m", mass["attached_m"])), mass["mass_kg"],
+                    tuple(mass["attached_m"]), (x, y, z))
+
+
+def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
+    """Return the named places on the branch, as `limber target` has written them.
+
+    Raises:
+        InputError: the file is of a newer program.
+    """
+    if not branch.has("targets.json"):
+        return ()
+    known = read_json_as(branch.path("targets.json"), _Targets, "a list of targets")
+    if known.format_version != TARGETS_FORMAT:
+        raise InputError(f"{branch.folder}/targets.json has format {known.format_version}.",
+                         f"This program knows format {TARGETS_FORMAT}.", "Update Limber.")
+    return tuple(NamedTarget(t.name, t.position_m, t.mass_kg) for t in known.targets)
+
+
+def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
+    """Return the place of the grasp that the mesh marks [m], None where it is not known."""
+    made = next((branch.manifest.stages[key] for key in ("reconstruct", "mesh")
+                 if key in branch.manifest.stages), None)
+    fraction = made.settings.get("grasp_fraction") if made else None
+    if fraction is None or not branch.has("skeleton.swc"):
+        return None
+    x, y, z = map(float, load_skeleton(branch).point_at(float(fraction)))
+    return x, y, z
+
+
+class ModelOptions(TypedDict, total=False):
+    """Options of a branch's model, as of BranchModel."""
+
+    material: str | Material
+    damping: RayleighDamping
+    lumped_mass: bool
+
+
+class Overrides(ModelOptions, total=False):
+    """What of a branch's model may be asked for instead of what its folder says."""
+
+    young: float | np.ndarray | None
+    poisson: float | np.ndarray | None
+    density: float | np.ndarray | None
+    point_masses: Iterable[PointMass] | None
+
+
+def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SILENT,
+                **overrides: Unpack[Overrides]) -> LoadedBranch:
+    """Return the branch as everything computes on it: as it hangs, with targets and grasp.
+
+    Args:
+        gravity: Whether it has any weight.
+        progress: Is told where it cannot carry itself and its weight is left out.
+        overrides: As for :func:`load_model`.
+
+    Raises:
+        BranchFolderError: there is no mesh. InputError: it lacks material data.
+    """
+    model = load_model(branch, gravity=gravity, **overrides)
+    loaded = hang(model, load_targets(branch), progress=progress)
+    return replace(loaded, grasp_point=load_grasp_point(branch))
+
+
+def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDamping:
+    """Return the damping that the last swing told, else what simulations take, with a warning."""
+    swings = [branch.manifest.stages[key] for key in ("swing", "vibration")
+              if key in branch.manifest.stages]
+    known = max(swings, key=lambda entry: entry.finished).result if swings else {}
+    mass, stiffness = known.get("damping_mass_per_s"), known.get("damping_stiffness_s")
+    if (isinstance(mass, int | float) and isinstance(stiffness, int | float)
+            and mass >= 0 and stiffness >= 0):
+        return RayleighDamping(float(mass), float(stiffness))
+    progress.warn("No swing has told the damping; that of simulations is taken.")
+    return DEFAULT_DAMPING
+
+
+def young_deviation(branch: Branch) -> float | None:
+    """Return the standard deviation of log E that the last estimate, swing or ringing left, taken
+    as one for all moduli; None where nothing has told it.
+
+    Raises:
+        InputError: ``estimate.json`` is damaged.
+    """
+    told = {key: branch.manifest.stages[key] for key in ("estimate", "swing", "vibration")
+            if key in branch.manifest.stages}
+    last = max(told, key=lambda key: told[key].finished, default=None)
+    if last in ("swing", "vibration"):
+        interval = told[last].result.get("young_interval_pa")
+        if isinstance(interval, list) and len(interval) == 2 and all(
+                isinstance(end, int | float) and end > 0 for end in interval):
+            return abs(math.log(interval[1] / interval[0])) / (2 * 1.96)
+    if not branch.has("estimate.json"):
+        return None
+    from limber.estimation.estimate_file import read_estimate
+
+    known = read_estimate(branch.path("estimate.json"))
+    total = [value for value in (known.get("young_deviation") or {}).get("total") or []
+             if value is not None]
+    return float(np.mean(total)) if total else None
+
+
+def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarray | None = None,
+               poisson: float | np.ndarray | None = None,
+               density: float | np.ndarray | None = None,
+               point_masses: Iterable[PointMass] | None = None,
+               **options: Unpack[ModelOptions]) -> BranchModel:
+    """Return the model of a branch folder's ``mesh.vtu``.
+
+    The mesh is taken as the shape without load: see :func:`load_branch`. Gravity is that of the
+    scan, which the upright turn has turned with the branch; what its mesh leaves out hangs on it.
+
+    Args:
+        gravity: Whether the branch has any weight.
+        young, poisson, density, point_masses: Instead of those of the folder.
+        options: As for BranchModel.
+
+    Raises:
+        BranchFolderError: there is no mesh. InputError: it lacks material data.
+    """
+    mesh = load_mesh(branch)
+
+    def known(name: str, value: float | np.ndarray | None) -> float | np.ndarray:
+        if value is not None:
+            return value
+        if name not in mesh.cell_data:
+            raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
+                             "The material is not known.", "Reconstruct again.")
+        return mesh.cell_data[name]
+
+    return BranchModel(
+        mesh, young=known("young", young), poisson=known("poisson", poisson),
+        density=known("density", density), gravity=branch.gravity if gravity else None,
+        point_masses=load_point_masses(branch) if point_masses is None else point_masses,
+        **options)
+
+
+def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILENT) -> GraspModel:
+    """Return what planning asks of a branch.
+
+    See :func:`limber.planning.field.grasp_model.grasp_model_of`.
+
+    Raises:
+        BranchFolderError: a file is missing. InputError: the mesh lacks material or grasp.
+    """
+    return grasp_model_of(load_branch(branch, gravity=gravity, progress=progress),
+                          load_skeleton(branch))
+
+
+def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
+    """Return the branch that is estimated; the start is uniform.
+
+    Raises:
+        BranchFolderError: a file is missing. InputError: its moduli are not positive.
+    """
+    return subject_of(load_mesh(branch), load_skeleton(branch), load_point_masses(branch),
+                      branch.gravity, settings)
+
+
+def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bool) -> Subject:
+    """Return the branch as an estimate took it, so that the numbers it found mean the same.
+
+    Args:
+        known: Content of ``estimate.json``.
+        gravity: Whether the branch's weight acts, if the estimate did not have to leave it out.
+    """
+    subject = load_subject(branch, EstimateSettings(
+        fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
+        field="open" if known.get("field_form") else "inverse_distance"))
+    if subject.field is not None and known.get("field_form_deviations") is None:
+        return replace(subject, field=subject.field.same_at_any_step())
+    return subject
+
+
+def known_pulls(branch: Branch) -> list[str]:
+    """Return the names of the branch's pulls, sorted."""
+    return [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
+
+
+def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
+    """Return the pulls to use, checked.
+
+    Raises:
+        InputError: there are none, or one that was asked for is missing.
+    """
+    known = known_pulls(branch)
+    missing = [name for name in settings.pull if name not in known]
+    if missing or not known:
+        raise InputError(
+            f"{branch.folder} has no pull {', '.join(missing)}." if missing
+            else f"{branch.folder} has no pulls.",
+            f"It has {', '.join(known)}." if known else "There is nothing to estimate from.",
+            "Bring one in with `limber import-pull`, or simulate one with `limber virtual-pull`.")
+    return list(settings.pull) or known
+
+
+def pulls_digest(branch: Branch, names: list[str]) -> str:
+    """Return a sha256 of all files of these pulls."""
+    joined = hashlib.sha256()
+    for file in sorted(branch.manifest.files):
+        if any(file.startswith(f"pulls/{name}/") for name in names):
+            joined.update(f"{file} {branch.digest(file)}\n".encode())
+    return joined.hexdigest()
+
+
+def load_pulls(branch: Branch, names: list[str], subject: Subject, settings: EstimateSettings,
+               progress: Progress = SILENT) -> list[Pull]:
+    """Read and clean pulls; find control points in their images where there are no markers."""
+    pulls = []
+    for number, name in enumerate(names):
+        folder = branch.path(f"pulls/{name}")
+        pull = read_pull(folder)
+        if pull.entry.observation in ("clouds", "depth"):
+            pull = observed(folder, pull, subject, settings,
+                            progress.part(number / len(names), (number + 1) / len(names)))
+        pull = clean(pull)
+        for message in pull.warnings:
+            progress.warn(message)
+        pulls.append(pull)
+    return pulls
