@@ -159,8 +159,8 @@ HEAVY = {"numpy", "pydantic", "scipy", "numba", "rich", "trimesh", "matplotlib"}
     (["estimate"], {"scipy", "numba", "trimesh", "matplotlib"})])
 def test_help_is_quick_and_imports_nothing_heavy(arguments, heavy):
     """`limber --help` loads none of the packages that take long; a stage's no numerical one."""
-    program = ("import sys; from limber import cli\n"
-               f"assert cli.call({[*arguments, '--help']}) == 0\n"
+    program = ("import sys; from limber.cli import main\n"
+               f"assert main.call({[*arguments, '--help']}) == 0\n"
                f"assert not {heavy} & set(sys.modules), {heavy} & set(sys.modules)")
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True)
     assert done.returncode == 0, done.stderr
@@ -170,12 +170,12 @@ def test_help_is_quick_and_imports_nothing_heavy(arguments, heavy):
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_ends_with_130(kind):
     """Ctrl-C and SIGTERM end a running command with 130 and the cancelled status."""
-    program = ("import time\nfrom limber import cli\n"
+    program = ("import time\nfrom limber.cli import main\n"
                "def function(run, **_):\n"
                "    'Probe.'\n"
                "    print('ready', flush=True); time.sleep(30)\n"
-               "cli._terminate_like_interrupt()\n"
-               "cli.stage_command('probe')(function).main(['--json'], standalone_mode=False)")
+               "main._terminate_like_interrupt()\n"
+               "main.stage_command('probe')(function).main(['--json'], standalone_mode=False)")
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True,
                                stderr=subprocess.DEVNULL)
     assert process.stdout.readline().strip() == "ready"

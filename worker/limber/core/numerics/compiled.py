@@ -44,16 +44,12 @@ def _writable(folder: Path) -> Path | None:
 
 @functools.cache
 def _layout() -> str:
-    """Digest of the modules' names and of how kernels are compiled.
+    """Digest of how kernels are compiled.
 
-    numba finds by itself that a kernel's source has changed. A kernel kept for a module that has
-    been renamed since would fail to load; one that was compiled otherwise would be used.
+    numba finds by itself that a kernel's source has changed; one that was compiled otherwise would
+    be used.
     """
-    package = Path(__file__).parent
-    names = sorted(path.relative_to(package).as_posix() for path in package.rglob("*.py"))
-    digest = hashlib.sha256("\n".join(names).encode())
-    digest.update(Path(__file__).read_bytes())
-    return digest.hexdigest()[:12]
+    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
 
 
 def compiled(function: Callable) -> Callable:
