@@ -20,6 +20,9 @@ BIN = Path(sys.prefix) / ("Scripts" if os.name == "nt" else "bin")
 PYTEST = [sys.executable, "-m", "pytest"]
 NO_TESTS = 5
 """pytest's exit code where no test was selected."""
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+# As many tests at once as there are cores to run them: tests of the robot wait 5 s for a process.
+SIDE_BY_SIDE = ["-n", str(min(CORES, 2)), "--dist", "worksteal"]
 
 
 @dataclass
@@ -66,13 +69,12 @@ def command(name: str, words: list) -> Part:
 def tests(fast: bool, others: list[str]) -> list[Part]:
     """The tests: those chosen by pytest's own arguments, the quick ones, or all."""
     if fast:
-        return [pytest_part("tests", ["-n", "2", "--dist", "worksteal", "-m",
+        return [pytest_part("tests", [*SIDE_BY_SIDE, "-m",
                                       "not slow and not real_time and not real_blender", *others])]
     if others:
         return [pytest_part("tests", others)]
     return [
-        pytest_part("tests", ["-n", "2", "--dist", "worksteal", "-m", "not real_time",
-                              "--durations", "20"]),
+        pytest_part("tests", [*SIDE_BY_SIDE, "-m", "not real_time", "--durations", "20"]),
         # These follow clocks of 2 and 8 ms: beside another test they would measure the machine.
         # Another program's burst can delay one of them as well, so a failed one is tried once more.
         pytest_part("real time", ["tests/robot", "-m", "real_time", "--durations", "5"],
