@@ -140,7 +140,8 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-NUMERICAL = ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation", "planning")
+NUMERICAL = ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation",
+             "planning")
 # The same between the parts of two packages; what is a plain file there is not ordered.
 PARTS = {"core": ("numerics", "files", "processes"),
          "geometry": ("cloud", "skeleton", "surface", "tets"),
