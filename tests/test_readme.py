@@ -1,6 +1,6 @@
-"""Every command that the README shows is one that Limber understands.
+"""Every command that README and guide show is one that Limber understands; links lead somewhere.
 
-They are run by `scripts/bench worker --only readme`.
+`scripts/bench worker --only readme` runs those of the README.
 """
 
 import re
@@ -13,15 +13,21 @@ import pytest
 from benchmarks.worker_readme import shown_commands
 from limber.cli.main import main
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+GUIDE = sorted(path for path in (ROOT / "worker" / "docs").rglob("*.md")
+               if path.name not in ("commands.md", "pull_toml.md", "cell_toml.md"))
+"""Without the pages that are written from the code."""
 
 
 def _commands() -> list[str]:
-    return shown_commands(README.read_text(encoding="utf-8"))
+    lines = [line for path in (README, *GUIDE)
+             for line in shown_commands(path.read_text(encoding="utf-8"))]
+    return list(dict.fromkeys(lines))
 
 
 @pytest.mark.parametrize("line", _commands())
-def test_a_command_of_the_readme_is_understood(line):
+def test_a_shown_command_is_understood(line):
     """Its options are there and take what is given; nothing is run."""
     _, name, *words = shlex.split(line)
     command = main.get_command(click.Context(main), name)
@@ -33,14 +39,34 @@ def test_a_command_of_the_readme_is_understood(line):
     command.make_context(name, words)
 
 
-def test_the_readme_shows_commands():
-    """The lines are found at all."""
-    assert len(_commands()) > 15
+def test_the_readme_is_short_and_shows_commands():
+    """It is read in a minute: at most 150 lines, no sentence of over 30 words."""
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    assert len(shown_commands(text)) > 5
+    prose = re.sub(r"^```.*?^```|^\|.*?$|^#.*?$|^!?\[.*?$|^- .*?(?=\n\n)", "", text,
+                   flags=re.MULTILINE | re.DOTALL)
+    prose = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", prose)
+    long = [sentence for sentence in re.split(r"(?<=[.:!?])\s+|\n\n", prose)
+            if len(sentence.split()) > 30]
+    assert not long
+
+
+@pytest.mark.parametrize("path", [README, ROOT / "CONTRIBUTING.md", *GUIDE],
+                         ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    """Every relative link of README and guide is a file that is there, or is written from code."""
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"),
+                  flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)#:]+?)(?:#[^)]*)?\)", text):
+        found = path.parent / target
+        assert found.exists() or found.name in ("commands.md", "pull_toml.md", "cell_toml.md"), (
+            f"{path.name} links {target}")
 
 
 def test_every_command_has_an_example():
     """Whatever `limber --help` lists is shown once."""
-    text = README.read_text(encoding="utf-8")
+    text = "\n".join(path.read_text(encoding="utf-8") for path in (README, *GUIDE))
     lacking = [name for name in main.list_commands(click.Context(main))
                if not re.search(rf"limber {name}[ `\n]", text)]
     assert not lacking

@@ -11,7 +11,8 @@ HEAVY = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.ndimage", 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", ["estimation.fit", "planning.plan", "geometry.reconstruct"])
+@pytest.mark.parametrize("module", ["estimation.fit", "planning.make_plan",
+                                    "geometry.reconstruction"])
 def test_what_is_heavy_waits_for_its_first_use(module):
     """``scipy.optimize.minimize(...)`` imports scipy's part when it is called, and not before."""
     code = f"import limber.{module}, sys; print([name for name in {HEAVY} if name in sys.modules])"

@@ -103,8 +103,9 @@ def test_top_level_is_as_designed():
                              check=True).stdout.splitlines()
     top = {name.split("/")[0] for name in tracked}
     allowed = {"addon", "worker", "tests", "blend_files", "scripts", ".ci", "README.md",
-               "CHANGELOG.md", "LICENSE", "MANIFEST.in", "pyproject.toml", "requirements.lock",
-               "setup.py", ".gitignore", ".gitattributes", ".pre-commit-config.yaml"}
+               "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in",
+               "pyproject.toml", "requirements.lock", "setup.py", ".gitignore",
+               ".gitattributes", ".pre-commit-config.yaml"}
     assert top <= allowed
 
 

@@ -33,7 +33,7 @@ class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
         return str(self._folder)
 
     def finish(self, context, result):
-        context.scene.limber.results.scene.animation = self.pull
+        context.scene.limber.scene.motion = self.pull
         bpy.ops.limber.open_result(
             "EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT",
             directory=str(self._folder))

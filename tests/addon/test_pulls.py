@@ -87,7 +87,7 @@ def test_it_is_hidden_and_gone_with_its_pull(bpy, opened, pulled, tmp_path):
     """A button hides it; another motion of the branch does not have it."""
     bpy.ops.limber.show(group="observed", hide=True)
     assert _mark(bpy).hide_viewport and _mark(bpy).hide_render
-    bpy.context.scene.limber.results.scene.animation = ""
+    bpy.context.scene.limber.scene.motion = ""
     bpy.ops.limber.open_result(directory=str(pulled.folder))
     assert "Measured point 1" not in bpy.data.objects
     assert part("branches").info_of(part("branches").find_surface(bpy.context.scene))[
@@ -131,7 +131,7 @@ def test_a_pull_of_the_example_is_replayed(bpy, worker_here, tmp_path):
     assert bpy.ops.limber.replay_pull(pull="pull-1") == {"FINISHED"}
     info = part("branches").info_of(part("branches").find_surface(scene))
     assert info["observation"] == {"pull": "pull-1", "is_shown": True}
-    assert "residual" in info["frame_scalars"] and scene.limber.results.scene.animation == "pull-1"
+    assert "residual" in info["frame_scalars"] and scene.limber.scene.motion == "pull-1"
     points = [thing for thing in scene.objects if thing.name.startswith("Measured point")]
     assert len(points) == 4
     high = info["frame_scalars"]["residual"]["high"]

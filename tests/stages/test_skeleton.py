@@ -125,7 +125,7 @@ def test_edits_in_the_branchs_frame_come_after_those_before(made, tmp_path) -> N
 _DYING = """
 import os, sys
 from pathlib import Path
-from limber.geometry import reconstruct as reconstruction
+from limber.geometry import reconstruction
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.shape.reconstruct import reconstruct
 reconstruction.mesh_skeleton = lambda *given: os._exit(9)

@@ -1,0 +1,131 @@
+"""A Sphinx extension: reference pages written from the code, so that they cannot go stale.
+
+`commands.md` comes from the stages' schemas and the other commands' options; `pull_toml.md` and
+`cell_toml.md` from the models that read those files.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import click
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+HERE = Path(__file__).parent
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Write the pages before Sphinx reads its sources."""
+    app.connect("builder-inited", lambda _app: write_pages(HERE / "reference"))
+    return {"parallel_read_safe": True}
+
+
+def write_pages(folder: Path) -> None:
+    """Write all generated pages into ``folder``; a page that has not changed is not touched."""
+    for name, text in pages().items():
+        path = folder / name
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each generated page by its file name."""
+    from limber.recordings.recording import PullEntry
+    from limber.robot.cell.cell import Cell
+
+    return {
+        "commands.md": commands_page(),
+        "pull_toml.md": _model_page("pull.toml", PullEntry, (
+            "The settings of a recording, in `pulls/NAME/pull.toml`. `limber import-pull` and "
+            "`limber record` write it; you may also write it by hand.")),
+        "cell_toml.md": _model_page("The cell file", Cell, (
+            "`cell.toml` says which robot stands where, what it holds, and what it must not "
+            "exceed. Lengths are in metres, angles in radians, masses in kilograms.")),
+    }
+
+
+def commands_page() -> str:
+    """Return the page of all commands with all of their options."""
+    from limber.cli.main import main
+
+    parts = ["# Commands\n",
+             "Every command prints this with `limber COMMAND --help-all`. Exit codes: 0 done, 2 "
+             "wrong usage or input, 3 the work failed, 4 stopped for safety, 130 cancelled.\n"]
+    context = click.Context(main, info_name="limber")
+    for name in main.list_commands(context):
+        parts.extend(_command(f"limber {name}", main.get_command(context, name)))
+    return "\n".join(parts) + "\n"
+
+
+def _command(name: str, command: click.Command | None) -> list[str]:
+    assert command is not None, name
+    summary = (command.help or "").split("\n\n")[0].replace("\n", " ")
+    parts = [f"## {name}\n", f"{_escaped(summary)}\n"]
+    if isinstance(command, click.Group):
+        context = click.Context(command, info_name=name)
+        for child in command.list_commands(context):
+            lines = _command(f"{name} {child}", command.get_command(context, child))
+            parts += [f"#{line}" if line.startswith("## ") else line for line in lines]
+        return parts
+    rows = [_option_row(option) for option in command.params]
+    if rows:
+        parts += ["| option | meaning | default |", "|---|---|---|", *rows, ""]
+    return parts
+
+
+def _option_row(option: click.Parameter) -> str:
+    names = ", ".join(f"`{word}`" for word in [*option.opts, *option.secondary_opts])
+    if isinstance(option, click.Argument):
+        names = f"`{option.make_metavar(click.Context(click.Command('limber')))}`"
+    default = option.default
+    shown = "" if default is None or default is False or callable(default) or "Sentinel" in str(
+        type(default)) else f"`{default}`"
+    return f"| {names} | {_escaped(getattr(option, 'help', None) or '')} | {_escaped(shown)} |"
+
+
+def _model_page(title: str, model: type[BaseModel], introduction: str) -> str:
+    parts = [f"# {title}\n", f"{introduction}\n", *_table("", model)]
+    return "\n".join(parts) + "\n"
+
+
+def _table(prefix: str, model: type[BaseModel]) -> list[str]:
+    """Rows of a model's own entries, then a section for each model inside it."""
+    rows, inner = [], []
+    for name, field in model.model_fields.items():
+        child = _child(field)
+        if child is not None:
+            inner.append((f"{prefix}{name}", child))
+            continue
+        rows.append(f"| `{name}` | {_kind(field)} | {_default(field)} "
+                    f"| {_escaped(field.description or '')} |")
+    parts = []
+    if rows:
+        parts = ["| key | type | default | meaning |", "|---|---|---|---|", *rows, ""]
+    for name, child in inner:
+        told = (child.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
+        parts += [f"## [{name}]\n", f"{_escaped(' '.join(told.split()))}\n",
+                  *_table(f"{name}.", child)]
+    return parts
+
+
+def _child(field: FieldInfo) -> type[BaseModel] | None:
+    """The model that an entry holds, if it holds just one."""
+    kinds = [field.annotation, *getattr(field.annotation, "__args__", ())]
+    models = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
+    return models[0] if len(models) == 1 else None
+
+
+def _kind(field: FieldInfo) -> str:
+    kind = field.annotation
+    text = kind.__name__ if isinstance(kind, type) else str(kind)
+    for word in ("typing.", "NoneType"):
+        text = text.replace(word, "")
+    return f"`{text}`".replace("|", "\\|")
+
+
+def _default(field: FieldInfo) -> str:
+    return "required" if field.is_required() else f"`{field.default!r}`".replace("|", "\\|")
+
+
+def _escaped(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
