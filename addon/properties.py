@@ -9,7 +9,6 @@ import numpy as np
 from . import branches, compat
 from .overlays import graph as viewport_graph
 from .stages import Field, SettingError, Stage, rows_of, stages
-from .steps import DRY_RUNS, NOT_FROM_HERE
 
 OPEN = "use_"
 """Before the name of a field that may be left open: whether it is given."""
@@ -220,8 +219,9 @@ def arguments_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> list[str]
         SettingError: what is required is missing, or a text is no list of what it should be.
     """
     values = values_of(group_of(scene, stage), stage)
-    for name in NOT_FROM_HERE.get(stage.name, ()):
-        values.pop(name)
+    for field in stage.fields.values():
+        if not field.is_kept:
+            values.pop(field.name)
     return stage.arguments({**values, "branch_folder": folder})
 
 
@@ -242,8 +242,7 @@ def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dic
     """
     common = ("status", "error", "warnings", "seconds", "arguments")
     kept = {name: outcome[name] for name in common if name in outcome}
-    if stage.name in DRY_RUNS or not stage.keeps_entry(
-            values_of(group_of(scene, stage), stage, {"name"})):
+    if not stage.keeps_entry(values_of(group_of(scene, stage), stage, {"name"})):
         kept["result"] = {name: value for name, value in outcome.items()
                           if name not in (*common, "command")}
     group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})

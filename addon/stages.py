@@ -1,10 +1,12 @@
 """What the worker's stages take, read from ``stages.json``: the one source of panels and settings.
 
 ``limber schema`` writes that file (``scripts/make_addon_schema``), so that the add-on knows every
-setting without a worker. No bpy here.
+setting without a worker; ``LIMBER_STAGES`` names another, where the worker has stages of other
+packages. No bpy here.
 """
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -14,7 +16,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = 1
-_FILE = Path(__file__).with_name("stages.json")
+_FILE = Path(os.environ.get("LIMBER_STAGES") or Path(__file__).with_name("stages.json"))
 
 
 class SettingError(ValueError):
@@ -39,6 +41,7 @@ class Field:
         is_optional: It may be left open.
         is_argument: Given on the command line without its name.
         is_expert: Shown on demand only.
+        is_kept: False where no panel keeps it: it is typed each time, or has a button of its own.
         choices: Of a choice.
         least, most: Bounds of a number, or None; ``is_open`` says that ``least`` itself is out.
         length: Of a vector.
@@ -55,6 +58,7 @@ class Field:
     is_optional: bool = False
     is_argument: bool = False
     is_expert: bool = False
+    is_kept: bool = True
     choices: tuple[str, ...] = ()
     least: float | None = None
     most: float | None = None
@@ -105,7 +109,11 @@ class Field:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the worker: its fields by name, and what it reads and writes."""
+    """A stage of the worker: its fields by name, and what it reads and writes.
+
+    ``step`` names its panel (nothing: it has none), ``label`` is what its button says,
+    ``moves_robot`` whether it does: ``always``, ``when armed`` or nothing.
+    """
 
     name: str
     summary: str
@@ -114,15 +122,31 @@ class Stage:
     writes: tuple[str, ...]
     fields: dict[str, Field]
     settings: frozenset[str]
+    step: str
+    label: str
+    moves_robot: str
+
+    @property
+    def makes_branch(self) -> bool:
+        """Whether it makes a branch folder; all others work in one."""
+        return "branch_folder" not in self.fields
+
+    @property
+    def own_fields(self) -> list[Field]:
+        """What a panel asks for: all but the branch folder, which the scene gives."""
+        folder = "output" if self.makes_branch else "branch_folder"
+        return [field for field in self.fields.values() if field.is_kept and field.name != folder]
 
     def keeps_entry(self, values: Mapping[str, Any]) -> bool:
         """Whether the branch folder knows the result of a run with these values."""
-        return bool(self.key) and ("{name}" not in self.key or bool(values.get("name")))
+        is_dry_run = self.moves_robot == "when armed"
+        return bool(self.key) and not is_dry_run and (
+            "{name}" not in self.key or bool(values.get("name")))
 
     def groups(self) -> dict[str, list[Field]]:
-        """Return the fields by the title of their group, in the worker's order."""
+        """Return what a panel asks for by the title of its group, in the worker's order."""
         found: dict[str, list[Field]] = {}
-        for field in self.fields.values():
+        for field in self.own_fields:
             found.setdefault(field.group, []).append(field)
         return found
 
@@ -177,7 +201,8 @@ def _stage(name: str, told: dict[str, Any]) -> Stage:
         for field, about in told[part].get("properties", {}).items():
             fields[field] = _field(field, about, is_required=field in required)
     return Stage(name, told["summary"], told["key"], tuple(told["reads"]), tuple(told["writes"]),
-                 fields, frozenset(told["settings"].get("properties", {})))
+                 fields, frozenset(told["settings"].get("properties", {})),
+                 told["step"], told["label"], told["moves_robot"])
 
 
 def _field(name: str, about: dict[str, Any], *, is_required: bool) -> Field:
@@ -189,6 +214,7 @@ def _field(name: str, about: dict[str, Any], *, is_required: bool) -> Field:
         unit=about.get("unit", ""), default=about.get("default"), is_required=is_required,
         is_optional=not is_required and about.get("default") is None,
         is_argument=about.get("argument", False), is_expert=about["expert"],
+        is_kept=about.get("panel", True),
         choices=tuple(kind.get("enum", ())), least=least,
         most=kind.get("maximum", kind.get("exclusiveMaximum")),
         is_open="exclusiveMinimum" in kind,

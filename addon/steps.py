@@ -1,22 +1,14 @@
 """The steps of the work: which stages stand in which panel, and how far each of them is. No bpy.
 
-Everything about a stage itself comes from its schema; here is only where the user meets it.
+Everything about a stage itself comes from its schema, also the step that it stands in; here are
+the steps.
 """
 
 import enum
 from dataclasses import dataclass
 
-FROM_SCENE = frozenset({"branch_folder", "output", "data", "render"})
-"""Inputs that the add-on gives itself: no panel asks for them."""
-SHOWN_FILES = {"export": frozenset({"output"}), "skeleton": frozenset({"output"})}
-"""Of those, what a stage does ask for: a file that is for other programs."""
-NOT_FROM_HERE = {"execute": frozenset({"arm", "confirm", "after_stop"}),
-                 "record": frozenset({"confirm", "after_stop"}), "simulate": frozenset({"pull"})}
-"""What no panel keeps: that a robot may move is typed each time, a pull has a button of its own."""
-DRY_RUNS = frozenset({"execute"})
-"""Stages of which the add-on's button runs a part that the branch folder keeps no result of."""
-MOVES_ROBOT = frozenset({"record"})
-"""Stages whose button asks for a name to be typed first."""
+from .stages import stages
+
 WAYS = frozenset({"move"})
 """Vectors in metres that say how far, not where: the 3D cursor does not give them."""
 REGIONS = ("goal", "tip_goal", "target_box", "workspace_low")
@@ -47,17 +39,16 @@ class StepState(enum.Enum):
 
 @dataclass(frozen=True)
 class StageView:
-    """A stage in a step: the label of its button, and the groups of settings shown with it."""
+    """A stage in a step, and the groups of settings shown with it."""
 
     stage: str
-    label: str
     groups: tuple[str, ...] | None = None
     """None: all."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One panel: its stage, the groups of others that belong to it, and further stages.
+    """One panel: its first stage, and the groups of another that belong to it.
 
     ``scene_operator`` stands instead of the stage's button where the step itself runs none.
     """
@@ -65,62 +56,34 @@ class Step:
     name: str
     title: str
     view: StageView
-    others: tuple[StageView, ...] = ()
     settings_of: tuple[StageView, ...] = ()
     scene_operator: tuple[str, str] = ()
     hint: str = ""
 
+    @property
+    def others(self) -> tuple[StageView, ...]:
+        """The further stages that stand in this step, as their schemas say."""
+        return tuple(StageView(stage.name) for stage in stages().values()
+                     if stage.step == self.name and stage.name != self.view.stage)
+
 
 STEPS = (
-    Step("scan", "Scan", StageView("reconstruct", "", ("input",)),
+    Step("scan", "Scan", StageView("reconstruct", ("input",)),
          scene_operator=("limber.import_cloud", "Import Scan")),
-    Step("skeleton", "Skeleton", StageView("reconstruct", "Reconstruct", ("shape", "running")),
-         others=(StageView("skeleton", "Review and Edit"),)),
-    Step("mesh", "Mesh", StageView("reconstruct", "Reconstruct", ("mesh",)),
-         others=(StageView("mesh", "Mesh a Closed Surface"),),
+    Step("skeleton", "Skeleton", StageView("reconstruct", ("shape", "running"))),
+    Step("mesh", "Mesh", StageView("reconstruct", ("mesh",)),
          hint="Made together with the skeleton"),
-    Step("material", "Material", StageView("reconstruct", "", ("material",)),
-         others=(StageView("simulate", "Simulate a Motion"),
-                 StageView("load", "Wind, Snow, Fruit, Cuts")),
+    Step("material", "Material", StageView("reconstruct", ("material",)),
          scene_operator=("limber.color_by", "Show Young's Modulus")),
-    Step("pulls", "Pulls", StageView("import-pull", "Import Pull"),
-         others=(StageView("virtual-pull", "Simulate a Pull"),
-                 StageView("record", "Record a Pull"),
-                 StageView("export-pull", "Export a Pull"))),
-    Step("estimate", "Estimate", StageView("estimate", "Estimate"),
-         others=(StageView("swing", "Fit a Free Swing"),
-                StageView("vibration", "Fit Natural Frequencies"),
-                StageView("predict", "Predict Another Load"),
-                StageView("suggest-pull", "Suggest the Next Pull"))),
-    Step("goal", "Goal", StageView("energy", "Sample the Energy"),
-         settings_of=(StageView("plan", "", ("start and goal",)),),
-         others=(StageView("target", "Name a Target"),)),
-    Step("plan", "Plan", StageView("plan", "Plan Path", (
+    Step("pulls", "Pulls", StageView("import-pull")),
+    Step("estimate", "Estimate", StageView("estimate")),
+    Step("goal", "Goal", StageView("energy"),
+         settings_of=(StageView("plan", ("start and goal",)),)),
+    Step("plan", "Plan", StageView("plan", (
         "output", "weights and limits", "timing", "solver", "running"))),
-    Step("robot", "Robot", StageView("execute", "Check With Robot"),
-         hint="A dry run first: nothing moves"),
-    Step("report", "Report", StageView("report", "Write Report"),
-         others=(StageView("export", "Export for Other Programs"),)),
+    Step("robot", "Robot", StageView("execute"), hint="A dry run first: nothing moves"),
+    Step("report", "Report", StageView("report")),
 )
-
-RUN = tuple(dict.fromkeys(view.stage for step in STEPS for view in (step.view, *step.others)))
-"""The stages that the add-on can run."""
-NOT_RUN_HERE = {
-    "generate": "it makes scans, no branch",
-    "scene": "`limber.open_result` draws what it says"}
-"""The others, and why."""
-
-
-def hidden_fields(stage: str) -> frozenset[str]:
-    """Return the fields of a stage that no panel asks for."""
-    return (FROM_SCENE - SHOWN_FILES.get(stage, frozenset())) | NOT_FROM_HERE.get(
-        stage, frozenset())
-
-
-def button_of(stage: str) -> str:
-    """Return what the button of a stage says: also the title of its job."""
-    return next(view.label for step in STEPS for view in (step.view, *step.others)
-                if view.stage == stage and view.label)
 
 
 def next_step(step: Step) -> Step | None:

@@ -6,7 +6,6 @@ import bpy
 
 from .. import branch_folder, branches, jobs, properties
 from ..stages import stages
-from ..steps import MOVES_ROBOT
 from .run_stage import StageOperator, stage_operator
 
 _WIDTH = 420
@@ -120,7 +119,9 @@ _registered: list[type] = []
 
 
 def register() -> None:
-    for operator in (LIMBER_OT_arm, *(stage_operator(name, MovesRobot) for name in MOVES_ROBOT)):
+    for operator in (LIMBER_OT_arm, *(stage_operator(stage.name, MovesRobot)
+                                      for stage in stages().values()
+                                      if stage.moves_robot == "always")):
         bpy.utils.register_class(operator)
         _registered.append(operator)
 

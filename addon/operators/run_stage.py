@@ -6,7 +6,6 @@ import bpy
 
 from .. import branch_folder, branches, properties
 from ..stages import SettingError, Stage, stages
-from ..steps import MOVES_ROBOT, NOT_FROM_HERE, RUN, button_of
 from .needs_result import needed_folder
 from .worker_operator import WorkerOperator
 
@@ -28,7 +27,7 @@ class StageOperator(WorkerOperator):
 
     @property
     def title(self) -> str:
-        return button_of(self.stage_name)
+        return self.stage.label
 
     def invoke(self, context, event):
         try:
@@ -54,7 +53,7 @@ class StageOperator(WorkerOperator):
     def arguments(self, context):
         self._take_keywords(context)
         stage, scene = self.stage, context.scene
-        if _makes_branch(stage):
+        if stage.makes_branch:
             values = properties.values_of(properties.group_of(context.scene, stage), stage)
             trouble = self._foreign(context)
             if trouble and not self.replace:
@@ -109,7 +108,7 @@ class StageOperator(WorkerOperator):
         for name in _own_properties(self.stage):
             if not self.properties.is_property_set(name):
                 continue
-            if name == ("output" if _makes_branch(self.stage) else "branch_folder"):
+            if name == ("output" if self.stage.makes_branch else "branch_folder"):
                 branches.use_folder(context.scene, getattr(self, name))
                 continue
             setattr(group, name, getattr(self, name))
@@ -128,18 +127,13 @@ class StageOperator(WorkerOperator):
 
     def _foreign(self, context) -> str:
         """Return why the folder is not this scan's, or nothing."""
-        if not _makes_branch(self.stage):
+        if not self.stage.makes_branch:
             return ""
         source = self._source(context)
         folder = branches.current_folder(context.scene)
         if folder is None or branch_folder.belongs(folder, branch_folder.file_sha256(source)):
             return ""
         return f"{folder.name} was not made of {source.name}: its results would be overwritten."
-
-
-def _makes_branch(stage: Stage) -> bool:
-    """Whether the stage makes a branch folder; all others work in one."""
-    return "branch_folder" not in stage.fields
 
 
 def _is_seen(stage: Stage) -> bool:
@@ -156,22 +150,22 @@ def stage_operator(name: str, base: type = StageOperator) -> type:
             name="Replace", options={"HIDDEN", "SKIP_SAVE"},
             description="Also where the folder holds the branch of another scan")},
         "__doc__": stage.summary.rstrip("."), "__module__": __name__, "stage_name": name,
-        "bl_idname": f"limber.{properties.attribute_name(name)}", "bl_label": button_of(name)})
+        "bl_idname": f"limber.{properties.attribute_name(name)}", "bl_label": stage.label})
 
 
 def _own_properties(stage: Stage) -> dict:
-    """Return the properties of a stage's operator by name, but those that no panel keeps."""
-    kept = NOT_FROM_HERE.get(stage.name, frozenset())
-    hidden = {*kept, *(properties.OPEN + name for name in kept)}
+    """Return the properties of a stage's operator by name: what panels keep."""
+    hidden = {name for field in stage.fields.values() if not field.is_kept
+              for name in (field.name, properties.OPEN + field.name)}
     # Not saved: what a script gave once is not given again by the button.
     return {name: value for name, value in
             properties.stage_properties(stage, {"SKIP_SAVE"}).items() if name not in hidden}
 
 
 def register() -> None:
-    for name in RUN:
-        if name not in MOVES_ROBOT:
-            operator = stage_operator(name)
+    for stage in stages().values():
+        if stage.step and stage.moves_robot != "always":
+            operator = stage_operator(stage.name)
             bpy.utils.register_class(operator)
             _registered.append(operator)
 

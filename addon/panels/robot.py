@@ -7,10 +7,8 @@ import bpy
 from .. import branches, jobs, live_force
 from ..operators.arming import LIMBER_OT_arm, why_not_armed
 from ..operators.worker_operator import redraw_sidebars
-from ..steps import MOVES_ROBOT, button_of
+from ..stages import stages
 
-_TITLES = (LIMBER_OT_arm.title, *(button_of(name) for name in MOVES_ROBOT))
-"""Jobs in which a robot moves."""
 _LOOK_SECONDS = 0.2
 _LOOK_AGAIN_SECONDS = 1.0
 _seen: dict[str, bool] = {}
@@ -55,7 +53,13 @@ def _moving() -> jobs.Job | None:
     """Return the job in which a robot moves now."""
     job = jobs.current()
     return job if job is not None and job.state is jobs.JobState.RUNNING and (
-        job.title in _TITLES) else None
+        job.title in _titles_in_motion()) else None
+
+
+def _titles_in_motion() -> tuple[str, ...]:
+    """Return the titles of the jobs in which a robot moves."""
+    return (LIMBER_OT_arm.title,
+            *(stage.label for stage in stages().values() if stage.moves_robot == "always"))
 
 
 def _folder(context: bpy.types.Context) -> Path | None:

@@ -7,18 +7,7 @@ import bpy
 from .. import branch_folder, branches, jobs, properties
 from ..branch_folder import BranchRecord, StageRecord
 from ..stages import Field, Stage, stages
-from ..steps import (
-    DRY_RUNS,
-    PLACES,
-    REGIONS,
-    STEPS,
-    WAYS,
-    StageView,
-    Step,
-    StepState,
-    button_of,
-    hidden_fields,
-)
+from ..steps import PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
 from ..steps import next_step as step_after
 from .comparing import draw_moduli, draw_paths
 from .pulls import draw_pulls
@@ -71,7 +60,8 @@ class StepPanel(SidebarPanel):
             _draw_groups(layout, context, more)
         for other in step.others:
             header, body = layout.panel(f"limber_{step.name}_{other.stage}", default_closed=True)
-            header.label(text=other.label, icon=state_of(context.scene, other.stage)[0].icon)
+            header.label(text=stages()[other.stage].label,
+                         icon=state_of(context.scene, other.stage)[0].icon)
             if body is not None:
                 _draw_stage(body, context, other, is_primary=False)
                 _draw_groups(body, context, other)
@@ -89,17 +79,17 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
     values = properties.values_of(group, stage, {"name"})
     entry = record.of(stage, values) if record else None
     job = jobs.current()
-    if job is not None and job.state is jobs.JobState.RUNNING and job.title == button_of(name):
+    if job is not None and job.state is jobs.JobState.RUNNING and job.title == stage.label:
         return StepState.RUNNING, entry
-    if any(job.title == button_of(name) for job in jobs.waiting()):
+    if any(job.title == stage.label for job in jobs.waiting()):
         return StepState.WAITING, entry
     outcome = properties.outcome_of(scene, stage, str(folder))
     if outcome.get("status") == "failed":
         return StepState.FAILED, entry
     if entry is None:
         # What makes no entry (a prediction) is done where it has ended well.
-        return (StepState.DONE if outcome.get("status") == "done" and (
-            name in DRY_RUNS or not stage.keeps_entry(values)) else StepState.NOT_RUN), None
+        return (StepState.DONE if outcome.get("status") == "done"
+                and not stage.keeps_entry(values) else StepState.NOT_RUN), None
     return _age(stage, group, record, entry), entry
 
 
@@ -126,15 +116,14 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
                 is_primary: bool) -> None:
     """Draw what must be given, the button, the state, and what came out."""
     stage = stages()[view.stage]
-    required = [field.name for field in stage.fields.values()
-                if field.is_required and field.name not in hidden_fields(view.stage)]
+    required = [field.name for field in stage.own_fields if field.is_required]
     if view.stage != "reconstruct":
         # Its scan is the first step's.
         _draw_fields(layout, context, view, names=required)
     state, entry = state_of(context.scene, view.stage)
     row = layout.row()
     row.scale_y = 1.4 if is_primary else 1.0
-    row.operator(f"limber.{properties.attribute_name(view.stage)}", text=view.label,
+    row.operator(f"limber.{properties.attribute_name(view.stage)}", text=stage.label,
                  icon="PLAY" if is_primary else "NONE")
     if state is not StepState.NOT_RUN:
         layout.label(text=state.words[0].upper() + state.words[1:], icon=state.icon)
@@ -175,9 +164,8 @@ def _draw_origin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 
 def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView) -> None:
     stage = stages()[view.stage]
-    hidden = hidden_fields(view.stage)
     for title, fields in stage.groups().items():
-        shown = [field for field in fields if field.name not in hidden and not field.is_required
+        shown = [field for field in fields if not field.is_required
                  and (context.scene.limber.show_expert or not field.is_expert)
                  and not (view.stage == "reconstruct" and field.name == "unit")]
         if not shown or (view.groups is not None and title not in view.groups):

@@ -133,16 +133,14 @@ def test_every_panel_is_in_the_tab(bpy, panels):
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, operators):
     """Its stages' buttons in order, and every setting of the schema that is not for experts."""
     stages = importlib.import_module("limber_addon.stages").stages()
-    steps = importlib.import_module("limber_addon.steps")
     drawn = _draw_step(bpy, name)
     shown = [call for call in drawn.names("operator") if call not in (
         "limber.from_cursor", "limber.from_object")]
     assert shown == operators
     step = _step(bpy, name).step
     for view in (step.view, *step.others):
-        for field in stages[view.stage].fields.values():
-            hidden = steps.hidden_fields(view.stage)
-            wanted = view.groups is None and not field.is_expert and field.name not in hidden
+        for field in stages[view.stage].own_fields:
+            wanted = view.groups is None and not field.is_expert
             assert not wanted or field.name in drawn.names("prop"), (view.stage, field.name)
     assert not {"arm", "confirm"} & set(drawn.names("prop")), "that it may move is typed each time"
 

@@ -22,10 +22,13 @@ def test_the_shipped_schema_is_the_workers():
     assert shipped == json.loads(json.dumps(all_schemas())), "run scripts/make_addon_schema"
 
 
-def test_every_stage_has_its_place_in_the_add_on(addon):
-    """A new stage stands in a step, or it is said why not."""
-    steps = importlib.import_module("limber_addon.steps")
-    assert {*steps.RUN, *steps.NOT_RUN_HERE} == set(NAMES)
+def test_every_stage_has_its_place_in_the_add_on(stages):
+    """A new stage stands in a step, with a label; `generate` makes no branch, and `scene` draws
+    what `limber.open_result` does."""
+    steps = {step.name for step in importlib.import_module("limber_addon.steps").STEPS}
+    assert {stage.name for stage in stages.values() if not stage.step} == {"generate", "scene"}
+    assert {stage.step for stage in stages.values()} <= {*steps, ""}
+    assert all(bool(stage.label) == bool(stage.step) for stage in stages.values())
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -21,6 +21,10 @@ def required(description: str, example: str) -> Any:
     return Field(description=description, json_schema_extra={"example": example})
 
 
+NOT_KEPT = {"panel": False}
+"""Of a field that the add-on's panels do not keep: it is typed each time, or given elsewhere."""
+
+
 class BranchInputs(Settings):
     """A branch folder."""
 

@@ -1,18 +1,24 @@
 """The registry of stages: the one source of commands, options, schemas and job tables.
 
-A stage is a module below this folder that assigns ``STAGE = StageDescription("name", ...)``. Its
-docstring is the command's help, the first line what ``limber --help`` says of it. The names are
-found without importing anything, so that ``limber --help`` waits for no package.
+A stage is a module that assigns ``STAGE = StageDescription("name", ...)``: below this folder, in
+another package that names it under the entry points ``limber.stages``, or given to
+:func:`register`. Its docstring is the command's help, the first line what ``limber --help`` says
+of it. The names are found without importing a stage, so that ``limber --help`` waits for no
+package.
 """
 
 import ast
 import importlib
-from collections.abc import Callable, Sequence
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal
 
+from limber.core.errors import InputError
 from limber.core.progress import Progress
 
 if TYPE_CHECKING:
@@ -38,6 +44,9 @@ class StageDescription:
         reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
         writes: Names of those that it writes.
         tables: Titles and rows to show a person beside the result, the first row the header.
+        step: The panel of the add-on (:data:`addon.steps.STEPS`) that it stands in; empty: none.
+        label: What its button says there.
+        moves_robot: Whether it does; batches do not run it then.
     """
 
     name: str
@@ -51,23 +60,64 @@ class StageDescription:
     writes: tuple[str, ...] = ()
     tables: ("Callable[[dict[str, Any]], Sequence[tuple[str, Sequence[Sequence[str]]]]]"
              " | None") = None
+    step: str = ""
+    label: str = ""
+    moves_robot: Literal["", "when armed", "always"] = ""
+
+
+_registered: list[ModuleType] = []
+
+
+def register(module: ModuleType) -> None:
+    """Make a module's ``STAGE`` a stage of this process; entry points make it one of all."""
+    _registered.append(module)
+    _stages.cache_clear()
 
 
 @cache
 def _stages() -> dict[str, tuple[str, str]]:
     """Return the module and the summary of each stage, in the order in which they run."""
-    found = []
+    found = [(*about, module) for module, path in _stage_files() if (about := _described(path))]
+    found += [(module.STAGE.position, module.STAGE.name, _summary(module.__doc__),
+               module.__name__) for module in _registered]
+    stages: dict[str, tuple[str, str]] = {}
+    for _position, name, summary, module in sorted(found):
+        if name in stages:
+            raise InputError(f"Two modules make a stage {name}: {stages[name][0]} and {module}.",
+                             "", "Uninstall the package of one of them.")
+        stages[name] = (module, summary)
+    return stages
+
+
+def _stage_files() -> Iterator[tuple[str, Path]]:
+    """The modules that may hold a stage, and their files."""
     folder = Path(__file__).parent
     for path in folder.rglob("*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in tree.body:
-            if (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
-                    and getattr(node.targets[0], "id", "") == "STAGE"):
-                name, position = (ast.literal_eval(part) for part in node.value.args[:2])
-                summary = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
-                module = ".".join(path.relative_to(folder).with_suffix("").parts)
-                found.append((position, name, module, summary))
-    return {name: (module, summary) for _position, name, module, summary in sorted(found)}
+        yield ".".join((__package__, *path.relative_to(folder).with_suffix("").parts)), path
+    for entry in importlib.metadata.entry_points(group="limber.stages"):
+        try:
+            spec = importlib.util.find_spec(entry.module)
+        except ImportError:
+            spec = None
+        if spec is None or spec.origin is None:
+            raise InputError(f"The stage {entry.name} should be in {entry.module}, which is not "
+                             "there.", "", "Install its package again, or uninstall it.")
+        yield entry.module, Path(spec.origin)
+
+
+def _described(path: Path) -> tuple[int, str, str] | None:
+    """Return position, name and summary of the stage in a file; None if it has none."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in tree.body:
+        if (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
+                and getattr(node.targets[0], "id", "") == "STAGE"):
+            name, position = (ast.literal_eval(part) for part in node.value.args[:2])
+            return position, name, _summary(ast.get_docstring(tree))
+    return None
+
+
+def _summary(docstring: str | None) -> str:
+    return (docstring or "").split("\n\n")[0].replace("\n", " ")
 
 
 def stage_summaries() -> dict[str, str]:
@@ -77,7 +127,7 @@ def stage_summaries() -> dict[str, str]:
 
 def stage_module(name: str) -> Any:
     """Return the module of a stage."""
-    return importlib.import_module(f"limber.stages.{_stages()[name][0]}")
+    return importlib.import_module(_stages()[name][0])
 
 
 def stage_description(name: str) -> StageDescription:
@@ -95,13 +145,15 @@ def stage_schema(name: str) -> dict[str, Any]:
     """Return what a program must know to run a stage, as plain JSON.
 
     ``inputs``, ``settings`` and ``options`` are JSON schemas; their properties also have
-    ``group`` (the title under which they stand), ``expert`` and, where they have one, ``unit``.
+    ``group`` (the title under which they stand), ``expert`` and, where they have one, ``unit``;
+    ``panel`` is false where no panel may keep it.
     An input with ``argument`` is given without its name; ``short`` is its short option.
     """
     stage = stage_description(name)
     return {
         "name": name, "summary": stage_summaries()[name], "key": stage.key,
         "reads": list(stage.reads), "writes": list(stage.writes),
+        "step": stage.step, "label": stage.label, "moves_robot": stage.moves_robot,
         "inputs": stage.inputs.model_json_schema(),
         "settings": stage.settings.model_json_schema(),
         "options": stage.options.model_json_schema()}

@@ -270,4 +270,4 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 STAGE = StageDescription(
     "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
-    tables=_tables)
+    tables=_tables, step="estimate", label="Estimate")

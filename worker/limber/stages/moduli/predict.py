@@ -62,5 +62,6 @@ def run(inputs: BranchInputs, settings: PredictSettings, _options: NoOptions,
 
 
 STAGE = StageDescription(
-    "predict", 80, run, BranchInputs, PredictSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"))
+    "predict", 77, run, BranchInputs, PredictSettings, NoOptions,
+    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"),
+    step="estimate", label="Predict Another Load")

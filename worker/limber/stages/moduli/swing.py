@@ -126,4 +126,5 @@ def run(inputs: BranchInputs, settings: SwingSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "swing", 75, run, BranchInputs, SwingSettings, RunOptions, key="swing",
-    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"))
+    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"),
+    step="estimate", label="Fit a Free Swing")

@@ -179,4 +179,5 @@ def run(inputs: VibrationInputs, settings: VibrationSettings, options: RunOption
 
 STAGE = StageDescription(
     "vibration", 76, run, VibrationInputs, VibrationSettings, RunOptions, key="vibration",
-    reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"))
+    reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"),
+    step="estimate", label="Fit Natural Frequencies")

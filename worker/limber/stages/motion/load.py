@@ -206,4 +206,4 @@ STAGE = StageDescription(
     "load", 45, run, BranchInputs, LoadSettings, RunOptions, key="load:{name}",
     reads=("mesh.vtu", "skeleton.swc"),
     writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
-    tables=_tables)
+    tables=_tables, step="material", label="Wind, Snow, Fruit, Cuts")

@@ -42,7 +42,7 @@ class SimulateInputs(BranchInputs):
         None, description="Replay this recording of the branch: grasped where and held as it was, "
         "moved as the gripper was; grasp, kind and name of the result are the recording's. What "
         "was measured can then be seen over it, frame by frame.",
-        json_schema_extra={"metavar": "NAME"})
+        json_schema_extra={"metavar": "NAME", "panel": False})
 
 
 def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
@@ -221,4 +221,5 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
 
 STAGE = StageDescription(
     "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY,
-    reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"))
+    reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"),
+    step="material", label="Simulate a Motion")

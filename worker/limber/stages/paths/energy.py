@@ -86,4 +86,5 @@ def run(inputs: BranchInputs, settings: EnergySettings, options: ParallelOptions
 
 STAGE = StageDescription(
     "energy", 90, run, BranchInputs, EnergySettings, ParallelOptions, key="energy",
-    reads=("mesh.vtu", "skeleton.swc"), writes=("energy.npz",))
+    reads=("mesh.vtu", "skeleton.swc"), writes=("energy.npz",),
+    step="goal", label="Sample the Energy")

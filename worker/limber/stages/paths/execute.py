@@ -18,7 +18,7 @@ from limber.core.files.reading import read_columns, read_text
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
-from limber.stages.inputs import BranchInputs, required
+from limber.stages.inputs import NOT_KEPT, BranchInputs, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -68,12 +68,13 @@ class ExecuteOptions(Settings):
     groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop")}
 
     arm: bool = Field(False, description="Move the robot. Without it: a dry run.",
-                      json_schema_extra={"switch": True})
+                      json_schema_extra={"switch": True, "panel": False})
     confirm: str | None = Field(
         None, description="The plan's name, typed: the robot moves. Without it the name is asked "
-        "for at the terminal.")
+        "for at the terminal.", json_schema_extra=NOT_KEPT)
     after_stop: AfterStop = Field(
-        "ask", description="What to do after a stop; ask: at the terminal, else hold.")
+        "ask", description="What to do after a stop; ask: at the terminal, else hold.",
+        json_schema_extra=NOT_KEPT)
 
 
 def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
@@ -440,4 +441,5 @@ def run(inputs: ExecuteInputs, settings: ExecuteSettings, options: ExecuteOption
 STAGE = StageDescription(
     "execute", 110, run, ExecuteInputs, ExecuteSettings, ExecuteOptions, key="execute:{name}",
     reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
-    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"))
+    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
+    step="robot", label="Check With Robot", moves_robot="when armed")

@@ -317,4 +317,4 @@ STAGE = StageDescription(
             "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
             "plans/{name}-bound.npz", "frames/{name}.pc2", "frames/{name}.json",
             "frames/{name}.npz"),
-    tables=_tables)
+    tables=_tables, step="plan", label="Plan Path")

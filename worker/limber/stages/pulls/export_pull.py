@@ -62,5 +62,5 @@ def run(inputs: ExportPullInputs, settings: ExportPullSettings, options: NoOptio
 
 
 STAGE = StageDescription(
-    "export-pull", 52, run, ExportPullInputs, ExportPullSettings, NoOptions,
-    reads=("pulls/{name}/",))
+    "export-pull", 58, run, ExportPullInputs, ExportPullSettings, NoOptions,
+    reads=("pulls/{name}/",), step="pulls", label="Export a Pull")

@@ -143,4 +143,4 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
-    writes=("pulls/{name}/",))
+    writes=("pulls/{name}/",), step="pulls", label="Import Pull")

@@ -14,7 +14,7 @@ from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
-from limber.stages.inputs import BranchInputs, required
+from limber.stages.inputs import NOT_KEPT, BranchInputs, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -74,12 +74,13 @@ class RecordOptions(Settings):
 
     confirm: str | None = Field(
         None, description="The recording's name, typed: the robot moves. Without it the name is "
-        "asked for at the terminal.")
+        "asked for at the terminal.", json_schema_extra=NOT_KEPT)
     markers: int | None = Field(
         None, ge=1, le=65535, description="Port on the robot's address at which a tracker sends "
         "the points that it sees as JSON lines (the virtual robot's is 63400).")
     after_stop: AfterStop = Field(
-        "ask", description="What to do after a stop; ask: at the terminal, else hold.")
+        "ask", description="What to do after a stop; ask: at the terminal, else hold.",
+        json_schema_extra=NOT_KEPT)
     recover: bool = Field(False, description="Move nothing: take over what a killed recording "
                           "of this name has left.", json_schema_extra={"switch": True})
 
@@ -340,4 +341,5 @@ def run(inputs: RecordInputs, settings: RecordSettings, options: RecordOptions,
 
 STAGE = StageDescription(
     "record", 55, run, RecordInputs, RecordSettings, RecordOptions, key="record:{name}",
-    reads=("skeleton.swc",), writes=("pulls/{name}/",))
+    reads=("skeleton.swc",), writes=("pulls/{name}/",), step="pulls", label="Record a Pull",
+    moves_robot="always")

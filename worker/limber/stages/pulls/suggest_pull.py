@@ -243,4 +243,5 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 STAGE = StageDescription(
     "suggest-pull", 78, run, SuggestPullInputs, SuggestPullSettings, ParallelOptions,
     key="suggest-pull", reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"),
-    writes=("suggested_pull.json",), tables=_tables)
+    writes=("suggested_pull.json",), tables=_tables, step="estimate",
+    label="Suggest the Next Pull")

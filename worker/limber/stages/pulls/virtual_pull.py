@@ -116,5 +116,6 @@ def run(inputs: VirtualPullInputs, settings: VirtualPullSettings, options: RunOp
 
 
 STAGE = StageDescription(
-    "virtual-pull", 60, run, VirtualPullInputs, VirtualPullSettings, RunOptions,
-    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",))
+    "virtual-pull", 52, run, VirtualPullInputs, VirtualPullSettings, RunOptions,
+    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",),
+    step="pulls", label="Simulate a Pull")

@@ -216,4 +216,4 @@ def run(inputs: ExportInputs, settings: ExportSettings, _options: NoOptions,
 
 STAGE = StageDescription(
     "export", 125, run, ExportInputs, ExportSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc"))
+    reads=("mesh.vtu", "skeleton.swc"), step="report", label="Export for Other Programs")

@@ -82,4 +82,4 @@ def run(inputs: ReportInputs, _settings: NoSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "report", 110, run, ReportInputs, NoSettings, RunOptions, key="report",
-    writes=("report.html",))
+    writes=("report.html",), step="report", label="Write Report")

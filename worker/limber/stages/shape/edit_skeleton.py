@@ -247,4 +247,4 @@ STAGE = StageDescription(
     "skeleton", 25, run, SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
     reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", EDITS), tables=tables)
+            "point_masses.json", EDITS), tables=tables, step="skeleton", label="Review and Edit")

@@ -112,4 +112,5 @@ def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "mesh", 30, run, MeshInputs, MeshSurfaceSettings, RunOptions, key="mesh",
-    writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"))
+    writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"),
+    step="mesh", label="Mesh a Closed Surface")

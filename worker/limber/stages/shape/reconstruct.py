@@ -315,4 +315,4 @@ STAGE = StageDescription(
     "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH, EDITS,
-            "truth/"))
+            "truth/"), step="skeleton", label="Reconstruct")

@@ -145,4 +145,4 @@ def run(inputs: TargetInputs, settings: TargetSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "target", 35, run, TargetInputs, TargetSettings, RunOptions, key="target:{name}",
-    reads=("mesh.vtu",), writes=("targets.json",))
+    reads=("mesh.vtu",), writes=("targets.json",), step="goal", label="Name a Target")
