@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks.worker_readme import shown_commands
 from limber.cli.main import main
+from limber.stages.registry import stage_table
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -62,6 +63,13 @@ def test_links_lead_somewhere(path):
         found = path.parent / target
         assert found.exists() or found.name in ("commands.md", "pull_toml.md", "cell_toml.md"), (
             f"{path.name} links {target}")
+
+
+def test_the_table_of_stages_is_the_registrys():
+    """Run scripts/make_addon_schema when a stage has changed."""
+    text = (ROOT / "worker/docs/reference/stages.md").read_text(encoding="utf-8")
+    _, _, rest = text.partition("<!-- Stages: scripts/make_addon_schema writes this table. -->\n")
+    assert rest.partition("\n<!-- End of stages. -->")[0] == stage_table()
 
 
 def test_every_command_has_an_example():

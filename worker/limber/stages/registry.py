@@ -163,3 +163,18 @@ def all_schemas() -> dict[str, Any]:
     """Return the schemas of all stages by name, with the format's version."""
     return {"format": FORMAT,
             "stages": {name: stage_schema(name) for name in stage_summaries()}}
+
+
+def stage_table() -> str:
+    """Return the Markdown table of stages: the shortest command of each, and what it does."""
+    rows = ["| stage | what it does |", "|---|---|"]
+    for name, summary in stage_summaries().items():
+        words = [f"limber {name}"]
+        for field, about in stage_schema(name)["inputs"]["properties"].items():
+            if about.get("argument"):
+                words.append(field.upper())
+            elif "example" in about:
+                option = about.get("short") or f"--{field.replace('_', '-')}"
+                words.append(f"{option} {about['example'].format(stem='NAME')}")
+        rows.append(f"| `{' '.join(words)}` | {summary} |")
+    return "\n".join(rows)
