@@ -11,8 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.jobs.command_lines import line_of_task, task_of_line
-from limber.batch.jobs.job_file import StageTask, read_jobs
+from limber.batch.jobs.job_file import read_jobs
 from limber.batch.records import Records
 from limber.cli import main
 from limber.core.errors import InputError

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import Asked, Row, Setting
-from limber.batch.jobs.job_file import StageTask
+from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.stage_task import run_task
 from limber.core.processes import Pool
 from limber.core.progress import SILENT

@@ -4,7 +4,7 @@ import logging
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 
-from limber.batch.jobs.job_file import JobFile
+from limber.batch.jobs.branch_jobs import JobFile
 
 MOST_BYTES = 1_000_000
 KEPT = 3

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from limber.batch.jobs.job_file import BranchJob, JobFile, StageTask
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.core.files.temporary_names import is_alive
 from limber.core.present import present
 from limber.store.growing_files import Stream, stream_lines

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from limber.batch.jobs.job_file import BranchJob, JobFile, StageTask
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.batch.log import BatchLog
 from limber.batch.machines.cluster import Cluster, ClusterLostError
 from limber.batch.machines.staging import AT_ONCE, Staging

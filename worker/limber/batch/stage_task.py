@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from limber.batch.jobs.job_file import StageTask
+from limber.batch.jobs.branch_jobs import StageTask
 from limber.core.errors import BranchBusyError, Cancelled, LimberError
 from limber.core.json_values import plain
 from limber.core.machine_errors import machine_error

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from limber.batch.jobs.job_file import BranchJob, JobFile
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile
 from limber.batch.pictures import pictures
 from limber.batch.records import (
     DONE,

@@ -2,7 +2,7 @@
 
 import click
 
-from limber.batch.jobs.job_file import StageTask
+from limber.batch.jobs.branch_jobs import StageTask
 from limber.core.settings import Settings
 from limber.stages.command_line import command_line, settings_options
 from limber.stages.registry import stage_description

@@ -9,8 +9,8 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.batch.jobs.command_lines import line_of_task
-from limber.batch.jobs.job_file import BranchJob, JobFile, StageTask
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
 

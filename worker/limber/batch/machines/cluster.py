@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from limber.batch.jobs.branch_jobs import JobFile, StageTask
 from limber.batch.jobs.command_lines import line_of_task
-from limber.batch.jobs.job_file import JobFile, StageTask
 from limber.batch.machines.dask_worker import run_line, stop_lines, unfit
 from limber.core.errors import Cancelled, InputError, WorkError
 from limber.core.optional import require_extra

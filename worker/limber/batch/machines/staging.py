@@ -20,7 +20,7 @@ from limber.batch.addresses import (
     remove,
     take_away,
 )
-from limber.batch.jobs.job_file import BranchJob, JobFile
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile
 from limber.batch.records import path_of_page, path_of_table
 from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
 from limber.core.files.atomic import file_digest, write_atomically

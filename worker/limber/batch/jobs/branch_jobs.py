@@ -1,0 +1,67 @@
+"""What a job file comes to: branches, and the stages that are run on each."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from limber.core.json_values import plain
+from limber.core.processes import Limits
+from limber.core.settings import Settings
+
+
+@dataclass(frozen=True)
+class StageTask:
+    """A stage to run on a branch, with checked inputs, settings and options."""
+
+    stage: str
+    inputs: Settings
+    settings: Settings
+    options: Settings
+
+    @property
+    def label(self) -> str:
+        """The stage's name, with that of what it makes where there may be several."""
+        name = getattr(self.inputs, "name", None) or getattr(self.settings, "name", None)
+        return f"{self.stage}:{name}" if name else self.stage
+
+    @property
+    def fingerprint(self) -> str:
+        """What the task is, its options left out: the same text for the same task."""
+        told = json.dumps([self.stage, plain(self.inputs), plain(self.settings)], sort_keys=True)
+        return hashlib.sha256(told.encode("utf-8")).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class BranchJob:
+    """What is run on one branch, in this order; ``sweep`` says which values are its own.
+
+    ``fetched`` has the addresses of its inputs and where those go here, ``home`` the address that
+    the branch folder itself has, or nothing.
+    """
+
+    name: str
+    folder: Path
+    tasks: tuple[StageTask, ...]
+    sweep: dict[str, Any] = field(default_factory=dict)
+    fetched: tuple[tuple[str, Path], ...] = ()
+    home: str = ""
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether it, or what it needs, is elsewhere."""
+        return bool(self.fetched or self.home)
+
+
+@dataclass(frozen=True)
+class JobFile:
+    """A checked job file; ``limits`` hold for each stage, ``home`` is the address of results."""
+
+    path: Path
+    out: Path
+    branches: tuple[BranchJob, ...]
+    workers: int | None = None
+    cluster: str | None = None
+    limits: Limits = field(default_factory=Limits)
+    home: str = ""

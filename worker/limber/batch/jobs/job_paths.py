@@ -1,0 +1,116 @@
+"""The paths that a job file names; what is at an address gets one here."""
+
+import glob
+import hashlib
+from pathlib import Path
+
+from limber.batch.addresses import checked_address, is_address, matching, plain_name
+from limber.batch.jobs.problems import Problems
+from limber.batch.jobs.toml_positions import Place
+from limber.core.errors import InputError, LimberError
+from limber.store.manifest import MANIFEST
+
+
+class JobPaths:
+    """Finds what a job file names, and keeps in mind what is at an address.
+
+    Args:
+        folder: Of the job file: paths in it begin there.
+        problems: Told what is wrong with a path, and its place in the job file.
+
+    Attributes:
+        out: Where results go, and what is fetched.
+        home: The address of results; empty where they stay in ``out``.
+    """
+
+    def __init__(self, folder: Path, problems: Problems):
+        self._folder, self._problems = folder, problems
+        self._known: dict[Path, str] = {}
+        self.out = folder
+        self.home = ""
+
+    def read_out(self, out: str, work: str, otherwise: str) -> None:
+        """Results go to a folder; or to an address, and are worked on in a folder here."""
+        self.out = self._folder / otherwise
+        if work and (is_address(work) or not is_address(out)):
+            self._problems.add(
+                ("work",), "work is a folder here, for results that go to an address.")
+        elif is_address(out):
+            self.home = self._checked(out, ("out",))
+            self.out = self._folder / (work or otherwise)
+        elif out:
+            self.out = self._folder / out
+
+    def files(self, pattern: str, place: Place) -> list[Path] | None:
+        """Return the files that a pattern names, sorted; None if it was refused."""
+        if not is_address(pattern):
+            return [self._folder / name for name in sorted(
+                glob.glob(pattern, root_dir=self._folder, recursive=True))]
+        found = self._listed(pattern, place)
+        return None if found is None else [self._file(each, place) for each in found]
+
+    def folders(self, pattern: str, place: Place) -> list[Path] | None:
+        """Return the branch folders that a pattern names; None if it was refused."""
+        if not is_address(pattern):
+            return [path for path in self.files(pattern, place) or ()
+                    if (path / MANIFEST).is_file()]
+        found = self._listed(f"{pattern.rstrip('/')}/{MANIFEST}", place)
+        return None if found is None else [
+            self._here(each.removesuffix(f"/{MANIFEST}"), self.out, place) for each in found]
+
+    def file(self, name: str, place: Place) -> Path:
+        """Return the path of one file or folder."""
+        if not is_address(name):
+            return self._folder / name
+        address = self._checked(name, place)
+        return self._file(address, place) if address else self.out
+
+    def written(self, name: str, place: Place) -> Path:
+        """Return where a stage writes a file: never outside ``out``."""
+        path = (self.out / name).resolve()
+        if is_address(name):
+            if self._checked(name, place):
+                self._problems.add(
+                    place, f"{name!r} is an address; what stages write goes to `out`.")
+        elif not path.is_relative_to(self.out.resolve()):
+            self._problems.add(place, f"{name!r} leads out of {self.out}.")
+        return path
+
+    def address_of(self, path: Path) -> str:
+        """Return the address of a path; nothing for what is here anyway."""
+        return self._known.get(path, "")
+
+    def fetched(self, paths: list[Path]) -> tuple[tuple[str, Path], ...]:
+        """Return address and path of those that have to be fetched."""
+        return tuple((self._known[path], path) for path in dict.fromkeys(paths)
+                     if path in self._known)
+
+    def _checked(self, text: str, place: Place) -> str:
+        """Return an address as it is used; nothing if it is refused."""
+        try:
+            return checked_address(text)
+        except InputError as error:
+            self._problems.add(place, str(error))
+            return ""
+
+    def _file(self, address: str, place: Place) -> Path:
+        """Return where one file, or folder, goes: beside what stands beside it there."""
+        around = address.rpartition("/")[0]
+        own = hashlib.sha256(around.encode("utf-8")).hexdigest()[:12]
+        return self._here(address, self.out / ".inputs" / own, place)
+
+    def _listed(self, pattern: str, place: Place) -> list[str] | None:
+        try:
+            return matching(pattern)
+        except LimberError as error:
+            self._problems.add(place, str(error))
+            return None
+
+    def _here(self, address: str, folder: Path, place: Place) -> Path:
+        try:
+            path = folder / plain_name(address)
+        except InputError as error:
+            self._problems.add(place, str(error))
+            return folder / "refused"
+        self._known[path] = address
+        return path

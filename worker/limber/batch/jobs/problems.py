@@ -1,0 +1,63 @@
+"""What is wrong with a job file: gathered, and told at once, each with its line."""
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from limber.batch.jobs.toml_positions import Place, line_of
+from limber.core.errors import InputError
+
+_SHOWN = 12
+_KINDS = {str: "a text", int: "a whole number", list: "a list"}
+
+
+class Problems:
+    """The problems of one file, of which ``lines`` says where what stands."""
+
+    def __init__(self, path: Path, lines: dict[Place, int]):
+        self._path, self._lines = path, lines
+        self._told: list[tuple[int, str]] = []
+
+    def add(self, place: Place, text: str) -> None:
+        self._told.append((line_of(self._lines, place), text))
+
+    def stop(self) -> None:
+        """Raise an InputError that tells them, if there are any."""
+        if not self._told:
+            return
+        told = [f"{self._path}, line {line}: {text}"
+                for line, text in sorted(dict.fromkeys(self._told))]
+        more = len(told) - _SHOWN
+        raise InputError("\n".join(told[:_SHOWN]) + (
+            f"\nand {more} more." if more > 0 else ""), "", "Nothing was run.")
+
+    def check_keys(self, table: dict[str, Any], known: tuple[str, ...], place: Place) -> None:
+        for key in table:
+            if key not in known:
+                self.add((*place, key), f"{key!r} is not known here. {nearest(key, known)}")
+
+    def typed(self, table: dict[str, Any], key: str, kind: type, place: Place,
+              otherwise: Any) -> Any:
+        """Return a value of this kind; ``otherwise`` where there is none."""
+        value = table.get(key, otherwise)
+        if value is not otherwise and (not isinstance(value, kind) or isinstance(value, bool)):
+            self.add((*place, key), f"{key} is {value!r}; it takes {_KINDS[kind]}.")
+            return otherwise
+        return value
+
+    def tables(self, table: dict[str, Any], key: str, place: Place) -> list[dict[str, Any]]:
+        """Return the tables of a name, as ``[[job]]`` are; none where it is something else."""
+        found = table.get(key, [])
+        if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+            names = ".".join(str(part) for part in (*place, key) if isinstance(part, str))
+            self.add((*place, key), f"Write {key} as tables: [[{names}]].")
+            return []
+        return found
+
+
+def nearest(key: str, known: Iterable[str]) -> str:
+    """Return a sentence about the known names that are like ``key``."""
+    known = tuple(known)
+    close = difflib.get_close_matches(key, known, 3)
+    return f"Did you mean {' or '.join(close)}?" if close else f"Known: {', '.join(known)}."

@@ -1,0 +1,201 @@
+"""The stages of a job, ``[[job.stage]]``: each a task, or several, on every branch."""
+
+import glob
+import itertools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from limber.batch.jobs.branch_jobs import StageTask
+from limber.batch.jobs.job_paths import JobPaths
+from limber.batch.jobs.problems import Problems, nearest
+from limber.batch.jobs.toml_positions import Place
+from limber.core.units import in_unit
+from limber.stages.registry import (
+    StageDescription,
+    stage_description,
+    stage_schema,
+    stage_summaries,
+)
+
+_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+_ROBOTS = {"always": "It moves a robot: somebody has to stand beside it.",
+           "when armed": "It may move a robot: run it at a terminal."}
+
+
+def why_not_in_batches(name: str) -> str:
+    """Return why a stage cannot stand in a job file; nothing where it can.
+
+    Raises:
+        KeyError: there is no such stage.
+    """
+    stage = stage_description(name)
+    if stage.moves_robot:
+        return _ROBOTS[stage.moves_robot]
+    if not stage.inputs.model_fields.keys() & {"branch_folder", "output"}:
+        return "It makes a scan, not a branch: run it before, and name its cloud under scans."
+    return ""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a branch begins with: a scan, or its own folder."""
+
+    path: Path
+    is_scan: bool
+
+    @property
+    def name(self) -> str:
+        return self.path.stem if self.is_scan else self.path.name.removesuffix(".branch")
+
+
+@dataclass(frozen=True)
+class StageTables:
+    """Makes the tasks of one branch; ``sweep`` has the values that are its own."""
+
+    problems: Problems
+    paths: JobPaths
+    source: Source
+    folder: Path
+    sweep: dict[str, Any]
+
+    def tasks(self, tables: list[dict[str, Any]], place: Place) -> list[StageTask]:
+        """Return the tasks of all stages of a job."""
+        return [task for number, table in enumerate(tables)
+                for task in self._tasks_of(table, (*place, "stage", number))]
+
+    def _tasks_of(self, table: dict[str, Any], place: Place) -> list[StageTask]:
+        name = table.get("run")
+        trouble = _trouble(name)
+        if trouble:
+            self.problems.add((*place, "run"), f"run = {name!r}: {trouble}")
+            return []
+        given = {key: (value, (*place, key)) for key, value in table.items() if key != "run"}
+        for swept, value in self.sweep.items():
+            stage, _, key = swept.partition(".")
+            if stage == name:
+                given[key] = value, (*place[:2], "sweep", swept)
+        return _StageValues(self, stage_description(name), given, place).tasks()
+
+
+class _StageValues:
+    """The values of one stage on one branch, each with its place in the file."""
+
+    def __init__(self, of: StageTables, stage: StageDescription,
+                 given: dict[str, tuple[Any, Place]], place: Place):
+        self._of, self._problems, self._stage, self._place = of, of.problems, stage, place
+        self._places = {key: where for key, (_, where) in given.items()}
+        self._given = {key: value for key, (value, _) in given.items()}
+        schema = stage_schema(stage.name)
+        self._fields = {key: about for part in ("inputs", "settings", "options")
+                        for key, about in schema[part].get("properties", {}).items()}
+        self._refused: set[str] = set()
+        """Fields whose value was refused before it came to the stage's settings."""
+
+    def tasks(self) -> list[StageTask]:
+        own = self._own_inputs()
+        values: dict[str, Any] = {}
+        for key, value in self._given.items():
+            if key in own:
+                self._problems.add(self._places[key], f"{key!r} is given by the batch.")
+            elif key not in self._fields:
+                self._problems.add(self._places[key], f"{self._stage.name} has no {key!r}. "
+                                   f"{nearest(key, self._fields)}")
+            else:
+                values[key] = self._value(key, value)
+        return [task for each in self._runs(values)
+                if (task := self._checked(own | each)) is not None]
+
+    def _own_inputs(self) -> dict[str, Any]:
+        """Return the inputs that follow from the branch."""
+        if "branch_folder" in self._fields:
+            return {"branch_folder": self._of.folder}
+        source = next(key for key, about in self._fields.items() if about.get("argument"))
+        if not self._of.source.is_scan:
+            self._problems.add((), f"{self._stage.name} makes a branch of a scan; this job has "
+                               "branch folders.")
+        return {source: self._of.source.path, "output": self._of.folder}
+
+    def _value(self, key: str, value: Any) -> Any:
+        """Return a value with its unit and its placeholders resolved."""
+        about = self._fields[key]
+        try:
+            if about.get("unit") or "string" not in _said_of(about, "type"):
+                return in_unit(value, about.get("unit", ""))
+        except ValueError as error:
+            self._refused.add(key)
+            where = self._places[key]
+            self._problems.add(where, f"{where[-1]}: {error}")
+        return self._filled(value, self._places[key]) if isinstance(value, str) else value
+
+    def _filled(self, text: str, place: Place) -> str:
+        def fill(match: re.Match) -> str:
+            if match.group(1) == "scan":
+                return self._of.source.name
+            if match.group(1) == "file":
+                return match.group(0)
+            self._problems.add(place, f"{match.group(0)} is not known; {{scan}} and {{file}} are.")
+            return ""
+        return _PLACEHOLDER.sub(fill, text)
+
+    def _runs(self, values: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return the values of each run: as many as a pattern among the inputs has files."""
+        choices = [self._files(key, value) for key, value in values.items()
+                   if "path" in _said_of(self._fields[key], "format") and isinstance(value, str)]
+        found = []
+        for files in itertools.product(*choices):
+            stem = next((path.stem for _, path, is_found in reversed(files) if is_found), "")
+            run = {key: value.replace("{file}", stem) if isinstance(value, str) else value
+                   for key, value in values.items()}
+            found.append(run | {key: path for key, path, _ in files})
+        return found
+
+    def _files(self, key: str, name: str) -> list[tuple[str, Path, bool]]:
+        """Return the choices for a file: its field, its path, whether a pattern found it."""
+        place = (*self._place, key)
+        if self._fields[key]["group"] == "output":
+            return [(key, self._of.paths.written(name, place), False)]
+        if not glob.has_magic(name):
+            return [(key, self._of.paths.file(name, place), False)]
+        matches = self._of.paths.files(name, place)
+        if matches == []:
+            self._problems.add(place, f"{key}: no file is {name!r}.")
+        return [(key, path, True) for path in matches or ()]
+
+    def _checked(self, values: dict[str, Any]) -> StageTask | None:
+        made = []
+        for model in (self._stage.inputs, self._stage.settings, self._stage.options):
+            own = {key: value for key, value in values.items() if key in model.model_fields}
+            try:
+                made.append(model(**own))
+            except ValidationError as error:
+                for one in error.errors():
+                    self._told(one)
+        return StageTask(self._stage.name, *made) if len(made) == 3 else None
+
+    def _told(self, refusal: Any) -> None:
+        """Tell why the stage's settings refuse a value."""
+        key = str(refusal["loc"][0]) if refusal["loc"] else ""
+        if key in self._refused:
+            return
+        unit = self._fields.get(key, {}).get("unit")
+        seen = "" if refusal["type"] == "missing" else f", not {refusal['input']!r}"
+        self._problems.add(self._places.get(key, (*self._place, key)),
+                           f"{self._stage.name} {key}: {refusal['msg']}{seen}"
+                           + (f" [{unit}]." if unit else "."))
+
+
+def _trouble(name: Any) -> str:
+    """Return why ``run = name`` cannot be; nothing where it can."""
+    known = stage_summaries()
+    if isinstance(name, str) and name in known:
+        return why_not_in_batches(name)
+    return "there is no such stage. " + nearest(
+        str(name), (each for each in known if not why_not_in_batches(each)))
+
+
+def _said_of(about: dict[str, Any], key: str) -> set[str]:
+    return {each.get(key, "") for each in about.get("anyOf", [about])}
