@@ -81,7 +81,7 @@ class LimberSettings(bpy.types.PropertyGroup):
         items=[(viewport_graph.NONE, "No graph", ""),
                *((name, title, "") for name, title in viewport_graph.GRAPHS.items())])
     show_expert: bpy.props.BoolProperty(
-        name="Expert settings", description="Show also the settings that few need")
+        name="All settings", description="Show also the settings that few need")
 
 
 def attribute_name(stage: str) -> str:

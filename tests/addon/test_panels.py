@@ -131,18 +131,20 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("robot", ["limber.execute", "limber.arm"]),
     ("report", ["limber.report", "limber.open_report", "limber.export"])])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, operators):
-    """Its stages' buttons in order, and every setting of the schema that is not for experts."""
+    """Its stages' buttons in order, and every setting of the schema; the common ones at once."""
     stages = importlib.import_module("limber_addon.stages").stages()
     drawn = _draw_step(bpy, name)
     shown = [call for call in drawn.names("operator") if call not in (
         "limber.from_cursor", "limber.from_object")]
     assert shown == operators
     step = _step(bpy, name).step
+    common = drawn.names("prop")
+    bpy.context.scene.limber.show_expert = True
+    whole = _draw_step(bpy, name).names("prop")
     for view in (step.view, *step.others):
-        for field in stages[view.stage].own_fields:
-            wanted = view.groups is None and not field.is_expert
-            assert not wanted or field.name in drawn.names("prop"), (view.stage, field.name)
-    assert not {"arm", "confirm"} & set(drawn.names("prop")), "that it may move is typed each time"
+        for field in stages[view.stage].own_fields if view.groups is None else ():
+            assert field.name in (whole if field.is_expert else common), (view.stage, field.name)
+    assert not {"arm", "confirm"} & set(whole), "that it may move is typed each time"
 
 
 def test_the_expert_settings_are_shown_on_demand(bpy, panels):

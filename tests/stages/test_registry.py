@@ -89,7 +89,7 @@ def test_description_is_whole(name):
     for model in (stage.inputs, stage.settings, stage.options):
         for base in model.__mro__:
             named = {field for names in vars(base).get("groups", {}).values() for field in names}
-            assert named | set(vars(base).get("experts", ())) <= set(
+            assert named | set(vars(base).get("common", ())) <= set(
                 getattr(base, "model_fields", {}))
         for field, about in model.model_json_schema().get("properties", {}).items():
             assert about["description"], field
@@ -109,13 +109,24 @@ def test_units_and_experts_are_in_the_schema():
         properties["damping_mass"])
 
 
-def test_help_hides_what_is_for_experts(capsys):
-    """--help leaves experts' options out and says so; --help-all has them."""
+def test_help_shows_what_most_users_choose(capsys):
+    """--help leaves other options out and says so; --help-all has them."""
     assert main.call(["simulate", "--help"]) == 0
     short = capsys.readouterr().out
     assert "--newmark-beta" not in short and "--help-all" in short and "Material:" in short
     assert main.call(["simulate", "--help-all"]) == 0
     assert "--newmark-beta" in capsys.readouterr().out
+
+
+def test_help_shows_about_a_fifth():
+    """Of all options and inputs, and of none more than ten."""
+    shown = {name: [field for part in ("inputs", "settings", "options")
+                    for field, about in stage_schema(name)[part].get("properties", {}).items()
+                    if not about["expert"]] for name in NAMES}
+    assert sum(map(len, shown.values())) < 0.25 * sum(
+        len(schema[part].get("properties", {})) for schema in map(stage_schema, NAMES)
+        for part in ("inputs", "settings", "options"))
+    assert max(map(len, shown.values())) <= 10
 
 
 @pytest.mark.slow

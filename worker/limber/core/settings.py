@@ -39,7 +39,8 @@ class Settings(BaseModel):
     Attributes:
         groups: Title to the names of the fields that stand under it; a model that inherits adds
             to those of its bases.
-        experts: Fields that only ``--help-all`` shows.
+        common: Fields that ``--help`` shows, beside those that must be given: what most users
+            choose. ``--help-all`` shows the others too.
         results_version: Raised where the same settings on the same input give other results than
             before: branches then count as out of date, and a batch runs the stage again.
     """
@@ -47,7 +48,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     groups: ClassVar[Groups] = {}
-    experts: ClassVar[tuple[str, ...]] = ()
+    common: ClassVar[tuple[str, ...]] = ()
     results_version: ClassVar[int] = 1
 
     @classmethod
@@ -61,8 +62,9 @@ class Settings(BaseModel):
 
     @classmethod
     def is_expert(cls, name: str) -> bool:
-        """Whether a field is shown to experts only."""
-        return any(name in vars(base).get("experts", ()) for base in cls.__mro__)
+        """Whether a field is shown on demand only."""
+        return not cls.model_fields[name].is_required() and not any(
+            name in vars(base).get("common", ()) for base in cls.__mro__)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:

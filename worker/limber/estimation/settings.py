@@ -21,7 +21,7 @@ class EstimateSettings(Settings):
         "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
                         "mesh_check", "shapes"),
     }
-    experts = ("key_frames", "evaluations", "delta_m2", "robust", "mesh_check", "shapes")
+    common = ("pull", "fractions")
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use; without it all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -81,6 +81,7 @@ class SwingSettings(Settings):
         "material": ("poisson", "density", "gravity"),
         "uncertainty": ("density_sigma",),
     }
+    common = ("pull",)
 
     pull: str | None = Field(None, description="Name of the swing; without it the only one.")
     periods: float = Field(6.0, ge=2, le=30, description="So many periods after the release.")
@@ -102,7 +103,7 @@ class VirtualPullSettings(Settings):
             "reach", "turn", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
     }
-    experts = ("damping", "phase", "turn", "outliers")
+    common = ("seed",)
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]; without it that of a "
@@ -174,6 +175,7 @@ class PredictSettings(Settings):
         "input": ("pull",),
         "grasp and loads": ("weight", "load", "gravity"),
     }
+    common = ("weight", "load")
 
     pull: str | None = Field(
         None, description="The pull whose points, grasp and gravity are taken; without it the "

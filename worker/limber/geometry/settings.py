@@ -18,8 +18,6 @@ class PreparationSettings(Settings):
         "shape": ("flying_angle", "flying_speck", "silhouette_reach", "keep_sheets",
             "outlier_ratio", "outlier_neighbours", "outlier_radius", "voxel"),
     }
-    experts = ("flying_angle", "flying_speck", "silhouette_reach", "outlier_neighbours",
-        "outlier_radius")
 
     crop_low: tuple[float, float, float] | None = Field(
         None, description="Lower corner of the part to keep, in the file's coordinates.")
@@ -57,8 +55,6 @@ class SkeletonSettings(Settings):
         "shape": ("contraction_points", "attraction", "gap_factor", "bridge_limit",
             "prune", "twig_probability", "plants", "radii", "radius_low", "radius_high"),
     }
-    experts = ("contraction_points", "attraction", "gap_factor", "bridge_limit",
-               "radius_low", "radius_high")
 
     contraction_points: int = Field(
         12_000, ge=50, description="Contract at most so many points (thinned evenly).")
@@ -92,7 +88,6 @@ class MeshSettings(Settings):
     groups: ClassVar[Groups] = {
         "mesh": ("mesher", "mesh_sides", "mesh_spacing", "mesh_time_limit", "mesh_memory_limit_mb"),
     }
-    experts = ("mesh_sides", "mesh_time_limit", "mesh_memory_limit_mb")
 
     mesher: Literal["auto", "ftetwild", "sweep"] = Field(
         "auto", description="auto: sweep along the axes, and fTetWild where that cannot join a "
@@ -114,6 +109,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         "material": ("young", "poisson", "density", "leaf_density"),
         "mesh": ("grasp_fraction",),
     }
+    common = ("unit", "up", "root", "leaves")
 
     unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
     up: Direction = Field(
@@ -154,7 +150,7 @@ class MeshSurfaceSettings(Settings):
         "mesh": ("elements_across", "mesh_time_limit", "mesh_memory_limit_mb", "grasp_fraction"),
         "material": ("young", "poisson", "density"),
     }
-    experts = ("mesh_time_limit", "mesh_memory_limit_mb")
+    common = ("unit",)
 
     unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
     up: Direction = Field(

@@ -23,7 +23,7 @@ class SimulateSettings(Settings):
             "damping_stiffness"),
         "solver": ("step", "scheme", "newmark_beta", "newmark_gamma", "lumped_mass"),
     }
-    experts = ("step", "scheme", "newmark_beta", "newmark_gamma", "lumped_mass", "rest_shape")
+    common = ("name", "move", "grasp_force", "young")
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result: frames/NAME.pc2 and frames/NAME.json.")

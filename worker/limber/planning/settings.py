@@ -45,8 +45,7 @@ class PlanSettings(Settings):
         "timing": ("speed", "acceleration", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
-    experts = ("goal_seed", "start_seed", "iterations", "engine", "replans", "field_error",
-               "slowings")
+    common = ("goal", "tip_goal", "target", "max_force", "max_strain")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "

@@ -23,7 +23,7 @@ class ImportSettings(Settings):
         "simulation": ("drive", "motion", "swing_start"),
         "noise": ("position_sigma", "force_sigma", "torque_sigma"),
     }
-    experts = ("yolo_weights", "yolo_prompt", "yolo_class", "torque_sigma")
+    common = ("unit", "grasp_point", "cell")
 
     kind: Kind = Field("auto", description="What SOURCE is; auto goes by its name and content.")
     robot: str | None = Field(None, description="CSV of the gripper: time, pose and wrench.")

@@ -21,7 +21,7 @@ from limber.core.settings import Settings, checked_settings
 
 
 class GroupedOption(click.Option):
-    """An option that stands under a title in the help; experts' options only in --help-all."""
+    """An option that stands under a title in the help; an expert's one only in --help-all."""
 
     def __init__(self, *declarations: Any, group: str = "running", expert: bool = False,
                  **attributes: Any):
@@ -44,7 +44,7 @@ class GroupedCommand(click.Command):
         super().__init__(*args, **attributes)
         self.params.append(GroupedOption(
             ["--help-all"], is_flag=True, is_eager=True, expose_value=False,
-            callback=_show_all, help="Show this message with the options for experts, and exit."))
+            callback=_show_all, help="Show this message with all options, and exit."))
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options title by title."""
@@ -69,7 +69,7 @@ class GroupedCommand(click.Command):
                     formatter.write_dl(records)
         if hidden:
             formatter.write_paragraph()
-            formatter.write_text(f"{hidden} more for experts: --help-all")
+            formatter.write_text(f"{hidden} more options: --help-all")
 
 
 _ALL = "limber.help_all"

@@ -36,6 +36,7 @@ class EstimateOptions(RunOptions):
     """How an estimate is run."""
 
     groups: ClassVar[Groups] = {"input": ("bag", "cell"), "running": ("resume", "follow", "pace")}
+    common = ("bag",)
 
     bag: Path | None = Field(
         None, description="Import this recording first (MCAP, rosbag2, RTDE log) as the pull of "

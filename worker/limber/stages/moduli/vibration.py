@@ -46,6 +46,7 @@ class VibrationSettings(Settings):
 
     groups: ClassVar[Groups] = {"record": ("start", "sensor"),
                                 "known": ("density_sigma", "radius_sigma")}
+    common = ("sensor",)
 
     start: float | None = Field(None, description="When the branch is left to itself, on the "
                                 "record's clock [s]; by default where it moves most.")

@@ -35,6 +35,7 @@ class LoadSettings(Settings):
         "gusts": ("gust", "gust_length", "gust_time", "gust_record"),
         "limits": ("strain_limit", "limit_load", "most"),
         "output": ("name",)}
+    common = ("wind", "snow", "fruit", "cut", "name")
 
     wind: tuple[float, float, float] | None = Field(
         None, description="Velocity of the wind, branch frame [m/s].",

@@ -44,6 +44,7 @@ class ExecuteInputs(BranchInputs):
     """A branch folder, one of its plans and the robot's cell."""
 
     groups: ClassVar[Groups] = {"input": ("name", "cell")}
+    common = ("name",)
 
     name: str = Field("path", description="Name of the plan.")
     cell: Path = required("The robot's cell file.", "cell.toml")
@@ -66,6 +67,7 @@ class ExecuteOptions(Settings):
     """Dry run, or motion."""
 
     groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop")}
+    common = ("arm", "confirm")
 
     arm: bool = Field(False, description="Move the robot. Without it: a dry run.",
                       json_schema_extra={"switch": True, "panel": False})

@@ -51,6 +51,7 @@ class PlanInputs(BranchInputs):
     """A branch folder, and the plan's name."""
 
     groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
+    common = ("cell", "name")
 
     cell: Path | None = Field(None, description=(
         "The robot's cell file: its workspace, force limit and obstacles hold, and its arm must "

@@ -34,6 +34,7 @@ class RecordInputs(BranchInputs):
     """A branch folder, the robot's cell and the recording's name."""
 
     groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
+    common = ("name",)
 
     cell: Path = required("The robot's cell file.", "cell.toml")
     name: str = Field("pull-1", description="Name of the recording.")
@@ -49,6 +50,7 @@ class RecordSettings(Settings):
     groups: ClassVar[Groups] = {
         "pull": ("direction", "distance", "shape", "waypoints", "suggested", "speed", "cycles",
                  "pause")}
+    common = ("direction", "distance")
 
     direction: tuple[float, float, float] = Field(
         (1.0, 0.0, 0.0), description="Where to pull, branch frame; its length does not count.")
@@ -71,6 +73,7 @@ class RecordOptions(Settings):
     """How a recording is run."""
 
     groups: ClassVar[Groups] = {"running": ("confirm", "markers", "after_stop", "recover")}
+    common = ("confirm",)
 
     confirm: str | None = Field(
         None, description="The recording's name, typed: the robot moves. Without it the name is "

@@ -39,6 +39,7 @@ class SuggestPullInputs(BranchInputs):
     """A branch folder, and a plan in it."""
 
     groups: ClassVar[Groups] = {"input": ("plan",)}
+    common = ("plan",)
 
     plan: str | None = Field(None, description=(
         "Name of a plan; it is said whether another pull is worth it for this one."))

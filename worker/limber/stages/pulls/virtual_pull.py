@@ -24,6 +24,7 @@ class VirtualPullInputs(BranchInputs):
     """A branch folder, and the pull's name."""
 
     groups: ClassVar[Groups] = {"output": ("name",)}
+    common = ("name",)
 
     name: str = Field("pull-1", description="Name of the pull.")
 

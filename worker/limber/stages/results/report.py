@@ -18,6 +18,7 @@ class ReportInputs(BranchInputs):
     """A branch folder, and a picture of it."""
 
     groups: ClassVar[Groups] = {"input": ("picture", "caliper")}
+    common = ("caliper",)
 
     picture: Path | None = Field(
         None, description="A PNG to open the page with, such as the render of `limber scene`.")

@@ -22,6 +22,7 @@ class SceneInputs(BranchInputs):
     """A branch folder, and the files to make of it."""
 
     groups: ClassVar[Groups] = {"output": ("output", "render", "turntable", "data")}
+    common = ("output", "render")
 
     output: Path | None = Field(None, description="The .blend to write.",
                                 json_schema_extra={"short": "-o"})

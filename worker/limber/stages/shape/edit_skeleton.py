@@ -50,6 +50,7 @@ class SkeletonInputs(BranchInputs):
     """A branch folder, edits of its skeleton, and where to write the skeleton."""
 
     groups: ClassVar[Groups] = {"input": ("edits", "frame", "append"), "output": ("output",)}
+    common = ("edits",)
 
     edits: Path | None = Field(
         None, description="Edits (JSON) that take the place of those that the branch has; an "

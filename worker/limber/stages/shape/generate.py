@@ -33,6 +33,7 @@ class GenerateSettings(BranchSpec):
     """A generated branch and its seed."""
 
     groups: ClassVar[Groups] = {"shape": ("seed",)}
+    common = ("seed",)
 
     seed: int = Field(0, description="Seed of all that is random.")
 

@@ -42,6 +42,7 @@ class ReconstructInputs(Settings):
 
     groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "edits", "camera", "mask"),
                                "output": ("output",)}
+    common = ("camera",)
 
     cloud: Path = argument("A point cloud file, or a folder of them: then each becomes a branch "
                            "folder in the output folder, and a bad one does not stop the others.")

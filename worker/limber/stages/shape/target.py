@@ -34,6 +34,7 @@ class TargetSettings(Settings):
     """Where a target is and what it weighs."""
 
     groups: ClassVar[Groups] = {"input": ("at", "mass", "farthest", "remove")}
+    common = ("at",)
 
     at: tuple[float, float, float] | None = Field(
         None, description="Where it is on the branch as it hangs, branch frame [m].",
