@@ -16,6 +16,7 @@ import numpy as np
 
 from limber.core.errors import InputError, WorkError
 from limber.core.present import present
+from limber.core.processes.ending import end_by_closing
 from limber.session.frame_buffer import Frame, FrameReader
 from limber.session.protocol import PROTOCOL
 from limber.session.settings import SessionSettings
@@ -221,12 +222,9 @@ class InteractiveSession:
     def close(self) -> None:
         """End the session; safe to call again."""
         if self.alive:
-            try:
+            with contextlib.suppress(WorkError, OSError):  # it ends just now
                 self._send(command="close")
-                present(self._process.stdin, "standard input").close()
-                self._process.wait(_GRACE_SECONDS)
-            except (WorkError, OSError, subprocess.TimeoutExpired):
-                self._process.kill()
+            end_by_closing(self._process, _GRACE_SECONDS)
         self._process.wait()
         if self._frames is not None:
             self._frames.close()

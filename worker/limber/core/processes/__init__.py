@@ -4,6 +4,7 @@ It stands on nothing but errors and progress, so that every package may use it.
 """
 
 from limber.core.processes.budget import core_budget, worker_count
-from limber.core.processes.pool import Limits, Pool, run_tasks
+from limber.core.processes.limits import Limits
+from limber.core.processes.pool import Pool, run_tasks
 
 __all__ = ["Limits", "Pool", "core_budget", "run_tasks", "worker_count"]

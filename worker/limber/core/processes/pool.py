@@ -12,16 +12,14 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
-from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import wait as wait_for_any
 from threading import Event, Lock, Thread
 from typing import Any
 
 from limber.core.errors import Cancelled, DamagedCacheWarning, WorkError
-from limber.core.present import present
 from limber.core.processes.budget import core_budget, worker_count
-from limber.core.processes.ending import kill_tree
+from limber.core.processes.limits import UNLIMITED, Limits
 from limber.core.processes.pool_process import (
     Began,
     CacheDamaged,
@@ -29,30 +27,13 @@ from limber.core.processes.pool_process import (
     Reported,
     Returned,
     Task,
-    serve,
 )
+from limber.core.processes.pool_worker import Job, Worker
 from limber.core.progress import SILENT, Progress
 
 _TICK_SECONDS = 0.1
-_MEMORY_SECONDS = 0.5
 _GRACE_SECONDS = 3.0
 """How long a cancelled task has to come to its next report before its process is killed."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a task may take; its process is killed when it goes over.
-
-    Attributes:
-        seconds: From its beginning, or None.
-        memory_mb: Of its process and all that it started, or None.
-    """
-
-    seconds: float | None = None
-    memory_mb: float | None = None
-
-
-UNLIMITED = Limits()
 
 
 class Pool:
@@ -73,8 +54,8 @@ class Pool:
         self._cores_each = max(core_budget() // self.worker_count, 1)
         self._context = get_context("spawn")
         self._guard = Lock()
-        self._waiting: deque[_Job] = deque()
-        self._workers: list[_Worker] = []
+        self._waiting: deque[Job] = deque()
+        self._workers: list[Worker] = []
         self._broken: BaseException | None = None
         self._closing = Event()
         self._bell, self._bell_button = self._context.Pipe(duplex=False)
@@ -89,7 +70,7 @@ class Pool:
         A function that takes ``progress`` gets one whose reports come to the ``progress`` given
         here, from another thread.
         """
-        job = _Job(Task(function, arguments), limits, progress)
+        job = Job(Task(function, arguments), limits, progress)
         with self._guard:
             if self._closing.is_set():
                 raise WorkError(f"The pool of {self.name} is closed.")
@@ -198,7 +179,8 @@ class Pool:
                          + sum(w.job is not None for w in self._workers))
             missing = needed - len(self._workers)
         for _ in range(missing):
-            self._workers.append(_Worker(self._context, self._begin, self._cores_each))
+            self._workers.append(Worker(self._context, self._begin, self._cores_each,
+                                        self.name))
         for worker in self._workers:
             with self._guard:
                 while worker.is_idle and self._waiting:
@@ -207,7 +189,7 @@ class Pool:
                         worker.give(job)
 
     def _listen(self) -> None:
-        by_handle: dict[Any, _Worker] = {}
+        by_handle: dict[Any, Worker] = {}
         for worker in self._workers:
             by_handle |= {worker.pipe: worker, worker.process.sentinel: worker}
         ready = wait_for_any([self._bell, *by_handle], _TICK_SECONDS)
@@ -216,7 +198,7 @@ class Pool:
         for worker in {id(w): w for h, w in by_handle.items() if h in ready}.values():
             self._hear(worker)
 
-    def _hear(self, worker: "_Worker") -> None:
+    def _hear(self, worker: Worker) -> None:
         """Take in all that a process has said; it may have ended after it."""
         try:
             while worker.pipe.poll():
@@ -235,7 +217,7 @@ class Pool:
                 "It crashed, or the system ended it because memory ran out.",
                 "Use a coarser mesh or fewer processes (LIMBER_CORES)."))
 
-    def _take(self, worker: "_Worker", said: Any) -> None:
+    def _take(self, worker: Worker, said: Any) -> None:
         if isinstance(said, Began):
             worker.has_begun = True
         elif isinstance(said, CacheDamaged):
@@ -262,22 +244,10 @@ class Pool:
                 if now - job.cancelled_at > _GRACE_SECONDS:
                     self._end(worker, Cancelled())
                 continue
-            seconds = now - worker.since
-            if job.limits.seconds is not None and seconds > job.limits.seconds:
-                self._end(worker, WorkError(
-                    f"{self.name} was stopped after {seconds:.0f} s.",
-                    "It had not finished within its time limit.",
-                    "Allow it more time, or make the task smaller."))
-            elif job.limits.memory_mb is not None and now > worker.next_memory_check:
-                worker.next_memory_check = now + _MEMORY_SECONDS
-                used = memory_mb(worker.process_id)
-                if used > job.limits.memory_mb:
-                    self._end(worker, WorkError(
-                        f"{self.name} was stopped at {used:.0f} MB of memory.",
-                        f"Its limit is {job.limits.memory_mb:.0f} MB.",
-                        "Allow it more, or make the task smaller."))
+            if error := worker.broken():
+                self._end(worker, error)
 
-    def _end(self, worker: "_Worker", error: BaseException) -> None:
+    def _end(self, worker: Worker, error: BaseException) -> None:
         self._workers.remove(worker)
         worker.kill()
         if worker.job is not None:
@@ -285,91 +255,6 @@ class Pool:
         elif not worker.has_begun and not self._closing.is_set():
             # The next one would end in the same way.
             self._broken = self._broken or error
-
-
-@dataclass
-class _Job:
-    """A task, what it may take, and who waits for it."""
-
-    task: Task
-    limits: Limits
-    progress: Progress
-    future: Future = field(default_factory=Future)
-    cancelled_at: float | None = None
-
-    def report(self, said: Reported) -> None:
-        try:
-            if said.warning:
-                self.progress.warn(said.message)
-            else:
-                self.progress(said.fraction, said.message, **said.numbers)
-        except Cancelled:
-            self._end_soon()
-
-    def cancel(self) -> None:
-        if self.future.cancel():
-            # Nobody else will tell those who wait for it.
-            self.future.set_running_or_notify_cancel()
-        else:
-            self._end_soon()
-
-    def _end_soon(self) -> None:
-        if self.cancelled_at is None:
-            self.cancelled_at = time.monotonic()
-
-    def fail(self, error: BaseException) -> None:
-        if not self.future.done():
-            self.future.set_exception(error)
-
-
-class _Worker:
-    """One process, its pipe and its task."""
-
-    def __init__(self, context: Any, begin: tuple, cores: int):
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=serve, args=(theirs, begin, cores),
-                                       name="limber pool")
-        self.process.start()
-        self.process_id = self.process.pid
-        # From now on the pipe closes when either side ends.
-        theirs.close()
-        self.job: _Job | None = None
-        self.has_begun = False
-        self.since = 0.0
-        self.next_memory_check = 0.0
-        self._is_told = False
-
-    @property
-    def is_idle(self) -> bool:
-        return self.has_begun and self.job is None
-
-    def give(self, job: _Job) -> None:
-        self.job, self.since, self._is_told = job, time.monotonic(), False
-        try:
-            self.pipe.send(job.task)
-        except OSError:
-            # It has just died; that is seen, and told to the task, in the next round.
-            return
-        except Exception as error:
-            self.take_job().fail(error)
-
-    def take_job(self) -> _Job:
-        job, self.job = present(self.job, "task"), None
-        return job
-
-    def cancel_once(self) -> None:
-        if not self._is_told:
-            self._is_told = True
-            try:
-                self.pipe.send(None)
-            except OSError:
-                return
-
-    def kill(self) -> None:
-        kill_tree(self.process_id)
-        self.process.join()
-        self.pipe.close()
-        self.process.close()
 
 
 class _Course:
@@ -435,21 +320,3 @@ class _Here:
             part(fraction, message, **numbers)
             course.report(done_count)
         self.progress = Progress(hear, part.warn)
-
-
-def memory_mb(process_id: int) -> float:
-    """Return the memory [MB] of a process and all that it has started."""
-    import psutil
-
-    try:
-        process = psutil.Process(process_id)
-        family = [process, *process.children(recursive=True)]
-    except psutil.NoSuchProcess:
-        return 0.0
-    used = 0
-    for each in family:
-        try:
-            used += each.memory_info().rss
-        except psutil.NoSuchProcess:
-            continue
-    return used / 1e6

@@ -8,20 +8,18 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Sequence
 from typing import Any, TextIO
 
 from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
 from limber.core.processes.budget import CORES
 from limber.core.processes.ending import PARENT_PIPE, kill_tree
-from limber.core.processes.pool import UNLIMITED, Limits, memory_mb
+from limber.core.processes.limits import UNLIMITED, Limits, LimitWatch
 from limber.core.progress import SILENT, Progress
 
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop, 130: Cancelled}
 _GRACE_SECONDS = 10.0
 _TICK_SECONDS = 0.1
-_MEMORY_SECONDS = 0.5
 
 
 def run_stage(arguments: Sequence[str], progress: Progress = SILENT, *,
@@ -89,8 +87,7 @@ def _followed(name: str, process: subprocess.Popen, progress: Progress,
     lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
     reader.start()
-    started = time.monotonic()
-    next_memory_check = started
+    watch = LimitWatch(name, limits, process.pid)
     result: dict[str, Any] = {}
     while True:
         try:
@@ -104,18 +101,8 @@ def _followed(name: str, process: subprocess.Popen, progress: Progress,
         result = _taken(line, progress) or result
         if progress.cancelled:
             raise Cancelled
-        now = time.monotonic()
-        if limits.seconds is not None and now - started > limits.seconds:
-            raise WorkError(f"{name} was stopped after {now - started:.0f} s.",
-                            "It had not finished within its time limit.",
-                            "Allow it more time, or make the task smaller.")
-        if limits.memory_mb is not None and now > next_memory_check:
-            next_memory_check = now + _MEMORY_SECONDS
-            used = memory_mb(process.pid)
-            if used > limits.memory_mb:
-                raise WorkError(f"{name} was stopped at {used:.0f} MB of memory.",
-                                f"Its limit is {limits.memory_mb:.0f} MB.",
-                                "Allow it more, or make the task smaller.")
+        if error := watch.broken():
+            raise error
 
 
 def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:

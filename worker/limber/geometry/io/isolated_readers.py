@@ -5,20 +5,18 @@
 """
 
 import importlib
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, WorkError
 from limber.core.files.reading import read_arrays
-from limber.core.processes.ending import end_by_kernel, kill_tree
-from limber.core.processes.pool import memory_mb
+from limber.core.processes.child_module import run_module
+from limber.core.processes.ending import end_by_kernel
+from limber.core.processes.limits import Limits
 
 _LEAST_SECONDS, _SECONDS_PER_MB = 8.0, 2.0
 _LEAST_MB, _MB_PER_MB = 1500.0, 60.0
@@ -41,41 +39,20 @@ def read_apart(kind: str, path: Path) -> dict[str, np.ndarray]:
     size_mb = sum(part.stat().st_size for part in parts if part.is_file()) / 1e6
     with tempfile.TemporaryDirectory(prefix="limber-read-") as folder:
         target = Path(folder, "read.npz")
-        command = [sys.executable, "-m", "limber.geometry.io.isolated_readers", kind,
-                   str(Path(path).resolve()), str(target), str(os.getpid())]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                                   stderr=subprocess.PIPE, env=environment)
         try:
-            trouble = _watch(process, _LEAST_SECONDS + _SECONDS_PER_MB * size_mb,
-                             _LEAST_MB + _MB_PER_MB * size_mb)
-        finally:
-            if process.poll() is None:
-                kill_tree(process.pid)
-            process.wait()
-            told = process.stderr.read().decode(errors="replace").strip().splitlines()
-            process.stderr.close()
-        if not trouble and process.returncode == 0 and target.exists():
-            return _unpacked(read_arrays(target, "points"))
-        last = told[-1][:200] if told else f"it ended with code {process.returncode}"
-        raise InputError(f"{path} cannot be read ({trouble or last}).",
+            code, last = run_module(
+                __name__, [kind, str(Path(path).resolve()), str(target)], "its reader",
+                Limits(_LEAST_SECONDS + _SECONDS_PER_MB * size_mb,
+                       _LEAST_MB + _MB_PER_MB * size_mb))
+        except WorkError as error:
+            trouble = error.seen.rstrip(".")
+        else:
+            if code == 0 and target.exists():
+                return _unpacked(read_arrays(target, "points"))
+            trouble = last[:200] or f"it ended with code {code}"
+        raise InputError(f"{path} cannot be read ({trouble}).",
                          "It is damaged, cut short, or not what its suffix says.",
                          "Export it again.")
-
-
-def _watch(process: subprocess.Popen, seconds: float, most_mb: float) -> str:
-    """Wait for the end; return why it was stopped, or nothing."""
-    started = time.monotonic()
-    while True:
-        try:
-            process.wait(timeout=0.05)
-            return ""
-        except subprocess.TimeoutExpired:
-            pass
-        if time.monotonic() - started > seconds:
-            return f"its reader was stopped after {seconds:.0f} s"
-        if memory_mb(process.pid) > most_mb:
-            return f"its reader was stopped at {most_mb:.0f} MB"
 
 
 def las_arrays(path: Path) -> dict[str, np.ndarray]:

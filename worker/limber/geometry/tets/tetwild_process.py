@@ -5,19 +5,17 @@ starts.
 """
 
 import importlib.util
-import os
-import subprocess
 import sys
 import tempfile
-import time
 import types
 from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import MeshingError, MissingDependencyError
-from limber.core.processes.ending import end_by_kernel, kill_tree
-from limber.core.processes.pool import memory_mb
+from limber.core.errors import MeshingError, MissingDependencyError, WorkError
+from limber.core.processes.child_module import run_module
+from limber.core.processes.ending import end_by_kernel
+from limber.core.processes.limits import Limits
 from limber.core.progress import SILENT, Progress
 
 
@@ -47,53 +45,28 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependencyError("pytetwild (fTetWild) is not installed.", "",
                                      "Install it, or choose --mesher sweep.")
+
+    def waiting(seconds: float) -> None:
+        progress(min(seconds / time_limit, 0.99), "fTetWild", seconds=round(seconds, 1))
+
     with tempfile.TemporaryDirectory(prefix="limber-tetwild-") as folder:
         source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
         np.savez(source, vertices=vertices, faces=faces, edge_length=edge_length,
                  epsilon=epsilon, stop_energy=stop_energy, coarsen=coarsen)
-        command = [sys.executable, "-m", "limber.geometry.tets.tetwild_process", str(source),
-                   str(target), str(os.getpid())]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        # It also writes a file of its own (__tracked_surface.stl) where it runs.
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                                   stderr=subprocess.PIPE, env=environment, cwd=folder)
         try:
-            _watch(process, time_limit, memory_limit_mb, progress)
-            message = process.stderr.read().decode(errors="replace").strip()
-        finally:
-            if process.poll() is None:
-                kill_tree(process.pid)
-            process.wait()
-            process.stderr.close()
-        if process.returncode != 0 or not target.exists():
-            last = message.splitlines()[-1] if message else "no message"
-            raise MeshingError(f"fTetWild ended with code {process.returncode} ({last}).",
+            # It also writes a file of its own (__tracked_surface.stl) where it runs.
+            code, last = run_module(__name__, [str(source), str(target)], "fTetWild",
+                                    Limits(time_limit, memory_limit_mb), folder=Path(folder),
+                                    waiting=waiting)
+        except WorkError as error:
+            raise MeshingError(error.seen, error.why, "Raise --mesh-time-limit or "
+                               "--mesh-memory-limit-mb, or choose a coarser mesh.") from error
+        if code != 0 or not target.exists():
+            raise MeshingError(f"fTetWild ended with code {code} ({last or 'no message'}).",
                                "The surface may be too fine or broken.",
                                "Choose --mesher sweep, or a coarser mesh.")
         with np.load(target) as result:
             return result["nodes"], result["tets"]
-
-
-def _watch(process: subprocess.Popen, time_limit: float, memory_limit_mb: float,
-           progress: Progress) -> None:
-    started = time.perf_counter()
-    while True:
-        try:
-            process.wait(timeout=0.1)
-            return
-        except subprocess.TimeoutExpired:
-            pass
-        seconds = time.perf_counter() - started
-        progress(min(seconds / time_limit, 0.99), "fTetWild", seconds=round(seconds, 1))
-        if seconds > time_limit:
-            raise MeshingError(f"fTetWild was stopped after {seconds:.0f} s.",
-                               "It had not finished within its time limit.",
-                               "Raise --mesh-time-limit, or choose a coarser mesh.")
-        used = memory_mb(process.pid)
-        if used > memory_limit_mb:
-            raise MeshingError(f"fTetWild was stopped at {used:.0f} MB.",
-                               "It went over its memory limit.",
-                               "Raise --mesh-memory-limit-mb, or choose a coarser mesh.")
 
 
 def _load_tetrahedralize():
