@@ -13,11 +13,9 @@ writes (:mod:`limber.store.lock`), any number read (:meth:`Branch.read`, which c
 What killed programs left behind is finished or swept by the next one that writes.
 """
 
-import gc
 import os
 import shutil
 import time
-import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -27,15 +25,23 @@ from typing import Any
 from pydantic import BaseModel
 
 from limber.core.constants import GRAVITY
-from limber.core.errors import BranchFolderError, InputError, WorkError
-from limber.core.files.atomic import file_digest, flush_folder, write_atomically
-from limber.core.files.safe_names import inside, refuse_links
-from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
+from limber.core.errors import BranchFolderError
+from limber.core.files.atomic import file_digest
+from limber.core.files.temporary_names import owned_name, sweep
 from limber.core.json_values import plain
-from limber.core.machine_errors import machine_error
 from limber.store import journal
+from limber.store.disk import gone, in_words, require_room, require_there
+from limber.store.folder_state import (
+    begin,
+    finish_pending,
+    inside,
+    is_litter,
+    refuse_links,
+    require_folder,
+    settle,
+)
 from limber.store.growing_files import Stream
-from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, run_lock, wait_for_commit
+from limber.store.lock import commit_lock, run_lock
 from limber.store.manifest import (
     MANIFEST,
     FileEntry,
@@ -50,8 +56,6 @@ from limber.store.verify import Checker, Damage, damage_error
 _STREAMS = ".streams"
 RESULTS = "results"
 """Among a stage's programs: the version of its settings' results; see limber.core.settings."""
-LEAST_FREE_BYTES = 200e6
-"""A stage does not begin with less room on the disk: it would lose its work at the end."""
 
 
 class Stage:
@@ -74,7 +78,7 @@ class Stage:
         path = self._folder / checked_name(name)
         if not self._folder.is_dir():
             # Not made anew: below the empty place of a lost disk there is another disk.
-            raise _gone(self._folder.parent)
+            raise gone(self._folder.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -128,16 +132,16 @@ class Branch:
             BranchFolderError: it holds other files, or cannot be made or written to.
         """
         folder = Path(folder)
-        _refuse_links(folder)
+        refuse_links(folder)
         if (folder / MANIFEST).exists() or journal.is_pending(folder):
             return cls.open(folder)
-        if folder.is_dir() and any(not _is_litter(p.name) for p in folder.iterdir()):
+        if folder.is_dir() and any(not is_litter(p.name) for p in folder.iterdir()):
             raise BranchFolderError(
                 f"{folder} exists and is not a branch folder.",
                 f"It has files but no {MANIFEST}; writing there could overwrite them.",
                 "Name a new folder with -o, for example NAME.branch.")
         name = folder.name.removesuffix(".branch") or folder.resolve().name.removesuffix(".branch")
-        _begin(folder, Manifest(name=name))
+        begin(folder, Manifest(name=name))
         return cls.open(folder)
 
     @classmethod
@@ -152,10 +156,10 @@ class Branch:
                 names that lead out of it.
         """
         folder = Path(folder)
-        with _in_words(folder):
-            _require_folder(folder)
-            _refuse_links(folder)
-            _finish_pending(folder)
+        with in_words(folder):
+            require_folder(folder)
+            refuse_links(folder)
+            finish_pending(folder)
             branch = cls(folder, read_manifest(folder))
         if verify:
             branch.verify()
@@ -176,10 +180,10 @@ class Branch:
                 not set.
         """
         folder = Path(folder)
-        with _in_words(folder):
-            _require_folder(folder)
-            _refuse_links(folder)
-            _settle(folder, unfinished=unfinished)
+        with in_words(folder):
+            require_folder(folder)
+            refuse_links(folder)
+            settle(folder, unfinished=unfinished)
             return cls(folder, journal.current_manifest(folder), only_reads=True)
 
     @property
@@ -194,7 +198,7 @@ class Branch:
             BranchFolderError: the manifest has it, or files in it, and they are damaged.
         """
         name = checked_name(name)
-        path = _inside(self.folder, name)
+        path = inside(self.folder, name)
         self._check(n for n in self.manifest.files if n == name or n.startswith(name + "/"))
         return path
 
@@ -216,8 +220,8 @@ class Branch:
     def names(self, folder: str) -> list[str]:
         """Return the names of the entries under ``folder`` (``pulls``, ``plans``), sorted."""
         prefix = folder.rstrip("/") + "/"
-        inside = (name[len(prefix):] for name in self.manifest.files if name.startswith(prefix))
-        return sorted({PurePosixPath(name).parts[0] for name in inside})
+        below = (name[len(prefix):] for name in self.manifest.files if name.startswith(prefix))
+        return sorted({PurePosixPath(name).parts[0] for name in below})
 
     def verify(self) -> None:
         """Compare every file with the manifest.
@@ -236,9 +240,9 @@ class Branch:
         if not damages:
             return
         if self._only_reads:
-            _settle(self.folder)
+            settle(self.folder)
         else:
-            _finish_pending(self.folder)
+            finish_pending(self.folder)
         now = read_manifest(self.folder).files
         renewed = [d.name for d in damages if now.get(d.name) != self.manifest.files[d.name]]
         if renewed:
@@ -261,11 +265,11 @@ class Branch:
             BranchFolderError: another program holds it; says who and since when.
             WorkError: the disk is full or nearly so, or the folder is lost, now or until the end.
         """
-        _require_there(self.folder)
-        with _in_words(self.folder), run_lock(self.folder, purpose) as is_first:
+        require_there(self.folder)
+        with in_words(self.folder), run_lock(self.folder, purpose) as is_first:
             if is_first:
                 sweep(self.folder)
-                _require_room(self.folder, purpose)
+                require_room(self.folder, purpose)
             yield
 
     def stream(self, name: str) -> Stream:
@@ -340,7 +344,7 @@ class Branch:
         written = {name: FileEntry(sha256=file_digest(work / name),
                                    bytes=(work / name).stat().st_size, stage=key)
                    for name in entry.writes}
-        _require_there(self.folder)
+        require_there(self.folder)
         with commit_lock(self.folder):
             # One that a killed program left comes first: its files count already.
             journal.roll_forward(self.folder)
@@ -370,84 +374,6 @@ class Branch:
         return {name: self.digest(name) for name in reads} | dict(digests or {})
 
 
-def _begin(folder: Path, manifest: Manifest) -> None:
-    """Make the folder with its manifest: a new one appears whole, an empty one is filled."""
-    unfinished = folder.with_name(owned_name(folder.name))
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        sweep_beside(folder)
-        if folder.is_dir():
-            with commit_lock(folder):
-                sweep(folder)
-                if not (folder / MANIFEST).exists():
-                    write_atomically(folder / MANIFEST, manifest.text())
-            return
-        unfinished.mkdir()
-        try:
-            write_atomically(unfinished / MANIFEST, manifest.text())
-            os.rename(unfinished, folder)
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
-        flush_folder(folder.parent)
-    except OSError as error:
-        if (folder / MANIFEST).exists():
-            # Another program made it in the same moment.
-            return
-        raise BranchFolderError(
-            f"{folder} cannot be written to ({error.strerror}).",
-            "Results go there.", "Choose another place with -o, or change its permissions.",
-        ) from error
-
-
-def settled_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a branch folder, once what a killed program left is finished.
-
-    For those who carry a folder elsewhere and read nothing of it.
-
-    Raises:
-        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`; or it has links.
-    """
-    _refuse_links(folder)
-    _finish_pending(folder)
-    return read_manifest(folder)
-
-
-def _require_folder(folder: Path) -> None:
-    if not folder.is_dir():
-        raise BranchFolderError(
-            f"There is no folder {folder}.", "A branch folder was expected.",
-            "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
-
-
-def _refuse_links(folder: Path) -> None:
-    try:
-        refuse_links(folder)
-    except InputError as error:
-        raise BranchFolderError(error.seen, error.why, error.fix) from error
-
-
-def _inside(folder: Path, name: str) -> Path:
-    try:
-        return inside(folder, name)
-    except InputError as error:
-        raise BranchFolderError(error.seen, error.why, error.fix) from error
-
-
-def _settle(folder: Path, *, unfinished: bool = False) -> None:
-    """Wait for a program that enters results; refuse what a killed one left, unless ``unfinished``.
-    """
-    if journal.is_pending(folder):
-        wait_for_commit(folder)
-        if journal.is_pending(folder) and not unfinished:
-            raise journal.unfinished_error(folder)
-
-
-def _finish_pending(folder: Path) -> None:
-    if journal.is_pending(folder):
-        with commit_lock(folder):
-            journal.roll_forward(folder)
-
-
 def _results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
     return str(getattr(type(settings), "results_version", 1))
 
@@ -455,58 +381,6 @@ def _results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
 def _told_version(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
     version = _results_version(settings)
     return {} if version == "1" else {RESULTS: version}
-
-
-@contextmanager
-def _in_words(folder: Path) -> Iterator[None]:
-    """Say what a full disk or a lost folder does to a stage as the user can read it."""
-    try:
-        yield
-    except OSError as error:
-        if _is_gone(folder):
-            raise _gone(folder) from error
-        told = machine_error(error, folder)
-        if told is None:
-            raise
-        # A file that the failed writer still has open keeps its room, removed or not; the next
-        # stage of this process would find the disk as full.
-        traceback.clear_frames(error.__traceback__)
-        gc.collect()
-        raise told from error
-
-
-def _require_there(folder: Path) -> None:
-    """Refuse a folder that was there and is not any more: locks would make an empty one."""
-    if _is_gone(folder):
-        raise _gone(folder)
-
-
-def _is_gone(folder: Path) -> bool:
-    try:
-        return not (folder / MANIFEST).is_file() and not journal.is_pending(folder)
-    except OSError:
-        # The place does not answer: another error says so better.
-        return False
-
-
-def _gone(folder: Path) -> WorkError:
-    return WorkError(f"{folder} is not there any more.",
-                     "It was moved or removed, or the disk or network folder that it is on was "
-                     "lost.", "Bring it back, and run this again: what was stored before is kept.")
-
-
-def _require_room(folder: Path, purpose: str) -> None:
-    free = shutil.disk_usage(folder).free
-    if free < LEAST_FREE_BYTES:
-        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left.",
-                        f"For {purpose} {LEAST_FREE_BYTES / 1e6:.0f} MB are wanted: it would end "
-                        "without its results.",
-                        "Make room (`limber cache --clear` frees some), or move the folder.")
-
-
-def _is_litter(name: str) -> bool:
-    """Whether a file of this name may be in a folder that was killed while it was made."""
-    return name in (COMMIT_LOCK, RUN_LOCK) or is_owned_name(name)
 
 
 def _short(key: str) -> str:

@@ -26,7 +26,7 @@ from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkErr
 from limber.core.files.atomic import file_digest, write_atomically
 from limber.core.files.reading import read_json
 from limber.core.files.temporary_names import owned_name, sweep_beside
-from limber.store.branch import settled_manifest
+from limber.store.folder_state import settled_manifest
 from limber.store.manifest import MANIFEST, Manifest, checked_name, read_manifest
 
 AT_ONCE = 2

@@ -1,0 +1,63 @@
+"""What a full disk or a lost folder does to a stage, as its user can read it."""
+
+import gc
+import shutil
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from limber.core.errors import WorkError
+from limber.core.machine_errors import machine_error
+from limber.store import journal
+from limber.store.manifest import MANIFEST
+
+LEAST_FREE_BYTES = 200e6
+"""A stage does not begin with less room on the disk: it would lose its work at the end."""
+
+
+@contextmanager
+def in_words(folder: Path) -> Iterator[None]:
+    """Say what a full disk or a lost folder does to a stage as the user can read it."""
+    try:
+        yield
+    except OSError as error:
+        if _is_gone(folder):
+            raise gone(folder) from error
+        told = machine_error(error, folder)
+        if told is None:
+            raise
+        # A file that the failed writer still has open keeps its room, removed or not; the next
+        # stage of this process would find the disk as full.
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+        raise told from error
+
+
+def require_there(folder: Path) -> None:
+    """Refuse a folder that was there and is not any more: locks would make an empty one."""
+    if _is_gone(folder):
+        raise gone(folder)
+
+
+def _is_gone(folder: Path) -> bool:
+    try:
+        return not (folder / MANIFEST).is_file() and not journal.is_pending(folder)
+    except OSError:
+        # The place does not answer: another error says so better.
+        return False
+
+
+def gone(folder: Path) -> WorkError:
+    return WorkError(f"{folder} is not there any more.",
+                     "It was moved or removed, or the disk or network folder that it is on was "
+                     "lost.", "Bring it back, and run this again: what was stored before is kept.")
+
+
+def require_room(folder: Path, purpose: str) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < LEAST_FREE_BYTES:
+        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left.",
+                        f"For {purpose} {LEAST_FREE_BYTES / 1e6:.0f} MB are wanted: it would end "
+                        "without its results.",
+                        "Make room (`limber cache --clear` frees some), or move the folder.")

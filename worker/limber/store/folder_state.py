@@ -1,0 +1,100 @@
+"""The folder of a branch before anything of it is read: made, there, whole, without links."""
+
+import os
+import shutil
+from pathlib import Path
+
+from limber.core.errors import BranchFolderError, InputError
+from limber.core.files import safe_names
+from limber.core.files.atomic import flush_folder, write_atomically
+from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
+from limber.store import journal
+from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, wait_for_commit
+from limber.store.manifest import MANIFEST, Manifest, read_manifest
+
+
+def begin(folder: Path, manifest: Manifest) -> None:
+    """Make the folder with its manifest: a new one appears whole, an empty one is filled."""
+    unfinished = folder.with_name(owned_name(folder.name))
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        sweep_beside(folder)
+        if folder.is_dir():
+            with commit_lock(folder):
+                sweep(folder)
+                if not (folder / MANIFEST).exists():
+                    write_atomically(folder / MANIFEST, manifest.text())
+            return
+        unfinished.mkdir()
+        try:
+            write_atomically(unfinished / MANIFEST, manifest.text())
+            os.rename(unfinished, folder)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        flush_folder(folder.parent)
+    except OSError as error:
+        if (folder / MANIFEST).exists():
+            # Another program made it in the same moment.
+            return
+        raise BranchFolderError(
+            f"{folder} cannot be written to ({error.strerror}).",
+            "Results go there.", "Choose another place with -o, or change its permissions.",
+        ) from error
+
+
+def settled_manifest(folder: Path) -> Manifest:
+    """Return the manifest of a branch folder, once what a killed program left is finished.
+
+    For those who carry a folder elsewhere and read nothing of it.
+
+    Raises:
+        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`; or it has links.
+    """
+    refuse_links(folder)
+    finish_pending(folder)
+    return read_manifest(folder)
+
+
+def require_folder(folder: Path) -> None:
+    """Refuse a folder that is not there."""
+    if not folder.is_dir():
+        raise BranchFolderError(
+            f"There is no folder {folder}.", "A branch folder was expected.",
+            "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder that has links in it: they may lead out of it."""
+    try:
+        safe_names.refuse_links(folder)
+    except InputError as error:
+        raise BranchFolderError(error.seen, error.why, error.fix) from error
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of ``name`` in a folder; refuse one that leads out of it."""
+    try:
+        return safe_names.inside(folder, name)
+    except InputError as error:
+        raise BranchFolderError(error.seen, error.why, error.fix) from error
+
+
+def settle(folder: Path, *, unfinished: bool = False) -> None:
+    """Wait for a program that enters results; refuse what a killed one left, unless ``unfinished``.
+    """
+    if journal.is_pending(folder):
+        wait_for_commit(folder)
+        if journal.is_pending(folder) and not unfinished:
+            raise journal.unfinished_error(folder)
+
+
+def finish_pending(folder: Path) -> None:
+    """Finish the commit of a program that was killed in it."""
+    if journal.is_pending(folder):
+        with commit_lock(folder):
+            journal.roll_forward(folder)
+
+
+def is_litter(name: str) -> bool:
+    """Whether a file of this name may be in a folder that was killed while it was made."""
+    return name in (COMMIT_LOCK, RUN_LOCK) or is_owned_name(name)
