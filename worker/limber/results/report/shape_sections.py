@@ -1,0 +1,125 @@
+"""What the report says of a branch's shape: scan and skeleton, cylinders, mesh."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from limber.geometry.skeleton import qsm_tables
+from limber.geometry.skeleton.doubtful_parts import Doubt, doubtful_parts
+from limber.geometry.skeleton.qsm_tables import Caliper
+from limber.results.report import figures
+from limber.results.report.section import Section
+from limber.results.report.tables import (
+    caliper_rows,
+    diameter_rows,
+    doubt_rows,
+    order_rows,
+    share_rows,
+)
+from limber.store import Branch
+from limber.store.loading import load_skeleton, load_targets
+
+_DOUBTS_SHOWN = 12
+_QUALITY_LABELS = {
+    "volume_ratio": "mesh over surface volume",
+    "min_dihedral_deg": "smallest angle between faces [degrees]",
+    "min_radius_ratio": "worst shape of a tetrahedron (1 regular, 0 flat)",
+    "mean_radius_ratio": "mean shape",
+    "elements_across": "elements across the branch",
+    "surface_distance_mean": "mean distance of mesh and surface [local radii]",
+    "surface_distance_max_m": "largest distance of mesh and surface [m]",
+    "fork_distance_mean": "mean distance at forks [local radii]",
+    "fork_distance_max": "largest distance at forks [local radii]"}
+
+
+def reconstruction_of(branch: Branch) -> dict[str, Any]:
+    """Return what the stage that made the mesh told; nothing without one."""
+    for key in ("reconstruct", "mesh"):
+        if key in branch.manifest.stages:
+            return branch.manifest.stages[key].result
+    return {}
+
+
+def scan_section(branch: Branch) -> Section:
+    section = Section("Scan and skeleton")
+    if not (branch.has("cloud.ply") and branch.has("skeleton.swc")):
+        section.missing = "limber reconstruct CLOUD -o NAME.branch"
+        return section
+    targets = _targets(branch)
+    section.draw(figures.scan_and_skeleton(branch, targets),
+                 "The aligned cloud (grey) with the centreline tree, one colour an order, the "
+                 "control points (rings) and named targets (stars); from the front and from the "
+                 "side.")
+    if targets:
+        section.tables.append(("Named targets", [
+            ["target", "x [m]", "y [m]", "z [m]", "mass [kg]"],
+            *([target["name"], *(f"{value:.3f}" for value in target["position_m"]),
+               f"{target['mass_kg']:.4g}"] for target in targets)]))
+    section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
+                                        "it is known, one colour an order.")
+    result = reconstruction_of(branch)
+    section.text += result.get("warnings") or []
+    doubtful = doubtful_parts(load_skeleton(branch))
+    if doubtful:
+        section.tables.append(_doubt_table(doubtful))
+    if result.get("clamped_radius_count"):
+        section.text.append(f"{result['clamped_radius_count']} radii were limited to the cloud's "
+                            "scale.")
+    return section
+
+
+def _doubt_table(doubtful: list[Doubt]) -> tuple[str, list[list[str]]]:
+    rows = doubt_rows([{"kind": doubt.kind, "branch": doubt.branch, "at": np.round(doubt.at, 4),
+                        "length_m": doubt.length, "radius_m": doubt.radius, "value": doubt.value}
+                       for doubt in doubtful[:_DOUBTS_SHOWN]])
+    rest = len(doubtful) - _DOUBTS_SHOWN
+    more = f"; {rest} more: limber skeleton" if rest > 0 else ""
+    return f"Doubtful parts of the skeleton, places in the branch's frame [m]{more}", rows
+
+
+def cylinders_section(branch: Branch, calipers: Sequence[Caliper]) -> Section:
+    section = Section("Cylinder model")
+    if not branch.has("skeleton.swc"):
+        section.missing = "limber reconstruct CLOUD -o NAME.branch"
+        return section
+    skeleton = load_skeleton(branch)
+    compared = qsm_tables.against_calipers(skeleton, list(calipers))
+    shares = reconstruction_of(branch).get("length_shares")
+    if shares:
+        section.tables.append(("How the radii are known", share_rows(shares)))
+    section.tables.append(("By branching order (0 is the main axis)",
+                           order_rows(qsm_tables.by_order(skeleton))))
+    section.tables.append(("Diameters along the main path",
+                           diameter_rows(qsm_tables.diameters_at_heights(skeleton))))
+    if compared:
+        section.tables.append(("Against calipers", caliper_rows(compared)))
+    section.draw(figures.diameters(skeleton, compared),
+                 "Diameter along the main path; the band is two standard deviations to each side.")
+    return section
+
+
+def _targets(branch: Branch) -> list[dict[str, Any]]:
+    return [{"name": target.name, "position_m": target.position, "mass_kg": target.mass}
+            for target in load_targets(branch)]
+
+
+def mesh_section(branch: Branch) -> Section:
+    section = Section("Mesh")
+    if not branch.has("mesh.vtu"):
+        section.missing = "limber reconstruct or limber mesh"
+        return section
+    section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
+                                                  "modulus; base in black, grasp patch in red.")
+    result = reconstruction_of(branch)
+    quality = result.get("mesh_quality") or {}
+    rows = [["what", "value"]]
+    for key in ("surface_volume_m3", "mesh_volume_m3"):
+        if result.get(key) is not None:
+            rows.append([key.replace("_m3", " [cm3]").replace("_", " "),
+                         f"{1e6 * result[key]:.4g}"])
+    rows += [[label, f"{quality[key]:.4g}"] for key, label in _QUALITY_LABELS.items()
+             if quality.get(key) is not None]
+    if len(rows) > 1:
+        section.tables.append(("", rows))
+    return section
