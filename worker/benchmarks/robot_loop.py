@@ -12,7 +12,8 @@ import numpy as np
 from benchmarks.held_up import Voided
 from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
-from limber.cli.closed_loop.loop import GOAL_TOLERANCE_M, OPEN_FACTOR, ClosedLoop, comparison
+from limber.cli.closed_loop.comparison import GOAL_TOLERANCE_M, comparison
+from limber.cli.closed_loop.loop import OPEN_FACTOR, ClosedLoop
 from limber.cli.terminal import table_lines
 from limber.core.errors import LimberError
 from limber.core.progress import Progress

@@ -15,7 +15,8 @@ from limber.cli.closed_loop.cell_layout import (
     gripper_at,
     write_touched,
 )
-from limber.cli.closed_loop.loop import ClosedLoop, comparison
+from limber.cli.closed_loop.comparison import comparison
+from limber.cli.closed_loop.loop import ClosedLoop
 from limber.cli.commands.robot import _points
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.progress import Progress
@@ -77,7 +78,7 @@ def test_more_poses_are_sampled_where_a_path_is_neither_found_nor_excluded(
                            limited=lambda cell: cell)
     for name, value in (("Branch", SimpleNamespace(open=lambda _folder: None)),
                         ("load_skeleton", lambda _branch: None),
-                        ("_grasp_of", lambda *_: (np.array([0.0, 0.0, 0.3]), np.eye(3)[2])),
+                        ("grasp_of", lambda *_: (np.array([0.0, 0.0, 0.3]), np.eye(3)[2])),
                         ("wish_for", lambda *_: wish), ("read_cell", lambda _path: None),
                         ("write_cell", lambda *_: None)):
         monkeypatch.setattr(loop, name, value)

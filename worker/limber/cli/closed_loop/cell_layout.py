@@ -14,6 +14,8 @@ from limber.robot.motion.trajectory import densely
 from limber.robot.ur.arms import Arm
 from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
 
+GRASP_FRACTION = 0.85
+"""Where on its main path the branch is held."""
 _AROUND_M = 0.06  # that the gripper is to reach about the grasp
 _RIM_M = 0.12  # radius of the pot's rim, which has marks to touch
 _MARKS = 6
@@ -119,3 +121,19 @@ def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: 
         name = f"rim-{number + 1}" if number < _MARKS else f"branch-{number + 1 - _MARKS}"
         lines.append(",".join([name, *(f"{value:.7g}" for value in (*point, *pose))]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def grasp_of(skeleton: Skeleton, fraction: float = GRASP_FRACTION,
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """A place on the main path [m] and the branch's axis there, shape [3] each."""
+    point = skeleton.point_at(fraction)
+    axis = point - skeleton.point_at(fraction - 0.05)
+    return point, axis / np.linalg.norm(axis)
+
+
+def sideways(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions across the line from the root, the origin, to ``point`` [3]."""
+    axis = point / np.linalg.norm(point)
+    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)

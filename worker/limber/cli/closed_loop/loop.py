@@ -17,11 +17,15 @@ import numpy as np
 
 from limber.cli.closed_loop.bystander import Watch
 from limber.cli.closed_loop.cell_layout import (
+    GRASP_FRACTION,
     base_beside,
     bending_modulus,
+    grasp_of,
     gripper_at,
+    sideways,
     write_touched,
 )
+from limber.cli.closed_loop.comparison import Told, compared
 from limber.cli.closed_loop.task_sizes import Wish, wish_for
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.json_values import plain
@@ -41,10 +45,7 @@ from limber.robot.virtual.server import MARKER_PORT
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
-GRASP_FRACTION = 0.85
 FLOWER, PLAN = "flower", "to-light"
-GOAL_TOLERANCE_M = 0.01
-"""So near its goal the flower is in it."""
 PLANNED_TOLERANCE_M = 0.006
 """So near it is planned: a path ends where the region begins, and the model is off by something."""
 
@@ -67,24 +68,6 @@ _DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16,
          "record": 0.27, "estimate": 0.5, "energy": 0.6, "plan": 0.66, "suggest": 0.68,
          "dry run": 0.75,
          "execute": 0.88, "overload": 1.0}
-
-
-@dataclass(frozen=True)
-class _Told:
-    """What pulls have told so far, and what was planned with it."""
-
-    estimated: dict[str, Any]
-    goal: np.ndarray
-    wish: Wish
-    plan: dict[str, Any]
-    pull_count: int = 1
-    reason: str = ""
-
-    @property
-    def open_factor(self) -> float:
-        """The widest interval of a modulus: its end over its beginning."""
-        low, high = np.array(self.estimated["young_interval_pa"], float).T
-        return float((high / low).max())
 
 
 @dataclass
@@ -124,7 +107,7 @@ class ClosedLoop:
         """Go once around.
 
         Returns:
-            What :meth:`_compared` tells.
+            What :func:`.comparison.compared` tells, and the seconds of each part.
 
         Raises:
             LimberError: a part failed; the robot is gone then, what was made stays.
@@ -153,7 +136,9 @@ class ClosedLoop:
                     self.progress.warn("stopped; until then the virtual robot itself was held up "
                                        f"for {held_up:.0f} ms in all.")
                 raise
-        return self._compared(truth, moved, told, executed, watch, stopped)
+        return plain({"seed": self.seed, "branch": self.branch, **compared(
+            truth, moved, told, executed, watch, stopped,
+            read_cell(self.cell_file).limits.soft_force_n), "part_seconds": self.seconds})
 
     # Parts
 
@@ -179,7 +164,7 @@ class ClosedLoop:
 
     def _cell(self, truth: TrueBranch) -> Cell:
         """Put the robot beside the branch; returns its true cell in the scan's frame."""
-        point, axis = _grasp_of(truth.skeleton)
+        point, axis = grasp_of(truth.skeleton)
         arm = arm_named(self.model)
         base = base_beside(arm, matrices(np.array(_GRASP_POSE)), point, axis)
         return Cell(
@@ -218,11 +203,11 @@ class ClosedLoop:
                    "--at", *tip)
         return moved
 
-    def _told(self, robot: VirtualRobot) -> "_Told":
+    def _told(self, robot: VirtualRobot) -> Told:
         """Pull, estimate and plan, and pull again as long as that is worth it for the plan."""
         branch = Branch.open(self.branch)
-        point, axis = _grasp_of(load_skeleton(branch))
-        self._pulled(robot, 1, point, axis, "--direction", *_sideways(point)[0], "--distance",
+        point, axis = grasp_of(load_skeleton(branch))
+        self._pulled(robot, 1, point, axis, "--direction", *sideways(point)[0], "--distance",
                      _TRAVEL_M)
         told = self._planned()
         for number in range(2, _MOST_PULLS + 1):
@@ -237,14 +222,14 @@ class ClosedLoop:
                                read_cell(self.cell_file).limits.soft_force_n)
             if not found["plan"]["worth"]:
                 return replace(told, reason=found["plan"]["why"])
-            self._pulled(robot, number, *_grasp_of(load_skeleton(branch),
+            self._pulled(robot, number, *grasp_of(load_skeleton(branch),
                                                    found["best"]["grasp_fraction"]), "--suggested")
             told = replace(self._planned(told.goal), pull_count=number)
         return replace(told, reason=f"{_MOST_PULLS} pulls were made")
 
     def _reaches(self, fraction: float) -> bool:
         """Whether the arm reaches about a place of the main path."""
-        place = _grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
+        place = grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
         try:
             gripper_at(read_cell(self.cell_file), *place)
         except NoPathError:
@@ -261,15 +246,15 @@ class ClosedLoop:
                    self.cell_file, "--name", name, "--confirm", name, "--markers", MARKER_PORT,
                    *way, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
 
-    def _planned(self, goal: np.ndarray | None = None) -> "_Told":
+    def _planned(self, goal: np.ndarray | None = None) -> Told:
         """Estimate, sample the energy field and plan the flower's way to a place [3], or to one
         that suits the branch."""
         estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
                                self.branch)
         branch = Branch.open(self.branch)
-        place, _axis = _grasp_of(load_skeleton(branch))
+        place, _axis = grasp_of(load_skeleton(branch))
         # A place that somebody wishes the flower at: where a pull to the other side takes it.
-        wish = wish_for(branch, _sideways(place)[1], _TRAVEL_M)
+        wish = wish_for(branch, sideways(place)[1], _TRAVEL_M)
         write_cell(self.cell_file, wish.limited(read_cell(self.cell_file)))
         goal = wish.place if goal is None else goal
         self._sampled(wish)
@@ -283,7 +268,7 @@ class ClosedLoop:
             self.progress.warn(f"plan: {error} Planned again with {_MORE_SAMPLES} poses.")
             self._sampled(wish, "--samples", _MORE_SAMPLES)
             plan = self._ways(wish, goal)
-        return _Told(estimated, goal, wish, plan)
+        return Told(estimated, goal, wish, plan)
 
     def _sampled(self, wish: Wish, *more: object) -> None:
         self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed",
@@ -330,42 +315,6 @@ class ClosedLoop:
                 "--confirm", PLAN, "--after-stop", "hold", "--gripper-rotation",
                 *dry["gripper_rotation"]]
 
-    # Both sides
-
-    def _compared(self, truth: TrueBranch, moved: np.ndarray, told: "_Told",
-                  executed: dict[str, Any], watch: Watch, stopped: tuple[str, Watch],
-                  ) -> dict[str, Any]:
-        """Return recovered against true E, force along the path, the flower, the overload."""
-        estimated, goal = told.estimated, told.goal
-        seen = watch.at_the_end()
-        flower = None if seen is None else seen[-1] + moved
-        off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
-        interval = np.array(estimated["young_interval_pa"], float)
-        reason, second = stopped
-        overload = second.overloaded
-        return plain({
-            "seed": self.seed, "branch": self.branch, "young_true_pa": truth.young,
-            "young_pa": estimated["young_pa"], "young_interval_pa": interval,
-            "covered": (interval[:, 0] <= truth.young) & (truth.young <= interval[:, 1]),
-            "force_within_share": executed["force_within_share"],
-            "force_error_of_peak": executed["force_error_of_peak"],
-            "predicted_peak_force_n": executed["predicted_peak_force_n"],
-            "predicted_force_sigma_n": executed["predicted_force_sigma_n"],
-            "peak_force_n": executed["peak_force_n"], "path_error_m": executed["path_error_m"],
-            "limit_broken": bool(executed["peak_force_n"]
-                                 > read_cell(self.cell_file).limits.soft_force_n),
-            "pull_count": told.pull_count, "open_factor": told.open_factor,
-            "no_further_pull": told.reason, "holding_force_n": told.wish.holding_force,
-            "max_force_n": told.wish.max_force,
-            "flower_goal_m": goal, "flower_planned_m": told.plan.get("target_end_m"),
-            "flower_m": flower, "flower_off_m": None if flower is None else off,
-            "flower_in_goal": off <= GOAL_TOLERANCE_M,
-            "overload_reason": reason,
-            "overload_way_m": overload.way if overload else None,
-            "overload_standstill_s": overload.standstill if overload else None,
-            "extrapolation_error_n": max(watch.extrapolation_error, second.extrapolation_error),
-            "part_seconds": self.seconds})
-
     def _part(self, name: str, title: str, *arguments: object) -> dict[str, Any]:
         """Run a command as a process; show its progress and its time."""
         with self._timed(name, title) as progress:
@@ -387,50 +336,3 @@ class ClosedLoop:
             took = round(time.perf_counter() - began, 1)
             self.seconds[name] = round(self.seconds.get(name, 0.0) + took, 1)
             self.say(f"  {title:<42} {took:6.1f} s")
-
-
-def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """Return titles and tables of what a loop found, for a terminal."""
-    from limber.results.report.tables import modulus_rows
-
-    force = [["force along the path", ""],
-             ["predicted peak", f"{result['predicted_peak_force_n']:.2f} N"],
-             ["measured peak", f"{result['peak_force_n']:.2f} N"],
-             ["within 5 % of the peak or its interval",
-              f"{100 * result['force_within_share']:.1f} % of the path"],
-             ["difference, 95 % of the path below",
-              f"{100 * result['force_error_of_peak']:.1f} % of the peak"],
-             ["the virtual branch's own force off by at most",
-              f"{result['extrapolation_error_n']:.2f} N"]]
-    places = [["", "x [mm]", "y [mm]", "z [mm]"]]
-    for title, key in (("flower's goal", "flower_goal_m"), ("as planned", "flower_planned_m"),
-                       ("where it came to", "flower_m")):
-        if result[key] is not None:
-            places.append([title, *(f"{1000 * value:.1f}" for value in result[key])])
-    way, still = result["overload_way_m"], result["overload_standstill_s"]
-    pulls = [["pulls", str(result["pull_count"])],
-             ["widest interval, its end over its beginning", f"{result['open_factor']:.1f}"],
-             ["no further pull", result["no_further_pull"]],
-             ["holds the flower in its goal", f"{result['holding_force_n']:.2f} N"],
-             ["allowed on the way", f"{result['max_force_n']:.2f} N"]]
-    stop = [["a provoked overload", ""], ["stopped by", result["overload_reason"]],
-            ["way after it", "-" if way is None else f"{1000 * way:.1f} mm"],
-            ["until standstill", "-" if still is None else f"{1000 * still:.0f} ms"]]
-    return [("Young's modulus", modulus_rows(result, result)), ("Whether that is enough", pulls),
-            ("Predicted against measured", force), ("The flower", places), ("Safety", stop)]
-
-
-def _grasp_of(skeleton: Any, fraction: float = GRASP_FRACTION,
-              ) -> tuple[np.ndarray, np.ndarray]:
-    """A place on the main path [m] and the branch's axis there, shape [3] each."""
-    point = skeleton.point_at(fraction)
-    axis = point - skeleton.point_at(fraction - 0.05)
-    return point, axis / np.linalg.norm(axis)
-
-
-def _sideways(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions across the line from the root, the origin, to ``point`` [3]."""
-    axis = point / np.linalg.norm(point)
-    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
-    first /= np.linalg.norm(first)
-    return first, np.cross(axis, first)

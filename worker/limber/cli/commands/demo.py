@@ -133,7 +133,8 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
                          "Leave one of them out.")
     require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
     require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
-    from limber.cli.closed_loop.loop import ClosedLoop, comparison
+    from limber.cli.closed_loop.comparison import comparison
+    from limber.cli.closed_loop.loop import ClosedLoop
 
     started = time.perf_counter()
     run.say(f"Limber demo with a virtual robot, results in {folder}")

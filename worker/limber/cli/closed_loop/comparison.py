@@ -1,0 +1,95 @@
+"""Both sides of a closed loop: what it found, and what only the virtual branch knows."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from limber.cli.closed_loop.bystander import Watch
+from limber.cli.closed_loop.task_sizes import Wish
+from limber.core.json_values import plain
+from limber.estimation.simulated_pull import TrueBranch
+
+GOAL_TOLERANCE_M = 0.01
+"""So near its goal the flower is in it."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What pulls have told so far, and what was planned with it."""
+
+    estimated: dict[str, Any]
+    goal: np.ndarray
+    wish: Wish
+    plan: dict[str, Any]
+    pull_count: int = 1
+    reason: str = ""
+
+    @property
+    def open_factor(self) -> float:
+        """The widest interval of a modulus: its end over its beginning."""
+        low, high = np.array(self.estimated["young_interval_pa"], float).T
+        return float((high / low).max())
+
+
+def compared(truth: TrueBranch, moved: np.ndarray, told: Told, executed: dict[str, Any],
+             watch: Watch, stopped: tuple[str, Watch], soft_force: float) -> dict[str, Any]:
+    """Return recovered against true E, force along the path, the flower, the overload."""
+    estimated, goal = told.estimated, told.goal
+    seen = watch.at_the_end()
+    flower = None if seen is None else seen[-1] + moved
+    off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
+    interval = np.array(estimated["young_interval_pa"], float)
+    reason, second = stopped
+    overload = second.overloaded
+    return plain({
+        "young_true_pa": truth.young,
+        "young_pa": estimated["young_pa"], "young_interval_pa": interval,
+        "covered": (interval[:, 0] <= truth.young) & (truth.young <= interval[:, 1]),
+        "force_within_share": executed["force_within_share"],
+        "force_error_of_peak": executed["force_error_of_peak"],
+        "predicted_peak_force_n": executed["predicted_peak_force_n"],
+        "predicted_force_sigma_n": executed["predicted_force_sigma_n"],
+        "peak_force_n": executed["peak_force_n"], "path_error_m": executed["path_error_m"],
+        "limit_broken": bool(executed["peak_force_n"] > soft_force),
+        "pull_count": told.pull_count, "open_factor": told.open_factor,
+        "no_further_pull": told.reason, "holding_force_n": told.wish.holding_force,
+        "max_force_n": told.wish.max_force,
+        "flower_goal_m": goal, "flower_planned_m": told.plan.get("target_end_m"),
+        "flower_m": flower, "flower_off_m": None if flower is None else off,
+        "flower_in_goal": off <= GOAL_TOLERANCE_M,
+        "overload_reason": reason,
+        "overload_way_m": overload.way if overload else None,
+        "overload_standstill_s": overload.standstill if overload else None,
+        "extrapolation_error_n": max(watch.extrapolation_error, second.extrapolation_error)})
+
+
+def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """Return titles and tables of what a loop found, for a terminal."""
+    from limber.results.report.tables import modulus_rows
+
+    force = [["force along the path", ""],
+             ["predicted peak", f"{result['predicted_peak_force_n']:.2f} N"],
+             ["measured peak", f"{result['peak_force_n']:.2f} N"],
+             ["within 5 % of the peak or its interval",
+              f"{100 * result['force_within_share']:.1f} % of the path"],
+             ["difference, 95 % of the path below",
+              f"{100 * result['force_error_of_peak']:.1f} % of the peak"],
+             ["the virtual branch's own force off by at most",
+              f"{result['extrapolation_error_n']:.2f} N"]]
+    places = [["", "x [mm]", "y [mm]", "z [mm]"]]
+    for title, key in (("flower's goal", "flower_goal_m"), ("as planned", "flower_planned_m"),
+                       ("where it came to", "flower_m")):
+        if result[key] is not None:
+            places.append([title, *(f"{1000 * value:.1f}" for value in result[key])])
+    way, still = result["overload_way_m"], result["overload_standstill_s"]
+    pulls = [["pulls", str(result["pull_count"])],
+             ["widest interval, its end over its beginning", f"{result['open_factor']:.1f}"],
+             ["no further pull", result["no_further_pull"]],
+             ["holds the flower in its goal", f"{result['holding_force_n']:.2f} N"],
+             ["allowed on the way", f"{result['max_force_n']:.2f} N"]]
+    stop = [["a provoked overload", ""], ["stopped by", result["overload_reason"]],
+            ["way after it", "-" if way is None else f"{1000 * way:.1f} mm"],
+            ["until standstill", "-" if still is None else f"{1000 * still:.0f} ms"]]
+    return [("Young's modulus", modulus_rows(result, result)), ("Whether that is enough", pulls),
+            ("Predicted against measured", force), ("The flower", places), ("Safety", stop)]
