@@ -163,7 +163,7 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
         end[segment.before] = segment.middle
         end[segment.link] = segment.end
     radius[0] = radius[1]
-    mass, centre, inertia = _masses(model, points, volume * model.density[tet], link, count, end)
+    mass, centre, inertia = _masses(points, volume * model.density[tet], link, count, end)
     # What hangs on the branch goes with the link that it grows from.
     tree = RodTree(parent, joint, axes, stiffness, mass, centre, inertia, end, radius,
                    np.array(model.gravity, float))
@@ -293,7 +293,7 @@ def _section(offset: np.ndarray, segment: _Segment, volume: np.ndarray, young: n
     return axes, np.array([values[0], values[1]]), twist
 
 
-def _masses(model: BranchModel, points: np.ndarray, mass: np.ndarray, link: np.ndarray,
+def _masses(points: np.ndarray, mass: np.ndarray, link: np.ndarray,
             count: int, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     total = np.bincount(link, mass, count)
     whole = np.maximum(total, 1e-300)

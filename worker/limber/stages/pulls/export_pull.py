@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, NoOptions, required
+from limber.core.settings import Groups
+from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -20,10 +20,6 @@ class ExportPullInputs(BranchInputs):
 
     name: str = required("Name of the pull.", "pull-1")
     mcap: Path = required("File to write: ROS 2 messages in an MCAP container.", "{stem}.mcap")
-
-
-class ExportPullSettings(Settings):
-    """Nothing can be chosen."""
 
 
 def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = SILENT,
@@ -55,12 +51,12 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
     return {"output": output, "messages": counts}
 
 
-def run(inputs: ExportPullInputs, settings: ExportPullSettings, options: NoOptions,
+def run(inputs: ExportPullInputs, settings: NoSettings, options: NoOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     return export_pull(inputs.branch_folder, inputs.name, inputs.mcap, progress=progress)
 
 
 STAGE = StageDescription(
-    "export-pull", 58, run, ExportPullInputs, ExportPullSettings, NoOptions,
+    "export-pull", 58, run, ExportPullInputs, NoSettings, NoOptions,
     reads=("pulls/{name}/",), step="pulls", label="Export a Pull")
