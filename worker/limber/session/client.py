@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
+from limber.core.json_lines import json_objects
 from limber.core.present import present
 from limber.core.processes.ending import end_by_closing
 from limber.session.frame_buffer import Frame, FrameReader
@@ -239,13 +240,7 @@ class InteractiveSession:
                     stream.close()
 
     def _listen(self) -> None:
-        for line in self._process.stdout or ():
-            try:
-                content = json.loads(line)
-            except json.JSONDecodeError:
-                continue  # a native library's own words
-            if not isinstance(content, dict):
-                continue
+        for content in json_objects(self._process.stdout or ()):
             with self._said:
                 self.events.append(content)
                 del self.events[:-1000]

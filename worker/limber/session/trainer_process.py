@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import LimberError
+from limber.core.json_lines import json_objects
 from limber.core.present import present
 from limber.mechanics.grasp import Grasp
 from limber.reduced.reduced_model import ReducedModel
@@ -107,13 +108,8 @@ class Learning:
 
     def _listen(self) -> None:
         try:
-            for line in self._process.stdout or ():
-                try:
-                    content = json.loads(line)
-                except json.JSONDecodeError:
-                    continue  # a native library's own words
-                if isinstance(content, dict):
-                    self._hear(content)
+            for content in json_objects(self._process.stdout or ()):
+                self._hear(content)
         except (OSError, ValueError):
             pass  # closed while it was read
         if not self._closed:

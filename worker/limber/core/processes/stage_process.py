@@ -1,6 +1,5 @@
 """One stage as a process: its progress relayed, its result returned, ended with its parent."""
 
-import json
 import math
 import os
 import queue
@@ -12,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any, TextIO
 
 from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
+from limber.core.json_lines import json_object
 from limber.core.processes.budget import CORES
 from limber.core.processes.ending import PARENT_PIPE, kill_tree
 from limber.core.processes.limits import UNLIMITED, Limits, LimitWatch
@@ -113,12 +113,8 @@ def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:
 
 def _taken(line: str, progress: Progress) -> dict[str, Any]:
     """Pass a line of progress on; returns what it holds if it is a result."""
-    try:
-        content = json.loads(line)
-    except (ValueError, RecursionError):
-        # Native libraries (fTetWild, Blender) print lines of their own.
-        return {}
-    if not isinstance(content, dict):
+    content = json_object(line)
+    if content is None:
         return {}
     fraction = content.pop("progress", None)
     if isinstance(fraction, int | float) and math.isfinite(fraction):

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.core.json_lines import json_object
+
 
 @dataclass(frozen=True)
 class EvaluationEntry:
@@ -61,27 +63,18 @@ class EvaluationLog:
     def _resume(self, path: Path) -> None:
         lines = (path.read_text(encoding="utf-8", errors="replace").splitlines()
                  if path.exists() else [])
-        header = _parsed(lines[0]) if lines else None
+        header = json_object(lines[0]) if lines else None
         if header is None or header.get("problem") != self._problem:
             path.write_text(json.dumps({"problem": self._problem}) + "\n", encoding="utf-8")
             return
         for line in lines[1:]:
-            record = _parsed(line) or {}
+            record = json_object(line) or {}
             try:
                 entry = EvaluationEntry(**(record | {"parameters": tuple(record["parameters"])}))
                 self._known[_key(np.array(entry.parameters))] = entry
             except (KeyError, TypeError, ValueError):
                 continue  # a damaged line: that evaluation is done again
         self.resumed_count = len(self._known)
-
-
-def _parsed(line: str) -> dict | None:
-    try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
-        # The line that was being written when the process was killed.
-        return None
-    return record if isinstance(record, dict) else None
 
 
 def _key(parameters: np.ndarray) -> bytes:

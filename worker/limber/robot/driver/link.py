@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.core.json_lines import json_objects
 from limber.core.processes.ending import end_by_closing
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.deadline import CALL_SECONDS, ended_by_deadline
@@ -231,11 +232,7 @@ class RobotLink:
                 return
 
     def _read(self) -> None:
-        for line in self.process.stdout or ():
-            try:
-                content = json.loads(line)
-            except json.JSONDecodeError:
-                continue
+        for content in json_objects(self.process.stdout or ()):
             if "samples" in content:
                 rows = np.array([[np.nan if x is None else x for x in row]
                                  for row in content["samples"]], float)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import LimberError, WorkError
+from limber.core.json_lines import json_objects
 from limber.core.processes.ending import end_by_closing
 from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.virtual.arm_motions import Servo, SpeedMotion, Waypoint, line_move
@@ -95,12 +96,7 @@ class VirtualRobot:
             self.process.stdout.close()
 
     def _read(self) -> None:
-        for line in self.process.stdout or ():
-            try:
-                content = json.loads(line)
-            except json.JSONDecodeError:
-                # Native libraries print lines of their own.
-                continue
+        for content in json_objects(self.process.stdout or ()):
             with self._news:
                 self._answers.append(content)
                 self._news.notify_all()
