@@ -8,7 +8,7 @@ from limber.stages.registry import all_schemas, stage_table
 
 
 @click.command("schema")
-@click.option("--table", is_flag=True, help="Print the table of stages of the README instead.")
+@click.option("--table", is_flag=True, help="Print the table of stages of the guide instead.")
 def command(table: bool) -> None:
     """Print what every stage takes, reads and writes as JSON.
 
