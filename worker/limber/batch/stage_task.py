@@ -88,12 +88,11 @@ def _outputs(task: StageTask) -> list[Path]:
 
 def _finished(task: StageTask, folder: Path) -> str | None:
     """Return when the branch's entry of the task was made; None where there is none."""
-    key = stage_description(task.stage).key
+    key = stage_description(task.stage).entry(task.inputs, task.settings)
     if not key or not folder.is_dir():
         return None
-    name = getattr(task.inputs, "name", None) or getattr(task.settings, "name", "")
     try:
-        entry = read_manifest(folder).stages.get(key.replace("{name}", str(name)))
+        entry = read_manifest(folder).stages.get(key)
     except (LimberError, OSError):
         # The stage says what is wrong with it.
         return None

@@ -122,17 +122,15 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
 
 def command_of(stage: "StageDescription", help_text: str) -> click.Command:
     """Make the command of a stage: its inputs, settings and options become options."""
-    from limber.stages.command_line import GroupedOption, settings_options
+    from limber.stages.command_line import GroupedOption, stage_options
 
     @stage_command(stage.name)
     @click.option("--schema", cls=GroupedOption, expert=True, is_flag=True, is_eager=True,
                   expose_value=False, callback=functools.partial(_show_schema, stage.name),
                   help="Print what the stage takes as a JSON schema, and exit.")
-    @settings_options(stage.inputs, "inputs")
-    @settings_options(stage.settings, "settings")
-    @settings_options(stage.options, "options")
-    def command(run: Run, inputs: Any, settings: Any, options: Any) -> dict[str, Any]:
-        result = stage.run(inputs, settings, options, run.progress)
+    @stage_options(stage)
+    def command(run: Run, values: dict[str, Any]) -> dict[str, Any]:
+        result = stage.run(*stage.models(values), run.progress)
         for title, rows in stage.tables(_plain(result)) if stage.tables else ():
             run.show(title, rows)
         return result

@@ -5,9 +5,11 @@ A model is the one source of an option's name, type, range, default and help; of
 unit of a value stands in its description in square brackets.
 """
 
+import difflib
 import math
 import re
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -76,6 +78,12 @@ class Settings(BaseModel):
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
         return schema
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """Return the sentence that names the known names nearest to one that is not known."""
+    close = difflib.get_close_matches(name, known, 3)
+    return f"Did you mean {' or '.join(close)}?" if close else f"Known: {', '.join(known)}."
 
 
 def checked_settings(model: type[Model], values: dict[str, Any]) -> Model:

@@ -10,7 +10,7 @@ import functools
 import re
 import types
 import typing
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ import click
 from pydantic import BaseModel
 
 from limber.core.settings import Settings, checked_settings
+from limber.stages.registry import StageDescription
 
 
 class GroupedOption(click.Option):
@@ -117,19 +118,35 @@ def settings_options(model: type[BaseModel], name: str = "settings", *,
     Raises:
         InputError: when the command is called with values that the model refuses.
     """
+    fields = {field: model for field in model.model_fields if field not in without}
+
     def wrap(function: Callable) -> Callable:
-        @functools.wraps(function)
-        def body(*args: Any, **options: Any) -> Any:
-            given = {field: options.pop(f"{name}__{field}") for field in model.model_fields
-                     if field not in without}
-            values = {field: value for field, value in given.items() if value is not None}
+        def body(*args: Any, values: dict[str, Any], **options: Any) -> Any:
             return function(*args, **{name: checked_settings(model, values)}, **options)
-        for field_name, field in reversed(model.model_fields.items()):
-            if field_name in without:
-                continue
-            body = _parameter(model, field_name, field, f"{name}__{field_name}")(body)
-        return body
+        return _with_options(functools.wraps(function)(body), fields, name)
     return wrap
+
+
+def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
+    """Add one option for each input, setting and option of a stage; the function gets ``values``,
+    what was given by name, as :meth:`StageDescription.models` takes it.
+    """
+    fields = {field: model for model in (stage.inputs, stage.settings, stage.options)
+              for field in model.model_fields}
+    return lambda function: _with_options(function, fields, "stage")
+
+
+def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
+                  prefix: str) -> Callable:
+    """Add an option a field of a model; the function gets ``values``, those that were given."""
+    @functools.wraps(function)
+    def body(*args: Any, **options: Any) -> Any:
+        given = {field: options.pop(f"{prefix}__{field}") for field in fields}
+        values = {field: value for field, value in given.items() if value is not None}
+        return function(*args, values=values, **options)
+    for name, model in reversed(fields.items()):
+        body = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(body)
+    return body
 
 
 def command_line(*models: Settings) -> list[str]:

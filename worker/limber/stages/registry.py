@@ -11,7 +11,7 @@ import ast
 import importlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -63,6 +63,31 @@ class StageDescription:
     step: str = ""
     label: str = ""
     moves_robot: Literal["", "when armed", "always"] = ""
+
+    def models(self, values: Mapping[str, Any]) -> "tuple[Settings, Settings, Settings]":
+        """Return inputs, settings and options of values by name; no name belongs to two of them.
+
+        Raises:
+            InputError: a name is not known, an input is missing, or a value is refused.
+        """
+        from limber.core.errors import InputError
+        from limber.core.settings import checked_settings, nearest
+
+        kinds = (self.inputs, self.settings, self.options)
+        known = [name for kind in kinds for name in kind.model_fields]
+        for name in values:
+            if name not in known:
+                raise InputError(f"{self.name} has no {name!r}.", nearest(name, known),
+                                 f"`limber {self.name} --help-all` explains them all.")
+        inputs, settings, options = (
+            checked_settings(kind, {name: value for name, value in values.items()
+                                    if name in kind.model_fields}) for kind in kinds)
+        return inputs, settings, options
+
+    def entry(self, inputs: "Settings", settings: "Settings") -> str:
+        """Return the name of the manifest's entry for these models; empty where it makes none."""
+        name = getattr(inputs, "name", None) or getattr(settings, "name", None) or ""
+        return self.key.replace("{name}", name)
 
 
 _registered: list[ModuleType] = []

@@ -1,10 +1,11 @@
 """A stage's task as the command line that runs it, and back."""
 
+from typing import Any
+
 import click
 
 from limber.batch.jobs.branch_jobs import StageTask
-from limber.core.settings import Settings
-from limber.stages.command_line import command_line, settings_options
+from limber.stages.command_line import command_line, stage_options
 from limber.stages.registry import stage_description
 
 
@@ -23,10 +24,8 @@ def task_of_line(line: list[str]) -> StageTask:
     stage = stage_description(line[0])
 
     @click.command(stage.name)
-    @settings_options(stage.inputs, "inputs")
-    @settings_options(stage.settings, "settings")
-    @settings_options(stage.options, "options")
-    def command(**models: Settings) -> StageTask:
-        return StageTask(stage.name, **models)
+    @stage_options(stage)
+    def command(values: dict[str, Any]) -> StageTask:
+        return StageTask(stage.name, *stage.models(values))
 
     return command.main(line[1:], prog_name=f"limber {stage.name}", standalone_mode=False)

@@ -37,13 +37,14 @@ from typing import Any
 
 from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.batch.jobs.job_paths import JobPaths
-from limber.batch.jobs.problems import Problems, nearest
+from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.stage_tables import Source, StageTables
 from limber.batch.jobs.toml_positions import Place, toml_lines
 from limber.core.errors import InputError
 from limber.core.files.atomic import require_file
 from limber.core.files.reading import read_text, read_toml
 from limber.core.processes import Limits
+from limber.core.settings import nearest
 from limber.core.units import in_unit
 
 CLUSTERS = ("local", "slurm", "pbs", "lsf", "sge", "oar", "moab", "htcondor")

@@ -1,12 +1,11 @@
 """What is wrong with a job file: gathered, and told at once, each with its line."""
 
-import difflib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from limber.batch.jobs.toml_positions import Place, line_of
 from limber.core.errors import InputError
+from limber.core.settings import nearest
 
 _SHOWN = 12
 _KINDS = {str: "a text", int: "a whole number", list: "a list"}
@@ -54,10 +53,3 @@ class Problems:
             self.add((*place, key), f"Write {key} as tables: [[{names}]].")
             return []
         return found
-
-
-def nearest(key: str, known: Iterable[str]) -> str:
-    """Return a sentence about the known names that are like ``key``."""
-    known = tuple(known)
-    close = difflib.get_close_matches(key, known, 3)
-    return f"Did you mean {' or '.join(close)}?" if close else f"Known: {', '.join(known)}."

@@ -11,8 +11,9 @@ from pydantic import ValidationError
 
 from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.jobs.job_paths import JobPaths
-from limber.batch.jobs.problems import Problems, nearest
+from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.toml_positions import Place
+from limber.core.settings import nearest
 from limber.core.units import in_unit
 from limber.stages.registry import (
     StageDescription,
@@ -194,7 +195,7 @@ def _trouble(name: Any) -> str:
     if isinstance(name, str) and name in known:
         return why_not_in_batches(name)
     return "there is no such stage. " + nearest(
-        str(name), (each for each in known if not why_not_in_batches(each)))
+        str(name), [each for each in known if not why_not_in_batches(each)])
 
 
 def _said_of(about: dict[str, Any], key: str) -> set[str]:
