@@ -138,7 +138,7 @@ LAYERS = (
     ("results",),
     ("stages",),
     ("batch",),
-    ("cli",),
+    ("cli", "api"),
     ("__main__",),
 )
 NUMERICAL = ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation",

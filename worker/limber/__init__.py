@@ -1,13 +1,65 @@
 """Limber: from the scan of a plant branch to a simulation that behaves like it.
 
-The core and the headless worker. Nothing in this package imports ``bpy``: the Blender add-on
-(folder ``addon``) is one of its callers, the command ``limber`` is another.
+From a scan to a gentle path::
+
+    import limber
+
+    branch = limber.reconstruct("scan.ply", "apple.branch")
+    branch.add_pull("pull.csv", "pull-1")
+    print(branch.estimate())
+    branch.energy_field()
+    branch.plan(max_force=3.0).plot()
+
+:mod:`limber.api.verbs` says what all verbs share. ``limber.settings("plan")`` lists what a verb
+takes. The command ``limber`` does the same in a terminal, and the Blender add-on (folder
+``addon``) on screen. Nothing in this package imports ``bpy``.
 """
 
+from typing import TYPE_CHECKING
+
+from limber.core.lazy import exports as _exports
 from limber.core.threads import one_thread as _one_thread
 from limber.version import VERSION as __version__
+
+if TYPE_CHECKING:
+    from limber.api.typed_results import EnergyField as EnergyField
+    from limber.api.typed_results import Estimate as Estimate
+    from limber.api.typed_results import Execution as Execution
+    from limber.api.typed_results import Generated as Generated
+    from limber.api.typed_results import Load as Load
+    from limber.api.typed_results import Plan as Plan
+    from limber.api.typed_results import Pull as Pull
+    from limber.api.typed_results import Result as Result
+    from limber.api.typed_results import Simulation as Simulation
+    from limber.api.typed_results import Written as Written
+    from limber.api.verbs import Branch as Branch
+    from limber.api.verbs import generate as generate
+    from limber.api.verbs import mesh as mesh
+    from limber.api.verbs import open as open
+    from limber.api.verbs import reconstruct as reconstruct
+    from limber.api.verbs import settings as settings
 
 # Before any module of Limber loads a library, in each process: no result may depend on threads.
 _one_thread()
 
-__all__ = ["__version__"]
+_PLACES = {
+    "Branch": "api.verbs",
+    "EnergyField": "api.typed_results",
+    "Estimate": "api.typed_results",
+    "Execution": "api.typed_results",
+    "Generated": "api.typed_results",
+    "Load": "api.typed_results",
+    "Plan": "api.typed_results",
+    "Pull": "api.typed_results",
+    "Result": "api.typed_results",
+    "Simulation": "api.typed_results",
+    "Written": "api.typed_results",
+    "generate": "api.verbs",
+    "mesh": "api.verbs",
+    "open": "api.verbs",
+    "reconstruct": "api.verbs",
+    "settings": "api.verbs",
+}
+
+__getattr__, __dir__ = _exports(__name__, _PLACES)
+__all__ = ["__version__", *_PLACES]

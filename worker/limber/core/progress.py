@@ -154,6 +154,37 @@ class BarSink:
         self._bar.console.print(line, markup=False, highlight=False)
 
 
+class LineSink:
+    """Rewrites one line of text: for a notebook, whose output takes no bar."""
+
+    def __init__(self, title: str, stream: TextIO | None = None, *,
+                 interval_seconds: float = 0.1):
+        self._title = title
+        self._stream = stream or sys.stderr
+        self._interval = interval_seconds
+        self._last = -interval_seconds
+        self._width = 0
+
+    def __enter__(self) -> "LineSink":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._write("")
+        self._stream.write("\r")
+
+    def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        now = time.perf_counter()
+        if now - self._last >= self._interval:
+            self._last = now
+            self._write(f"{self._title} {100 * fraction:3.0f} % {message}")
+
+    def _write(self, text: str) -> None:
+        """Write over what stood there."""
+        self._stream.write("\r" + text.ljust(self._width))
+        self._stream.flush()
+        self._width = len(text)
+
+
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 

@@ -146,3 +146,20 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
     bar = figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.7)
     bar.ax.set_ylim(0.0, largest)
     return figure
+
+
+def strain_along_path(from_m: np.ndarray, to_m: np.ndarray, strain: np.ndarray) -> "Figure":
+    """Draw the greatest strain of each piece of the main path.
+
+    Args:
+        from_m, to_m: Ends of the pieces, from the root [m], shape [n].
+        strain: Greatest principal strain in each, shape [n].
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.bar(from_m, 100 * strain, to_m - from_m, align="edge", edgecolor="white")
+    axes.set(xlabel="from the root along the main path [m]", ylabel="greatest strain [%]")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure

@@ -1,0 +1,85 @@
+"""Running a stage for a Python user: progress, warnings, and messages in a Python user's words."""
+
+import contextlib
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import LimberError
+from limber.core.json_values import plain
+from limber.core.progress import BarSink, LineSink, Progress, Sink
+from limber.stages.registry import stage_description
+
+_STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
+_OPTION = re.compile(r"(?<![\w-])--(no-)?([a-z][a-z0-9]*(?:-[a-z0-9]+)*)")
+
+
+def stage_of(verb: str) -> str:
+    """Return the name of the command that a verb of the Python interface runs."""
+    return _STAGES.get(verb, verb.replace("_", "-"))
+
+
+def run_stage(name: str, given: Mapping[str, Any], *, quiet: bool) -> tuple[str, dict[str, Any]]:
+    """Run a stage in this process.
+
+    Args:
+        name: The stage's.
+        given: Its inputs, settings and options by name; arrays may stand for lists.
+        quiet: Show no progress.
+
+    Returns:
+        The name of its entry in the branch's manifest, empty where it makes none; and what its
+        command prints with ``--json``, from ``warnings`` on.
+
+    Raises:
+        InputError: a name is not known, or a value is refused. LimberError: as the stage does.
+    """
+    told: list[str] = []
+    stage = stage_description(name)
+    try:
+        with _in_python_words(), _sink(name, quiet) as sink:
+            inputs, settings, options = stage.models(
+                {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
+                 else value for key, value in given.items()})
+            result = stage.run(inputs, settings, options, Progress(sink, told.append))
+    finally:
+        for text in told:
+            # At the line that calls the verb: run_stage, the verb's helper and the verb lie between.
+            warnings.warn(_with_python_names(text), stacklevel=4)
+    return stage.entry(inputs, settings), {"warnings": told} | plain(result)
+
+
+@contextlib.contextmanager
+def _sink(title: str, quiet: bool) -> Iterator[Sink | None]:
+    """What shows progress: a bar in a terminal, a line in a notebook, nothing elsewhere."""
+    if quiet:
+        yield None
+    elif "ipykernel" in sys.modules:
+        with LineSink(title) as line:
+            yield line
+    elif sys.stderr.isatty():
+        with BarSink(title) as bar:
+            yield bar
+    else:
+        yield None
+
+
+@contextlib.contextmanager
+def _in_python_words() -> Iterator[None]:
+    """Let the messages of errors name keyword arguments where they name options."""
+    try:
+        yield
+    except LimberError as error:
+        error.seen, error.why, error.fix = map(
+            _with_python_names, (error.seen, error.why, error.fix))
+        error.args = (" ".join(part for part in (error.seen, error.why, error.fix) if part),)
+        raise
+
+
+def _with_python_names(text: str) -> str:
+    return _OPTION.sub(lambda found: found[2].replace("-", "_") + ("=False" if found[1] else ""),
+                       text)

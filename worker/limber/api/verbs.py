@@ -1,0 +1,542 @@
+"""The verbs of the Python interface: a branch and what is done to it.
+
+Every verb works alike. What it needs comes first, without its name; all else are the inputs,
+settings and options of its command by name (``--mesh-spacing 4`` is ``mesh_spacing=4``), which
+:func:`limber.settings` lists. ``quiet=True`` shows no progress. A verb runs its stage in this process,
+writes what the command writes, and returns a frozen result. What has not changed is not computed
+again. Errors are those of :mod:`limber.core.errors`; what the work warns of are Python warnings.
+
+A script that runs :meth:`Branch.energy_field`, :meth:`Branch.plan` or :meth:`Branch.session` needs
+``if __name__ == "__main__":`` around it, since these start processes; a notebook does not.
+"""
+
+import html
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+
+import numpy as np
+
+from limber.api.running import run_stage, stage_of
+from limber.api.typed_results import (
+    EnergyField,
+    Estimate,
+    Execution,
+    Generated,
+    Load,
+    Plan,
+    Pull,
+    Result,
+    Simulation,
+    Written,
+    read_result,
+)
+from limber.core.errors import InputError
+from limber.core.settings import checked_settings, nearest
+from limber.store import Branch as Folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.geometry.tets.tet_mesh import TetMesh
+    from limber.session.client import InteractiveSession
+
+PathLike = str | os.PathLike[str]
+Value = TypeVar("Value")
+
+
+def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> Generated:
+    """Make a branch with known truth, and scan it as a scanner would.
+
+    Args:
+        folder: Where the scan and its truth go.
+        quiet: Show no progress.
+        settings: ``length`` [m], ``fork_count``, ``noise`` [m], ``seed`` and those that
+            ``limber.settings("generate")`` lists.
+
+    >>> scan = limber.generate(folder / "scan", length=0.3, fork_count=0, seed=1)
+    >>> scan.cloud.name, scan.young.shape
+    ('cloud.ply', (4,))
+    """
+    _, values = run_stage("generate", {**settings, "folder": folder}, quiet=quiet)
+    return Generated.read(None, "", values)
+
+
+def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: PathLike, *,
+                quiet: bool = False, **settings: Any) -> "Branch":
+    """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+
+    Args:
+        cloud: A point cloud's file; or points, shape [n, 3]; or columns ``x``, ``y``, ``z`` and
+            others by name, as a structured array or a table of pandas has them. Numbers are in
+            ``unit``.
+        folder: The branch folder to make or renew.
+        quiet: Show no progress.
+        settings: ``unit`` ("m", "cm", "mm", "in"), ``root`` [3], ``mesh_spacing`` in radii,
+            ``young`` [Pa], ``skeleton`` (a file of your own) and those that
+            ``limber.settings("reconstruct")`` lists.
+
+    Raises:
+        InputError: the scan or a setting cannot be used. WorkError: no branch came out.
+
+    >>> branch = limber.reconstruct(folder / "scan" / "cloud.ply", folder / "a.branch", quiet=True)
+    >>> branch.mesh.tet_count > 100
+    True
+    """
+    if isinstance(cloud, str | os.PathLike):
+        if Path(cloud).is_dir():
+            raise InputError(f"{cloud} is a folder.", "One scan becomes one branch.",
+                             "Call limber.reconstruct for each of its files.")
+        return _made("reconstruct", folder, quiet, {**settings, "cloud": cloud})
+    with tempfile.TemporaryDirectory(prefix="limber-cloud-") as temporary:
+        path = Path(temporary) / "array.ply"
+        _write_cloud(cloud, path)
+        return _made("reconstruct", folder, quiet, {**settings, "cloud": path})
+
+
+def mesh(surface: PathLike, folder: PathLike, *, quiet: bool = False, **settings: Any) -> "Branch":
+    """Make a branch folder of a closed surface, a table of sections or a cylinder model.
+
+    Args:
+        surface: The file: STL, PLY, OBJ, a CSV of sections, or a cylinder model.
+        folder: The branch folder to make or renew.
+        quiet: Show no progress.
+        settings: ``unit``, ``root`` [3], ``elements_across``, ``young`` [Pa] and those that
+            ``limber.settings("mesh")`` lists.
+
+    Raises:
+        InputError: the surface or a setting cannot be used. MeshingError: no mesh came out.
+    """
+    return _made("mesh", folder, quiet, {**settings, "surface": surface})
+
+
+def open(folder: PathLike) -> "Branch":
+    """Return the branch of a folder that :func:`limber.reconstruct` or a command has made.
+
+    Raises:
+        BranchFolderError: there is no such folder, or it is damaged or of a newer format.
+
+    >>> limber.open(folder / "a.branch").name
+    'a'
+    """
+    return Branch(folder)
+
+
+def settings(verb: str) -> "SettingsTable":
+    """Return the settings of a verb, or of a command, with their defaults and meanings.
+
+    Raises:
+        InputError: there is no such verb.
+
+    >>> limber.settings("plan")["max_force"].default is None
+    True
+    """
+    from limber.stages.registry import stage_description, stage_summaries
+
+    name = stage_of(verb)
+    if name not in stage_summaries():
+        raise InputError(f"There is no {verb!r}.", nearest(name, list(stage_summaries())))
+    stage = stage_description(name)
+    return SettingsTable(verb, {
+        field: Setting(about.description or "",
+                       "required" if about.is_required() else about.default)
+        for kind in (stage.inputs, stage.settings, stage.options)
+        for field, about in kind.model_fields.items() if field != "branch_folder"})
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a verb.
+
+    Attributes:
+        meaning: With its unit in square brackets.
+        default: Or ``required``.
+    """
+
+    meaning: str
+    default: Any
+
+
+class SettingsTable(Mapping[str, Setting]):
+    """The settings of a verb by name; it prints as a list, and as a table in a notebook."""
+
+    def __init__(self, verb: str, content: Mapping[str, Setting]):
+        self._verb, self._content = verb, MappingProxyType({**content})
+
+    def __getitem__(self, name: str) -> Setting:
+        return self._content[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    def __repr__(self) -> str:
+        return "\n".join([f"Settings of {self._verb}:", *(
+            f"  {name} = {one.default!r}: {one.meaning}" for name, one in self.items())])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><td><code>{name}</code></td><td>{html.escape(repr(one.default))}</td>"
+                       f"<td>{html.escape(one.meaning)}</td></tr>" for name, one in self.items())
+        return (f"<table><caption>{html.escape(self._verb)}</caption>"
+                f"<tr><th>setting</th><th>default</th><th>meaning</th></tr>{rows}</table>")
+
+
+class ByName(Mapping[str, Value], Generic[Value]):
+    """Things of a branch folder by name; each is read when it is asked for."""
+
+    def __init__(self, names: list[str], read: Callable[[str], Value]):
+        self._names, self._read = tuple(names), read
+
+    def __getitem__(self, name: str) -> Value:
+        if name not in self._names:
+            raise KeyError(f"{name!r}: there are {', '.join(self._names) or 'none'}")
+        return self._read(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return f"<{', '.join(self._names) or 'none'}>"
+
+
+class Branch:
+    """A branch folder and what can be done with it.
+
+    Nothing is kept in memory: each verb reads the folder and writes to it, as commands do.
+
+    Args:
+        folder: Of the branch; :func:`limber.open` says the same.
+
+    Raises:
+        BranchFolderError: there is no such folder, or it is damaged or of a newer format.
+
+    >>> branch = limber.open(folder / "a.branch")
+    >>> pull = branch.virtual_pull(frames=8, seed=1, quiet=True)
+    >>> pull.forces.shape, list(branch.pulls)
+    ((8, 3), ['pull-1'])
+    """
+
+    def __init__(self, folder: PathLike):
+        self.folder = Path(folder)
+        self.name: str = self._read().name
+
+    @property
+    def mesh(self) -> "TetMesh":
+        """The tetrahedra: ``nodes`` [m], ``tets``, ``cell_data["young"]`` [Pa] and more.
+
+        Raises:
+            BranchFolderError: there is no mesh yet.
+        """
+        from limber.store.loading import load_mesh
+
+        return load_mesh(self._read())
+
+    @property
+    def skeleton(self) -> "Skeleton":
+        """The axes as a tree: ``nodes`` [m], ``parent``, ``radius`` [m], ``order`` and more.
+
+        Raises:
+            BranchFolderError: there is no skeleton yet.
+        """
+        from limber.store.loading import load_skeleton
+
+        return load_skeleton(self._read())
+
+    @property
+    def pulls(self) -> Mapping[str, Pull]:
+        """The recordings by name."""
+        from limber.store.loading import known_pulls
+
+        branch = self._read()
+        entries = branch.manifest.stages
+        return ByName(known_pulls(branch), lambda name: Pull.read(
+            branch, f"pull:{name}",
+            entries[f"pull:{name}"].result if f"pull:{name}" in entries else {}))
+
+    @property
+    def results(self) -> Mapping[str, Result]:
+        """The results that the folder holds, such as ``estimate`` or ``plan:path``, by name."""
+        branch = self._read()
+        entries = branch.manifest.stages
+        return ByName(sorted(entries), lambda key: read_result(branch, key, entries[key].result))
+
+    def plot(self) -> "Figure":
+        """Draw the scan and its skeleton from the front and from the side."""
+        from limber.api.typed_results import drawn
+        from limber.results.report.figures import scan_and_skeleton
+
+        branch = self._read()
+        branch.require("cloud.ply", "reconstruct")
+        return drawn(lambda: scan_and_skeleton(branch, []))
+
+    def add_pull(self, source: PathLike, name: str, *, quiet: bool = False, **settings: Any) -> Pull:
+        """Bring a recording of a pull into the branch folder.
+
+        Args:
+            source: A robot's log, a bag, a table of markers, or a folder of them.
+            name: Of the pull.
+            quiet: Show no progress.
+            settings: ``unit``, ``cell`` (the robot's cell file), ``grasp_point`` [m], ``weight``
+                [kg] and those that ``limber.settings("add_pull")`` lists.
+
+        Raises:
+            InputError: the recording or a setting cannot be used.
+        """
+        return cast(Pull, self._run("add_pull", quiet, settings, source=source, name=name))
+
+    def virtual_pull(self, *, quiet: bool = False, **settings: Any) -> Pull:
+        """Simulate a pull of the branch with a known Young's modulus and the noise of sensors.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``name``, ``young`` [Pa] at the control points, ``frames``, ``reach``,
+                ``position_noise`` [m], ``force_noise`` [N], ``seed`` and those that
+                ``limber.settings("virtual_pull")`` lists.
+
+        Raises:
+            WorkError: the branch cannot be pulled like that.
+        """
+        return cast(Pull, self._run("virtual_pull", quiet, settings))
+
+    def estimate(self, *, quiet: bool = False, **settings: Any) -> Estimate:
+        """Estimate Young's modulus along the branch from its pulls; the mesh gets it.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``pull`` (names; without it all), ``method``, ``fractions`` of the control
+                points, ``bag`` (a recording to import first) and those that
+                ``limber.settings("estimate")`` lists.
+
+        Raises:
+            InputError: there are no pulls, or they cannot tell Young's modulus.
+            WorkError: the fit ends at no result.
+        """
+        if settings.get("follow"):
+            raise InputError("follow was given.", "It estimates while a pull is recorded, and has "
+                             "another result.", "Use branch.run(\"estimate\", follow=True).")
+        return cast(Estimate, self._run("estimate", quiet, settings))
+
+    def simulate(self, *, quiet: bool = False, **settings: Any) -> Simulation:
+        """Pull the branch by a pose or a force.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``move`` [m], ``turn`` [rad] or ``grasp_force`` [N], ``kind`` ("static",
+                "dynamic"), ``duration`` [s], ``young`` [Pa], ``along`` (a table of poses) or
+                ``pull`` (a recording to replay), ``name`` and those that
+                ``limber.settings("simulate")`` lists.
+
+        Raises:
+            ConvergenceError: the branch could not follow; what it reached is in
+                ``branch.results["simulate"]``.
+        """
+        replayed = settings.get("pull")
+        return cast(Simulation, self._run(
+            "simulate", quiet, settings, key=f"replay:{replayed}" if replayed else None))
+
+    def load(self, *, quiet: bool = False, **settings: Any) -> Load:
+        """Put the branch under wind, snow, fruit or a cut.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``wind`` [m/s], shape [3], ``gust``, ``snow`` [kg/m^2], ``fruit`` ((x, y, z,
+                kg), ...), ``cut`` ((x, y, z), ...), ``limit_load``, ``name`` (keeps the result in
+                the folder) and those that ``limber.settings("load")`` lists.
+
+        Raises:
+            WorkError: the branch finds no rest under the loads.
+        """
+        return cast(Load, self._run("load", quiet, settings))
+
+    def energy_field(self, *, quiet: bool = False, **settings: Any) -> EnergyField:
+        """Sample grasp poses and fit the deformation energy over them.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``samples``, ``field_error`` [%], ``deflection``, ``seed``, ``workers`` and
+                those that ``limber.settings("energy_field")`` lists.
+
+        Raises:
+            WorkError: too few poses could be solved.
+        """
+        return cast(EnergyField, self._run("energy_field", quiet, settings))
+
+    def plan(self, *, quiet: bool = False, **settings: Any) -> Plan:
+        """Plan a gentle path of the grasp on the energy field; the shortest one for comparison.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``goal`` or ``tip_goal`` [m], ``target``, ``max_force`` [N], ``max_strain``,
+                ``max_detour`` [%], ``cell`` (the robot's cell file), ``name`` and those that
+                ``limber.settings("plan")`` lists.
+
+        Raises:
+            BranchFolderError: there is no energy field, or one of another branch.
+            NoPathError: no path leads to the goal; the message says why.
+        """
+        return cast(Plan, self._run("plan", quiet, settings))
+
+    def execute(self, cell: PathLike, *, quiet: bool = False, **settings: Any) -> Execution:
+        """Check a plan for a robot; with ``arm=True`` and ``confirm=NAME`` follow it.
+
+        Args:
+            cell: The robot's cell file.
+            quiet: Show no progress.
+            settings: ``name`` of the plan, ``speed`` [m/s], ``arm``, ``confirm`` and those that
+                ``limber.settings("execute")`` lists.
+
+        Raises:
+            InputError: plan, cell and branch do not belong together, or nobody confirmed.
+            NoPathError: the arm cannot follow the path.
+            SafetyStop: it was stopped; its ``result`` says where.
+        """
+        return cast(Execution, self._run("execute", quiet, settings, cell=cell))
+
+    def report(self, *, quiet: bool = False, **settings: Any) -> Written:
+        """Write one HTML page with figures and tables of all results.
+
+        Args:
+            quiet: Show no progress.
+            settings: ``picture``, ``caliper`` and those that ``limber.settings("report")`` lists.
+        """
+        _, values = self._values("report", quiet, settings)
+        return Written(MappingProxyType(values), Path(values["report"]))
+
+    def scene(self, output: PathLike, *, quiet: bool = False, **settings: Any) -> Written:
+        """Write a Blender scene with the branch, its motion and paths.
+
+        Args:
+            output: The .blend to write.
+            quiet: Show no progress.
+            settings: ``render`` (a PNG), ``turntable``, ``color``, ``plan`` and those that
+                ``limber.settings("scene")`` lists.
+
+        Raises:
+            WorkError: Blender failed, or is not installed.
+        """
+        _, values = self._values("scene", quiet, settings, output=output)
+        return Written(MappingProxyType(values), Path(output))
+
+    def export(self, output: PathLike, *, quiet: bool = False, **settings: Any) -> Written:
+        """Write the branch for another program.
+
+        Args:
+            output: The file; its suffix says what: .xml (MuJoCo), .urdf, .usd, .inp, .mat, .csv,
+                .mtg or .swc.
+            quiet: Show no progress.
+            settings: ``links``, ``columns`` and those that ``limber.settings("export")`` lists.
+
+        Raises:
+            InputError: the suffix is not known, or the file cannot be written.
+        """
+        _, values = self._values("export", quiet, settings, output=output)
+        return Written(MappingProxyType(values), Path(output))
+
+    def run(self, stage: str, *, quiet: bool = False, **settings: Any) -> Result:
+        """Run a stage that has no verb of its own, such as ``predict``, ``swing`` or ``target``.
+
+        Args:
+            stage: Name of its command.
+            quiet: Show no progress.
+            settings: Its inputs, settings and options, as ``limber.settings(stage)`` lists them.
+
+        Raises:
+            InputError: there is no such stage, or a setting is refused.
+        """
+        if stage_of(stage) in ("generate", "reconstruct", "mesh"):
+            raise InputError(f"{stage} makes a branch.", "", f"Call limber.{stage}.")
+        _, values = self._values(stage, quiet, settings)
+        return Result(MappingProxyType(values))
+
+    def session(self, *, mode: str = "clamped", **settings: Any) -> "InteractiveSession":
+        """Start a process in which the branch follows what holds it, many times a second.
+
+        Args:
+            mode: Of the marked grasp: ``clamped`` (the pose is held) or ``pinned`` (the position).
+            settings: Fields of :class:`limber.session.settings.SessionSettings`.
+
+        Returns:
+            The session; use it in a ``with`` statement.
+
+        Raises:
+            InputError: a setting is refused. WorkError: the session did not start.
+        """
+        from limber.session.client import InteractiveSession
+        from limber.session.settings import SessionSettings
+
+        known = list(SessionSettings.model_fields)
+        for name in settings:
+            if name not in known:
+                raise InputError(f"session has no {name!r}.", nearest(name, known))
+        checked_settings(SessionSettings, {"mode": mode, **settings})
+        return InteractiveSession(self.folder, mode=mode, **settings)
+
+    def __repr__(self) -> str:
+        told = "".join(f", {label}: {text}" for label, text in self._shown().items())
+        return f"Branch({str(self.folder)!r}{told})"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><td>{label}</td><td>{html.escape(text)}</td></tr>"
+                       for label, text in self._shown().items())
+        return f"<table><caption>{html.escape(self.name)}</caption>{rows}</table>"
+
+    def _shown(self) -> dict[str, str]:
+        branch = self._read()
+        made = next((branch.manifest.stages[key].result for key in ("reconstruct", "mesh")
+                     if key in branch.manifest.stages), {})
+        size = {"tetrahedra": f"{made['tet_count']:,}"} if "tet_count" in made else {}
+        return size | {"results": ", ".join(sorted(branch.manifest.stages)) or "none"}
+
+    def _read(self) -> Folder:
+        return Folder.read(self.folder)
+
+    def _values(self, verb: str, quiet: bool, settings: dict[str, Any], **needed: Any,
+                ) -> tuple[str, dict[str, Any]]:
+        return run_stage(stage_of(verb), {**settings, **needed, "branch_folder": self.folder},
+                         quiet=quiet)
+
+    def _run(self, verb: str, quiet: bool, settings: dict[str, Any], *, key: str | None = None,
+             **needed: Any) -> Result:
+        entry, values = self._values(verb, quiet, settings, **needed)
+        return read_result(self._read(), key or entry, values)
+
+
+def _made(stage: str, folder: PathLike, quiet: bool, given: dict[str, Any]) -> Branch:
+    run_stage(stage, {**given, "output": folder}, quiet=quiet)
+    return Branch(folder)
+
+
+def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
+    """Write an array or columns as a PLY file.
+
+    Raises:
+        InputError: they are no points.
+    """
+    from plyfile import PlyData, PlyElement
+
+    names = getattr(getattr(cloud, "dtype", None), "names", None) or (
+        list(cloud) if hasattr(cloud, "keys") else None)
+    if names is None:
+        points = np.asarray(cloud)
+        if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+            raise InputError(f"The cloud is an array of shape {points.shape}, {points.dtype}.",
+                             "Points have shape [n, 3].",
+                             "Give other columns by name: {\"x\": ..., \"red\": ...}.")
+        columns = dict(zip("xyz", points.T, strict=True))
+    else:
+        columns = {str(name): np.asarray(cloud[name]) for name in names}
+    table = np.empty(len(next(iter(columns.values()))), [
+        (name, "f8" if name in "xyz" else column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(path))
