@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.paper_branches import measured
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.fitting.optimise import nelder_mead
 from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.forward.force_motion import motion_response
@@ -14,7 +15,6 @@ from limber.estimation.forward.input_force import course_of, nodal_loads
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
 from limber.mechanics.dynamics.integration import simulate_dynamics
-from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.points import point_operator
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry

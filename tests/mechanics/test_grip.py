@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.forward.input_force import nodal_loads
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics import BranchModel, Grasp, solve_static
-from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.sensitivities import grasp_slopes
 from limber.recordings.recording import GraspEntry
 

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
 from limber.recordings.recording import Observations
-from limber.recordings.synchronisation import estimate_offset, frames_of, poses_at
+from limber.recordings.synchronisation import estimate_offset, frames_of
 
 
 def test_frames_are_the_observers_instants(plain_pull):
@@ -19,14 +18,6 @@ def test_frames_are_the_observers_instants(plain_pull):
     assert np.allclose(frames.poses[:, 0], expected)
     error = frames.wrenches[:, 0] - 50 * expected
     assert np.std(error) < 0.02 and abs(np.mean(error)) < 0.01
-
-
-def test_rotations_take_the_short_way():
-    """Halfway between turns of 0 and 170 degrees about an axis is 85 degrees about it."""
-    poses = np.zeros((2, 6))
-    poses[1, 3:] = np.radians(170) * np.array([0.6, 0.0, 0.8])
-    middle = poses_at(np.array([0.0, 1.0]), poses, np.array([0.5]))[0, 3:]
-    assert np.degrees(Rotation.from_rotvec(middle).magnitude()) == pytest.approx(85)
 
 
 def there_and_back(pull):

@@ -172,8 +172,9 @@ def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
 def test_joint_angles_need_the_cell(tmp_path, bare_folder):
     """In any order, with a robot's own names; the base's pose in the branch's frame is the
     cell's."""
+    from limber.core.numerics.rigid import pose_vectors
     from limber.robot.cell.cell import Cell, write_cell
-    from limber.robot.ur.kinematics import forward, pose_vectors
+    from limber.robot.ur.kinematics import forward
 
     names = ["elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
              "wrist_2_joint", "wrist_3_joint"]

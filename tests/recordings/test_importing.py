@@ -15,7 +15,6 @@ from limber.perception.observe import list_frames, read_depth, write_depth
 from limber.recordings.importing import ImportSettings, markers_from_c3d
 from limber.recordings.masks import read_mask
 from limber.recordings.recording import read_pull, write_pull
-from limber.recordings.registration import rigid_fit
 from limber.recordings.time_series import Stream, read_stream, write_stream
 from limber.stages.pulls.import_pull import import_pull
 from limber.store import Branch
@@ -60,18 +59,6 @@ def test_a_robot_table_is_needed_and_its_columns_are_named(bare_folder, source):
     with pytest.raises(InputError, match="no "):
         import_pull(bare_folder, source / "nothing.csv", "m", ImportSettings())
     assert "m" not in json.loads((bare_folder / "branch.json").read_text())["files"]
-
-
-def test_rigid_fit_of_a_turned_copy():
-    """Kabsch: a turned and shifted cloud comes back, and a mirror image is never used."""
-    rng = np.random.default_rng(0)
-    points = rng.standard_normal((6, 3))
-    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    found, shift = rigid_fit(points, points @ turn.T + [1, 2, 3])
-    assert np.allclose(found, turn) and np.allclose(shift, [1, 2, 3])
-    mirrored, _ = rigid_fit(points, points * [1, 1, -1])
-    assert np.linalg.det(mirrored) == pytest.approx(1)
 
 
 def test_rgbd_folder_in_the_layout_of_tum(bare_folder, source):

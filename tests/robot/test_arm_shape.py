@@ -7,13 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import NoPathError
+from limber.core.numerics.rigid import matrices
 from limber.planning.constraints.obstacles import Box
 from limber.robot.cell.arm_shape import rods_of
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward, matrices
+from limber.robot.ur.kinematics import forward
 from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 
 

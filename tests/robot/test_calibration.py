@@ -8,10 +8,11 @@ import pytest
 
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.base_calibration import fit_base, touched_place
 from limber.robot.cell.cell import Cell, read_cell, write_cell
-from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+from limber.robot.ur.kinematics import forward
 from limber.robot.ur.samples import Sample
 from limber.robot.virtual.controller import HOME
 

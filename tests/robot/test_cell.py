@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell, read_cell, write_cell
-from limber.robot.ur.kinematics import matrices, pose_vectors
 
 TEXT = """\
 branch = "0d5a"

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.robot_faults import restored
 from limber.core.errors import InputError, NoPathError, SafetyStop
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.mechanics.status import Status
 from limber.robot.cell.base_calibration import fit_base
@@ -18,7 +19,7 @@ from limber.robot.cell.compatibility import check_plan
 from limber.robot.motion.execution import across, followed, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward, inverse, inverted, matrices, pose_vectors
+from limber.robot.ur.kinematics import forward, inverse
 from limber.stages.paths.execute import (
     ExecuteOptions,
     ExecuteSettings,

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.cell.hand_eye import base_from_camera, fit_camera
-from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
 from limber.store import Branch
 
 STANDING = np.array([1.2, -0.3, 0.6, -1.9, 0.4, 0.3])

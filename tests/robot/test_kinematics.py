@@ -11,15 +11,7 @@ from scipy.spatial.transform import Rotation
 from limber.core.errors import InputError, NoPathError
 from limber.robot.motion.joint_path import follow, joint_path
 from limber.robot.ur.arms import ARMS, arm_named
-from limber.robot.ur.kinematics import (
-    forward,
-    inverse,
-    inverted,
-    jacobian,
-    matrices,
-    pose_vectors,
-    singularity_distance,
-)
+from limber.robot.ur.kinematics import forward, inverse, jacobian, singularity_distance
 
 
 def random_joints(count: int, seed: int = 11) -> np.ndarray:
@@ -106,13 +98,6 @@ def test_inverse_keeps_its_digits_near_the_wrist_singularity(near, side, seed):
     assert exist.any()
     assert np.abs(forward(arm, solutions[exist]) - frame).max() < 1e-8
     assert np.abs(forward(arm, solutions[exist])[..., :3, 3] - frame[:3, 3]).max() < 1e-9
-
-
-def test_poses_and_matrices_go_both_ways():
-    poses = np.concatenate([random_joints(50)[:, :3], 0.5 * random_joints(50, 3)[:, 3:]], axis=1)
-    frames = matrices(poses)
-    assert pose_vectors(frames) == pytest.approx(poses)
-    assert frames @ inverted(frames) == pytest.approx(np.tile(np.eye(4), (50, 1, 1)))
 
 
 def test_out_of_reach_has_no_solution():

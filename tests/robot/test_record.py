@@ -15,11 +15,11 @@ from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_
 from benchmarks.robot_faults import restored
 from limber.cli.main import command_of
 from limber.core.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
+from limber.core.numerics.rigid import matrices
 from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.robot.cell.cell import Cell
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
-from limber.robot.ur.kinematics import matrices
 from limber.stages.pulls.record import RecordOptions, RecordSettings, record
 from limber.stages.pulls.record_path import suggested_pull, there_and_back, way_on_arc, way_through
 from limber.stages.registry import stage_description

@@ -5,15 +5,10 @@ import threading
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, WorkError
+from limber.core.numerics.rigid import matrices
 from limber.core.numerics.rigid_kernels import (
-    frame_of,
-    inverse_of,
-    pose_between,
-    pose_of,
-    rotation_vector,
     turned_wrench,
     weight_wrench,
 )
@@ -28,7 +23,6 @@ from limber.robot.driver.force_sensors import (
     open_sensor,
     parsed_message,
 )
-from limber.robot.ur.kinematics import matrices
 from limber.robot.ur.samples import Sample
 
 TOOL = (0.02, -0.01, 0.15, 0.3, 0.1, -0.2)
@@ -48,25 +42,6 @@ def sample_at(pose, wrench=(0.0,) * 6, clock=1.0) -> Sample:
 
 def reading_of(wrench) -> Reading:
     return Reading(np.asarray(wrench, float), 0.0, np.asarray(wrench, float))
-
-
-def test_compiled_frames_are_those_of_scipy():
-    rng = np.random.default_rng(2)
-    for _ in range(300):
-        pose, other = np.r_[rng.normal(size=3), rng.uniform(-1.8, 1.8, 3)], rng.normal(size=6)
-        frame = frame_of(pose)
-        assert frame == pytest.approx(matrices(pose), abs=1e-14)
-        assert pose_of(frame) == pytest.approx(pose, abs=1e-9)
-        assert inverse_of(frame) @ frame == pytest.approx(np.eye(4), abs=1e-13)
-        turn = Rotation.from_rotvec(other[3:]) * Rotation.from_rotvec(pose[3:]).inv()
-        middle = Rotation.from_rotvec(0.3 * turn.as_rotvec()) * Rotation.from_rotvec(pose[3:])
-        assert frame_of(pose_between(pose, other, 0.3))[:3, :3] == pytest.approx(
-            middle.as_matrix(), abs=1e-12)
-    for angle in (0.0, 1e-12, np.pi - 1e-9, np.pi):
-        axis = np.array([0.6, 0.0, 0.8])
-        back = rotation_vector(Rotation.from_rotvec(angle * axis).as_matrix())
-        assert Rotation.from_rotvec(back).as_matrix() == pytest.approx(
-            Rotation.from_rotvec(angle * axis).as_matrix(), abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["controller", "ft300"])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import SafetyStop
+from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.expected_wrench import ExpectedWrench
@@ -11,7 +12,7 @@ from limber.robot.motion.retreat import WayBack
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward, inverse, matrices, pose_vectors
+from limber.robot.ur.kinematics import forward, inverse
 from limber.robot.ur.samples import Sample
 from limber.robot.virtual.controller import HOME
 from limber.stages.pulls.record_path import there_and_back

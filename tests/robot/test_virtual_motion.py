@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.robot.conftest import Registers
 
-from limber.robot.ur.kinematics import matrices
+from limber.core.numerics.rigid import matrices
 from limber.robot.virtual.controller import HOME, Controller, RuntimeState, SafetyMode
 from limber.robot.virtual.force_sensor import E_SERIES, ForceSensor
 

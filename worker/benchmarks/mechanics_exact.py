@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks import mechanics_reduced
 from benchmarks.table import Asked, Row, Setting
+from limber.core.numerics.rigid import rotation_matrix
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import (
@@ -23,7 +24,6 @@ from limber.mechanics import (
     solve_static,
 )
 from limber.mechanics.elements import shapes as fe
-from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics.solve import solve_prescribed
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.motion.execution import across
 from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import forward, inverted, matrices, pose_vectors
+from limber.robot.ur.kinematics import forward
 from limber.robot.virtual.controller import HOME
 from limber.robot.virtual.gripped_branch import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot

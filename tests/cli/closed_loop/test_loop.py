@@ -19,13 +19,14 @@ from limber.cli.closed_loop.comparison import comparison
 from limber.cli.closed_loop.loop import ClosedLoop
 from limber.cli.commands.robot import _points
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
+from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.problem import UNPROVEN
 from limber.robot.cell.base_calibration import fit_base
 from limber.robot.cell.cell import Cell
 from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import forward, matrices
+from limber.robot.ur.kinematics import forward
 
 TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 

@@ -165,7 +165,7 @@ def test_start_in_balance_stays_there(mesh):
 
 def test_rigid_turn_is_not_braked(mesh):
     """Viscosity works on strain alone: a rigidly turned state has no viscous force."""
-    from limber.mechanics.grasp import rotation_matrix
+    from limber.core.numerics.rigid import rotation_matrix
     from limber.mechanics.linear.equations import Viscous
 
     model = make_model(mesh)

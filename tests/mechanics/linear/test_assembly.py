@@ -7,10 +7,10 @@ import pytest
 import scipy.sparse as sp
 from tests.subjects.meshes import box_mesh
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp
-from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.linear import equations as equations_module
 from limber.mechanics.linear import factor
 from limber.mechanics.linear.equations import Viscous

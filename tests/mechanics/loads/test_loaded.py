@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import Progress
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.loaded_branch import NamedTarget, hang, target_masses
 from limber.mechanics.model import BranchModel
 

@@ -427,7 +427,8 @@ def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
 
 def _preview(joints, base, arm):
     """A dry run's table for these joints; its poses are those of the flange."""
-    from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+    from limber.core.numerics.rigid import matrices, pose_vectors
+    from limber.robot.ur.kinematics import forward
 
     poses = pose_vectors(matrices(np.array(base)) @ forward(arm, joints))
     columns = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",

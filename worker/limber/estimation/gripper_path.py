@@ -15,10 +15,11 @@ import numpy as np
 import scipy
 
 from limber.core.errors import WorkError
+from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult
-from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 

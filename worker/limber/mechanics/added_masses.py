@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import closest_rotation
 from limber.geometry.tets.tet_mesh import TetMesh
 
 Place = tuple[float, float, float]
@@ -95,9 +96,8 @@ class Tied:
         position = np.array(self.added.position) + way
         if not isinstance(self.added, HungTwig):
             return replace(self.added, position=tuple(position))
-        turn = np.eye(3) + np.einsum("t,tia,taj->ji", self.share, self.slopes, local)
-        left, _, right = np.linalg.svd(turn)
-        turn = left @ right
+        turn = closest_rotation(
+            np.eye(3) + np.einsum("t,tia,taj->ji", self.share, self.slopes, local))
         arm = np.array(self.added.position) - np.array(self.added.attached)
         x, y, z = map(tuple, turn @ np.array(self.added.inertia) @ turn.T)
         return replace(self.added, position=tuple(position),

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import closest_rotation, rotation_matrix, rotation_vector
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements.shapes import node_weights
 from limber.mechanics.grip import nodes_between, parts_between
@@ -205,9 +206,7 @@ class Grasp:
         mean = self.weights @ positions
         if len(self.nodes) < 3:
             return np.concatenate([mean, np.zeros(3)])
-        left, _, right = np.linalg.svd((self.weights[:, None] * (positions - mean)).T @ arm)
-        turn = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
-        turned = left @ turn @ right
+        turned = closest_rotation((self.weights[:, None] * (positions - mean)).T @ arm)
         if self.held is not None:
             mean = mean - turned @ (self.weights @ arm)
         return np.concatenate([mean, rotation_vector(turned)])
@@ -231,30 +230,6 @@ class Grasp:
         turns = np.linalg.pinv(np.trace(squares) * np.eye(3) - squares, rcond=1e-9) @ spin
         lever = self.pose_of(rest, displacement)[:3] - self.weights @ positions
         return moved + np.cross(turns, lever[:, None], axis=0)
-
-
-def rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix of a rotation vector [rad] (Rodrigues)."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(vector).as_matrix()
-
-
-def rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation vector [rad] of a rotation matrix."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(matrix).as_rotvec()
-
-
-def pose_between(first: np.ndarray, second: np.ndarray, part: float) -> np.ndarray:
-    """Return the pose at ``part`` of the way, on a straight line and the shortest rotation."""
-    from scipy.spatial.transform import Rotation
-
-    start, end = Rotation.from_rotvec(first[3:]), Rotation.from_rotvec(second[3:])
-    turn = (end * start.inv()).as_rotvec() * part
-    return np.concatenate([first[:3] + part * (second[:3] - first[:3]),
-                           (Rotation.from_rotvec(turn) * start).as_rotvec()])
 
 
 def check_pose(pose: np.ndarray) -> np.ndarray:

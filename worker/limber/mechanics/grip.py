@@ -10,6 +10,7 @@ only the rest bends, which is in series with it: its compliance is 1 - p of the 
 
 import numpy as np
 
+from limber.core.numerics.rigid import principal_axes
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 STIFFEST = 100.0
@@ -57,7 +58,7 @@ def _placed(mesh: TetMesh, point: np.ndarray, half_length: float) -> tuple[np.nd
     reach = max(_NEAR_RADII * half_length, np.sort(distance)[min(
         _NEAR_NODES, mesh.node_count) - 1])
     near = distance <= reach
-    axis = np.linalg.svd(away[near] - away[near].mean(axis=0), full_matrices=False)[2][0]
+    axis = principal_axes(away[near])[0]
     along = away @ axis
     beside = np.linalg.norm(away - along[:, None] * axis, axis=1)
     return along, beside > max(2 * half_length, _BESIDE * beside[near].mean())

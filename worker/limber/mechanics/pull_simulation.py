@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import composed
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.added_masses import PointMass
@@ -132,9 +133,6 @@ def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.n
 
 def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
     """Return the grasp's poses [frames, 6], from where the loaded branch holds it."""
-    from scipy.spatial.transform import Rotation
-
     if mode == "pinned":
         pose = np.concatenate([pose[:3], np.zeros(3)])
-    turned = Rotation.from_rotvec(changes[:, 3:]) * Rotation.from_rotvec(pose[3:])
-    return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])
+    return np.hstack([pose[:3] + changes[:, :3], composed(changes[:, 3:], pose[3:])])

@@ -7,8 +7,8 @@ that is piecewise linear between a few knots. Arc length therefore names a mater
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.geometry.skeleton.skeleton import Skeleton
 
 
@@ -100,7 +100,7 @@ class BentCurve:
 
     def turned(self, step: np.ndarray) -> "BentCurve":
         """Return the curve after a rotation step [rad] at the knots, shape [knots, 3]."""
-        field = Rotation.from_rotvec(self.rest.hats @ step).as_matrix()
+        field = rotation_matrix(self.rest.hats @ step)
         return replace(self, turns=field @ self.turns, knots=self.knots + step)
 
     def jacobian(self) -> np.ndarray:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import poses_at, rotation_angle, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera
 from limber.geometry.cloud.pixels import read_pixels
@@ -15,7 +15,6 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
 from limber.recordings.masks import read_mask, segment_by_depth
 from limber.recordings.recording import Observations, Pull
-from limber.recordings.synchronisation import poses_at
 
 CAMERA_OFFSET_M = 4e-3
 """A camera pose that is off by more at the branch is corrected, with a warning [m]."""
@@ -170,7 +169,7 @@ def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray
     moved = np.linalg.norm(tracker.rest.nodes @ turn.T + shift - tracker.rest.nodes, axis=1)
     if moved.max() <= CAMERA_OFFSET_M:
         return nothing
-    angle = np.degrees(Rotation.from_matrix(turn).magnitude())
+    angle = np.degrees(rotation_angle(turn))
     notes.messages.append(
         f"the camera's pose is off by up to {moved.max() * 1e3:.0f} mm and {angle:.1f} degrees at "
         "the branch at rest; the frames were moved onto it. Calibrate the camera again.")
@@ -181,7 +180,7 @@ def _anchor(tracker: CurveTracker, pull: Pull, pose: np.ndarray) -> Anchor:
     held = np.array(pull.entry.grasp.point_m)
     arc = tracker.arc_near(held)
     arm = tracker.rest.start().at(np.array([arc]))[0] - held
-    turn = Rotation.from_rotvec(pose[3:]).as_matrix()
+    turn = rotation_matrix(pose[3:])
     return Anchor(arc, pose[:3] + turn @ arm)
 
 

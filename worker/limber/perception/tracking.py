@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.geometry.cloud.camera import SeenCloud
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.curve import BentCurve, RestCurve
@@ -156,7 +156,7 @@ def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np
         seen = directions[:, values > SEEN_SHARE * values[-1]]
         step = -scale * (seen @ np.linalg.solve(
             seen.T @ (scaled @ jacobian) @ seen, seen.T @ (scaled @ residual)))
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        turn = rotation_matrix(step[:3])
         rotation, shift = turn @ rotation, turn @ shift + step[3:]
     return rotation, centre + shift - rotation @ centre
 

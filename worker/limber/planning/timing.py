@@ -11,6 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from limber.core.numerics.rigid import rotations_at
+
 _SHARE = np.sqrt(0.5)  # of the acceleration, each along and across
 _PIECES = 16  # an edge is cut into, so that speeds change within it
 _STILL = 1e-9  # [m] below which two poses are one
@@ -109,7 +111,6 @@ def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
         law: Of these poses' positions and stops.
     """
     from scipy.interpolate import Akima1DInterpolator
-    from scipy.spatial.transform import Rotation, Slerp
 
     knots = law.along[::_PIECES]
     along = law.at(instants)
@@ -128,8 +129,7 @@ def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
             if len(passed) > 2 else poses[first, :3] + np.outer(
                 (asked - places[0]) / (places[1] - places[0]),
                 poses[passed[1], :3] - poses[first, :3]))
-        turns = Rotation.from_rotvec(poses[passed, 3:])
-        found[here, 3:] = Slerp(places, turns)(asked).as_rotvec()
+        found[here, 3:] = rotations_at(places, poses[passed, 3:], asked)
     return found
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as, read_json, read_text
 from limber.core.files.safe_names import inside
+from limber.core.numerics.rigid import composed, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.cloud.pixels import read_pixels
@@ -28,11 +29,10 @@ def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.nd
     Args:
         frame_pose: Of the frame that they are given in [m] and rotation vector [rad], shape [6].
     """
-    turn = Rotation.from_rotvec(np.array(frame_pose[3:]))
     known = np.isfinite(poses[:, 3:]).all(axis=1)
     turned = np.full((len(poses), 3), np.nan)
-    turned[known] = (turn * Rotation.from_rotvec(poses[known, 3:])).as_rotvec()
-    matrix = turn.as_matrix().T
+    turned[known] = composed(np.array(frame_pose[3:]), poses[known, 3:])
+    matrix = rotation_matrix(np.array(frame_pose[3:])).T
     return (np.hstack([np.array(frame_pose[:3]) + poses[:, :3] @ matrix, turned]),
             np.hstack([wrenches[:, :3] @ matrix, wrenches[:, 3:] @ matrix]))
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.mechanics.grasp import Grasp
 from limber.recordings.recording import GraspEntry
 
 LEAST_NODES = 6

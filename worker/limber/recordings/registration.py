@@ -5,9 +5,9 @@ from itertools import combinations, permutations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import rigid_fit
 from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split_title
 
 POOR_FIT_M = 5e-3
@@ -174,20 +174,6 @@ def _require_same_body(points: np.ndarray, target: np.ndarray, labels: list[str]
                 f"they are exchanged, and to {1e3 * rms:.0f} mm as they are named.",
                 "They are mistaken for each other in the recording or in the table.",
                 "Exchange their names in the table of nominal places.")
-
-
-def rigid_fit(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] that take ``points`` onto ``target`` (Kabsch), [n, 3]."""
-    centre, goal = points.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((points - centre).T @ (target - goal))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
-    turn = right.T @ flip @ left.T
-    return turn, goal - turn @ centre
-
-
-def turned(rotation: np.ndarray) -> float:
-    """Angle of a rotation matrix [rad]."""
-    return float(Rotation.from_matrix(rotation).magnitude())
 
 
 def _residuals(points: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from scipy.spatial.transform import Rotation, Slerp
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import poses_at
 from limber.recordings.recording import Pull
 from limber.recordings.time_series import gaps, inside_gap
 
@@ -77,13 +77,6 @@ def frames_of(pull: Pull) -> Frames:
     wrenches, counts = _mean_wrenches(pull, times)
     return Frames(times, poses_at(pull.times, pull.poses, times), wrenches, counts,
                   positions[usable], np.array(covariance[usable]), warnings)
-
-
-def poses_at(times: np.ndarray, poses: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Interpolate poses [m, rad]; rotations along the shortest turn. Returns shape [w, 6]."""
-    positions = np.column_stack([np.interp(wanted, times, axis) for axis in poses[:, :3].T])
-    turned = Slerp(times, Rotation.from_rotvec(poses[:, 3:]))(wanted)
-    return np.hstack([positions, turned.as_rotvec()])
 
 
 def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:

@@ -13,7 +13,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.core.errors import InputError
-from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.core.numerics.rigid import rotation_matrix
+from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import gradient_metric
 from limber.reduced.training import Snapshots

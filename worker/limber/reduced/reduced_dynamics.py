@@ -13,10 +13,11 @@ import numpy as np
 import scipy
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import pose_between
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.dynamics.integration import NewmarkSettings
 from limber.mechanics.dynamics.pose_path import unwrapped
-from limber.mechanics.grasp import check_pose, pose_between
+from limber.mechanics.grasp import check_pose
 from limber.reduced.reduced_model import ReducedModel, ReducedState, solved_raised
 
 _HALVINGS = 6

@@ -20,9 +20,10 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_arrays
+from limber.core.numerics.rigid import pose_between
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
-from limber.mechanics.grasp import Grasp, check_pose, pose_between
+from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.reduced.basis import Basis, GraspCoordinates, make_basis

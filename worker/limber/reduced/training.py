@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.core.errors import ConvergenceError, InputError
+from limber.core.numerics.rigid import angle_between, rotation_matrix, rotation_vector
 from limber.core.progress import SILENT, Progress
-from limber.mechanics.grasp import RADIAN, Grasp, rotation_matrix, rotation_vector
+from limber.mechanics.grasp import RADIAN, Grasp
 from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
@@ -179,10 +180,7 @@ def sample_young(control_young: np.ndarray, count: int, rng: np.random.Generator
 def pose_distance(model: BranchModel, poses: np.ndarray, young: np.ndarray, pose: np.ndarray,
                   control_young: np.ndarray) -> np.ndarray:
     """Return how far states are from a pose and modulus [m], shape [s]; for choosing starts."""
-    from scipy.spatial.transform import Rotation
-
-    turns = (Rotation.from_rotvec(pose[3:]).inv()
-             * Rotation.from_rotvec(np.atleast_2d(poses)[:, 3:])).magnitude()
+    turns = angle_between(pose[3:], np.atleast_2d(poses)[:, 3:])
     factor = np.abs(np.log(np.atleast_2d(young) / control_young)).max(axis=1)
     return (np.linalg.norm(np.atleast_2d(poses)[:, :3] - pose[:3], axis=1)
             + model.extent * (RADIAN * turns + _YOUNG_SCALE * factor))

@@ -2,17 +2,16 @@
 
 import numpy as np
 
-from limber.mechanics.grasp import RADIAN, rotation_matrix
+from limber.core.numerics.rigid import rotation_matrix, rotation_vector
+from limber.mechanics.grasp import RADIAN
 
 
 class TrainingPoses:
     """Poses that distances are taken to."""
 
     def __init__(self, poses: np.ndarray, extent: float):
-        from scipy.spatial.transform import Rotation
-
         self.positions = np.atleast_2d(poses)[:, :3]
-        self.rotations = Rotation.from_rotvec(np.atleast_2d(poses)[:, 3:]).as_matrix()
+        self.rotations = rotation_matrix(np.atleast_2d(poses)[:, 3:])
         self.extent = extent
 
     def distance(self, pose: np.ndarray) -> np.ndarray:
@@ -26,9 +25,7 @@ class TrainingPoses:
         """Return the 90th percentile of the distance to the nearest other pose [m]."""
         if len(self.positions) < 3:
             return self.extent
-        from scipy.spatial.transform import Rotation
-
-        vectors = Rotation.from_matrix(self.rotations).as_rotvec()
+        vectors = rotation_vector(self.rotations)
         nearest = [np.partition(self.distance(np.concatenate([position, vector])), 1)[1]
                    for position, vector in zip(self.positions, vectors, strict=True)]
         return float(np.percentile(nearest, 90))

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import pose_between
 from limber.mechanics.dynamics.integration import NewmarkSettings
-from limber.mechanics.grasp import pose_between
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.reduced.reduced_dynamics import ReducedStepper
 from limber.reduced.reduced_model import ReducedModel

@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import pose_between
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.mechanics.grasp import RADIAN, Grasp, pose_between
+from limber.mechanics.grasp import RADIAN, Grasp
 from limber.mechanics.loads.loaded_branch import LoadedBranch
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.mechanics.model import BranchModel

@@ -29,6 +29,7 @@ from limber.cli.closed_loop.comparison import Told, compared
 from limber.cli.closed_loop.task_sizes import Wish, wish_for
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.json_values import plain
+from limber.core.numerics.rigid import matrices
 from limber.core.processes.stage_process import run_stage
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import VirtualPullSettings
@@ -38,7 +39,6 @@ from limber.geometry.io.skeletons import read_swc
 from limber.planning.problem import UNPROVEN
 from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import matrices
 from limber.robot.virtual.gripped_branch import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import MARKER_PORT

@@ -47,7 +47,8 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
                           "write to /dev/cpu_dma_latency keeps them awake): a virtual machine's "
                           "wake late, which ends in a stop.")
     pose = np.array(facts["pose"])
-    from limber.robot.ur.kinematics import forward, matrices
+    from limber.core.numerics.rigid import matrices
+    from limber.robot.ur.kinematics import forward
 
     nominal = forward(cell.arm, np.array(facts["joints"])) @ matrices(np.array(
         cell.tool.grasp_pose))
@@ -114,9 +115,9 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Pa
                camera_on: str, scan_pose: tuple[float, ...] | None, largest_residual: float,
                ) -> dict[str, Any]:
     from limber.core.files.reading import read_columns
+    from limber.core.numerics.rigid import matrices, pose_vectors
     from limber.recordings.recording import POSE_COLUMNS
     from limber.robot.cell.hand_eye import base_from_camera, fit_camera
-    from limber.robot.ur.kinematics import matrices, pose_vectors
     from limber.store.loading import load_skeleton
 
     robot_columns = [f"robot_{name}" for name in POSE_COLUMNS]

@@ -1,6 +1,6 @@
 """Rigid transforms one at a time, compiled: what the loops at the controller's rate use.
 
-Arrays of poses go through :mod:`limber.robot.ur.kinematics`; here a call takes about a microsecond.
+Arrays of poses go through :mod:`limber.core.numerics.rigid`; here a call takes about a microsecond.
 """
 
 import math

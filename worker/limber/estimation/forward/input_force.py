@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.forward.key_frames import key_frames, smoothed
-from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import refined_solve
 from limber.recordings.recording import GraspEntry

@@ -14,6 +14,7 @@ from typing import TypeGuard
 
 import numpy as np
 
+from limber.core.numerics.rigid import principal_axes
 from limber.core.present import present
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response
@@ -148,7 +149,7 @@ class WatchedForward(QuasiStaticForward):
         away = np.linalg.norm(nodes - self.grasp.centre, axis=1)
         near = away < max(TANGENT_RADII * self.entry.grasp.radius_m, np.sort(away)[30])
         placed = nodes[near] + displacement[near]
-        axis = np.linalg.svd(placed - placed.mean(axis=0), full_matrices=False)[2][0]
+        axis = principal_axes(placed)[0]
         outward = placed.mean(axis=0) - nodes[self._model.fixed].mean(axis=0)
         return axis * np.sign(axis @ outward or 1.0)
 

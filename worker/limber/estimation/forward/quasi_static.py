@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
+from limber.core.numerics.rigid import rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.present import present
 from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
@@ -21,7 +22,6 @@ from limber.estimation.gripper_path import force_for_travel
 from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator

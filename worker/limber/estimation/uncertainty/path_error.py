@@ -10,8 +10,8 @@ the pull would differ with the frame a little aside, the fit would have taken up
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from limber.core.numerics.rigid import composed, rotated
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.forward_model import Forward
 from limber.recordings.cell_errors import CalibrationEntry, calibration_of
@@ -74,9 +74,9 @@ def _aside(poses: np.ndarray, calibration: CalibrationEntry, pivot: np.ndarray,
     if error < 3:
         moved[:, error] += STEP * calibration.pose_sigma_m
         return moved
-    turn = Rotation.from_rotvec(STEP * calibration.pose_sigma_rad * np.eye(3)[error - 3])
-    moved[:, :3] = pivot + turn.apply(poses[:, :3] - pivot)
-    moved[:, 3:] = (turn * Rotation.from_rotvec(poses[:, 3:])).as_rotvec()
+    turn = STEP * calibration.pose_sigma_rad * np.eye(3)[error - 3]
+    moved[:, :3] = pivot + rotated(turn, poses[:, :3] - pivot)
+    moved[:, 3:] = composed(turn, poses[:, 3:])
     return moved
 
 

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml
+from limber.core.numerics.rigid import rotation_matrix, rotation_vector
 
 _MOST = 1e6
 """No camera's number is larger, whatever its unit; or smaller than one over it."""
@@ -42,7 +42,7 @@ class Camera(BaseModel):
 
     @property
     def rotation(self) -> np.ndarray:
-        return Rotation.from_rotvec(self.pose[3:]).as_matrix()
+        return rotation_matrix(np.array(self.pose[3:]))
 
     @property
     def origin(self) -> np.ndarray:
@@ -68,7 +68,7 @@ class Camera(BaseModel):
         right = np.cross(forward, up)
         right /= np.linalg.norm(right)
         turn = np.column_stack([right, np.cross(forward, right), forward])
-        pose = (*map(float, eye), *Rotation.from_matrix(turn).as_rotvec())
+        pose = (*map(float, eye), *rotation_vector(turn))
         return self.model_copy(update={"pose": pose})
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.core.numerics.rigid import principal_axes
 from limber.geometry.cloud.canonical_frame import own_order
 
 _SAMPLE = 400
@@ -52,7 +53,7 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
         if on.sum() > share:
             best, share = on, int(on.sum())
     middle = centres[best].mean(axis=0)
-    axes = np.linalg.svd(centres[best] - middle, full_matrices=False)[2]
+    axes = principal_axes(centres[best])
     offset = (points - middle) @ axes.T
     on = np.abs(offset[:, 2]) < thick
     if on.sum() < least or not _is_broad(offset[on][:, :2], diagonal):

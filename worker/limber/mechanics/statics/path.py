@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 
+from limber.core.numerics.rigid import pose_between
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import Progress
-from limber.mechanics.grasp import pose_between
 from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import InternalState

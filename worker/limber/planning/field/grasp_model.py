@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from limber.core.numerics.rigid import rotated
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -157,8 +157,7 @@ class GraspModel:
 
     def axial_force(self, displacement: np.ndarray, force: np.ndarray) -> float:
         """Return the part of a force [3] on the grasp along the branch there, outward [N]."""
-        turn = Rotation.from_rotvec(self.pose(displacement)[3:])
-        return float(turn.apply(self.reach.axis) @ force)
+        return float(rotated(self.pose(displacement)[3:], self.reach.axis) @ force)
 
     def tip(self, displacement: np.ndarray) -> np.ndarray:
         """Return the position of the branch's tip [m], shape [3]."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from limber.core.constants import PATH_COLOURS
+from limber.core.numerics.rigid import principal_axes
 from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
@@ -261,7 +262,7 @@ def _ways(plan: PlanFile) -> dict[str, Way]:
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return origin and two axes of the plane that fits points best, the second upwards."""
     origin = points.mean(axis=0)
-    _, _, directions = np.linalg.svd(points - origin, full_matrices=False)
+    directions = principal_axes(points)
     normal = directions[2]
     # A plane of paths is seldom horizontal; where it is, any second axis does.
     up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal

@@ -3,9 +3,10 @@
 import numpy as np
 
 from limber.core.files.reading import read_columns
+from limber.core.numerics.rigid import matrices
 from limber.results.scene.arrays import SceneData
 from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import link_frames, matrices
+from limber.robot.ur.kinematics import link_frames
 from limber.store import Branch
 
 _FARTHEST_M = 0.02

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.constants import FOUND_SKELETON
+from limber.core.numerics.rigid import principal_axes
 from limber.geometry.io.clouds import read_cloud
 from limber.geometry.skeleton.edits import differing
 from limber.geometry.skeleton.skeleton import (
@@ -173,8 +174,7 @@ def add_view(data: SceneData) -> None:
 
 def _view_direction(points: np.ndarray) -> np.ndarray:
     """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards."""
-    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    across = axes[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    across = principal_axes(points)[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     # Of the two sides, always the same one, so that a picture made twice is the same picture.
     across = across if across[1] >= 0 else -across
     turned = np.array([across[0] - 0.3 * across[1], across[1] + 0.3 * across[0], -0.22])

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rigid_fit, spreads
 from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.cell.cell import Cell
-from limber.robot.ur.kinematics import forward, inverted, matrices, pose_vectors
+from limber.robot.ur.kinematics import forward
 from limber.robot.ur.samples import Sample
 
 _FEWEST = 4
@@ -38,12 +39,6 @@ class BaseFit:
     def residual(self) -> float:
         """Root mean square of the residuals [m]."""
         return float(np.sqrt(np.mean(self.residuals**2)))
-
-
-def spread_of(points: np.ndarray) -> np.ndarray:
-    """Root mean squares of points [n, 3] along their principal directions [m], shape [3]."""
-    away = points - points.mean(axis=0)
-    return np.linalg.svd(away, compute_uv=False) / np.sqrt(len(points))
 
 
 def least_depth(largest_residual: float) -> float:
@@ -83,7 +78,7 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
             f"Points {names[first]} and {names[second]} are {1000 * away[first, second]:.1f} mm "
             f"apart {which}.", f"At least {1000 * largest_residual:.0f} mm are needed: closer ones "
             "pass for each other.", "Leave one of them out, and touch another place.")
-    spread = spread_of(points)
+    spread = spreads(points)
     if spread[1] < _LEAST_SPREAD:
         raise InputError(
             f"The points {which} spread by {1000 * spread[1]:.1f} mm across their line (root mean "
@@ -154,23 +149,20 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
     names = [str(number + 1) for number in range(len(touched))] if names is None else names
     require_frame(on_branch, names, "on the branch", largest_residual)
     require_frame(touched, names, "as they were touched", largest_residual)
-    turn, residuals = _registered(touched, on_branch)
+    frame, residuals = _registered(touched, on_branch)
     if residuals.max() > largest_residual:
         raise _off(residuals, _registered(-touched, on_branch)[1], names, largest_residual)
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = turn, on_branch.mean(axis=0) - turn @ touched.mean(axis=0)
     # Six unknowns come out of 3 n numbers.
     sigma = float(np.sqrt((residuals**2).sum() / (3 * len(touched) - 6)))
     return BaseFit(pose_vectors(frame), residuals, sigma / np.sqrt(len(touched)),
-                   sigma / (np.sqrt(len(touched)) * float(spread_of(on_branch)[1])))
+                   sigma / (np.sqrt(len(touched)) * float(spreads(on_branch)[1])))
 
 
 def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation [3, 3] that fits points [n, 3] best, and what is left of each [m, n]."""
-    a, b = touched - touched.mean(axis=0), on_branch - on_branch.mean(axis=0)
-    left, _, right = np.linalg.svd(b.T @ a)
-    turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
-    return turn, np.linalg.norm(a @ turn.T - b, axis=1)
+    """Return the frame [4, 4] that fits points [n, 3] best, and what is left of each [m, n]."""
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = rigid_fit(touched, on_branch)
+    return frame, np.linalg.norm(touched @ frame[:3, :3].T + frame[:3, 3] - on_branch, axis=1)
 
 
 def _off(residuals: np.ndarray, mirrored: np.ndarray, names: Sequence[str],

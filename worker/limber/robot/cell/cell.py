@@ -15,8 +15,8 @@ from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
 from limber.core.json_values import plain
+from limber.core.numerics.rigid import inverted, matrices
 from limber.robot.ur.arms import ARMS, Arm, arm_named
-from limber.robot.ur.kinematics import inverted, matrices
 
 Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]

@@ -15,8 +15,8 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.robot.cell.base_calibration import least_depth, spread_of
-from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector, spreads
+from limber.robot.cell.base_calibration import least_depth
 
 CameraOn = Literal["stand", "gripper"]
 
@@ -65,8 +65,7 @@ class CameraFit:
             moved[k] += _STEP
             there = frame(*_frames(moved))
             slopes[:3, k] = (there - middle)[:3] @ np.r_[point, 1.0] / _STEP
-            turn = Rotation.from_matrix(there[:3, :3] @ middle[:3, :3].T)
-            slopes[3:, k] = turn.as_rotvec() / _STEP
+            slopes[3:, k] = rotation_vector(there[:3, :3] @ middle[:3, :3].T) / _STEP
         spread = slopes @ self.covariance @ slopes.T
         return (float(np.sqrt(np.linalg.eigvalsh(spread[:3, :3])[-1])),
                 float(np.sqrt(np.linalg.eigvalsh(spread[3:, 3:])[-1])))
@@ -116,8 +115,7 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
 
 
 def _require_turns(moves: np.ndarray, what: str) -> None:
-    turns = Rotation.from_matrix(moves[:, :3, :3] @ moves[0, :3, :3].T).as_rotvec()
-    spread = np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False) / np.sqrt(len(turns))
+    spread = spreads(rotation_vector(moves[:, :3, :3] @ moves[0, :3, :3].T))
     if spread[1] < _LEAST_TURN:
         raise InputError(
             f"The arm was turned by {np.degrees(spread[1]):.1f} degrees about a second axis.",
@@ -127,7 +125,7 @@ def _require_turns(moves: np.ndarray, what: str) -> None:
 
 def _require_depth(places: np.ndarray, largest_residual: float) -> None:
     """Refuse places [n, 3] in a plane, which fit as well where the camera's axes are mirrored."""
-    spread = spread_of(places)[2]
+    spread = spreads(places)[2]
     needed = least_depth(largest_residual)
     if spread < needed:
         raise InputError(
@@ -146,7 +144,7 @@ def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[flo
     left = np.hstack([np.tile(-np.eye(3), (count, 1)), moves[:, :3, :3].reshape(-1, 3)])
     right = (seen[:, :3] @ turn.T - moves[:, :3, 3]).ravel()
     places = np.linalg.lstsq(left, right, rcond=None)[0]
-    start = np.r_[places[:3], Rotation.from_matrix(turn).as_rotvec(), places[3:]]
+    start = np.r_[places[:3], rotation_vector(turn), places[3:]]
     if seen.shape[1] == 6:
         boards = moves[:, :3, :3].transpose(0, 2, 1) @ turn @ matrices(seen)[:, :3, :3]
         start = np.r_[start, Rotation.from_matrix(boards).mean().as_rotvec()]
@@ -159,8 +157,8 @@ def _off(values: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> np.ndarray:
     there, should = camera @ matrices(_whole(seen)), moves @ board
     off = there[:, :3, 3] - should[:, :3, 3]
     if seen.shape[1] == 6:
-        turns = Rotation.from_matrix(should[:, :3, :3].transpose(0, 2, 1) @ there[:, :3, :3])
-        off = np.hstack([off, _LEVER_M * turns.as_rotvec()])
+        turns = rotation_vector(should[:, :3, :3].transpose(0, 2, 1) @ there[:, :3, :3])
+        off = np.hstack([off, _LEVER_M * turns])
     return off.ravel()
 
 

@@ -4,14 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, NoPathError
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotated, rotation_vector
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, at_places
 from limber.robot.motion.joint_path import JointPath, follow, no_branch
 from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
 
 _WITHIN = 7.815  # squared deviations that hold 95 % of a vector's draws
 _TURNS = 12  # directions about the branch from which the gripper may come
@@ -116,10 +115,10 @@ def across(axis: np.ndarray) -> list[np.ndarray]:
     side /= np.linalg.norm(side)
     found = []
     for angle in np.arange(_TURNS) * 2 * np.pi / _TURNS:
-        z = Rotation.from_rotvec(angle * y).apply(side)
+        z = rotated(angle * y, side)
         for sign in (1.0, -1.0):
             frame = np.column_stack([np.cross(sign * y, z), sign * y, z])
-            found.append(Rotation.from_matrix(frame).as_rotvec())
+            found.append(rotation_vector(frame))
     return found
 
 

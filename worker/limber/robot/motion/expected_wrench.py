@@ -10,8 +10,8 @@ makes of it: a covariance, which the guard and the report allow for.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
+from limber.core.numerics.rigid import rotations_at, turn_between
 from limber.robot.cell.cell import Cell
 
 
@@ -95,8 +95,7 @@ class Predicted:
     def _way_covariance(self, cell: Cell) -> np.ndarray:
         """Of the gripper's way since it closed, shape [n, 6, 6] in m and rad."""
         ways = self.poses[:, :3] - self.poses[0, :3]
-        start = Rotation.from_rotvec(self.poses[0, 3:])
-        turns = (Rotation.from_rotvec(self.poses[:, 3:]) * start.inv()).as_rotvec()
+        turns = turn_between(self.poses[0, 3:], self.poses[:, 3:])
         by_base = np.concatenate([_crossing(ways), _crossing(turns)], axis=1)
         covariance = cell.base.rotation_sigma_rad**2 * by_base @ by_base.transpose(0, 2, 1)
         own = np.r_[np.full(3, cell.robot.pose_sigma_m), np.full(3, cell.robot.pose_sigma_rad)]
@@ -113,8 +112,8 @@ def at_places(predicted: Predicted, places: np.ndarray, wanted: np.ndarray) -> P
     poses = carried(predicted.poses)
     kept = np.r_[True, np.diff(places) > 0]
     if kept.sum() > 1:
-        turns = Slerp(places[kept], Rotation.from_rotvec(predicted.poses[kept, 3:]))
-        poses[:, 3:] = turns(np.clip(wanted, places[0], places[-1])).as_rotvec()
+        poses[:, 3:] = rotations_at(places[kept], predicted.poses[kept, 3:],
+                                    np.clip(wanted, places[0], places[-1]))
     return Predicted(poses, carried(predicted.wrenches), carried(predicted.stiffness),
                      carried(predicted.young_covariance))
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import angle_between, matrices
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
 from limber.robot.motion.expected_wrench import ExpectedWrench
 
@@ -89,8 +90,6 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
         turn_speed: Greatest angular speed [rad/s].
         pause: Time added before the start [s].
     """
-    from limber.robot.ur.kinematics import matrices
-
     turns = matrices(poses)[:, :3, :3]
     angles = np.arccos(np.clip((np.einsum("nij,nij->n", turns[1:], turns[:-1]) - 1) / 2, -1, 1))
     steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
@@ -104,12 +103,10 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
 
 def densely(poses: np.ndarray, spacing: float = 0.002, angle: float = 0.02) -> np.ndarray:
     """Return poses close together along straight lines and turns between ``poses`` [n, 6]."""
-    from scipy.spatial.transform import Rotation
-
     result = [poses[0]]
     for first, second in pairwise(poses):
         way = float(np.linalg.norm(second[:3] - first[:3]))
-        turn = (Rotation.from_rotvec(second[3:]) * Rotation.from_rotvec(first[3:]).inv())
-        count = max(int(np.ceil(max(way / spacing, turn.magnitude() / angle))), 1)
+        turn = float(angle_between(first[3:], second[3:]))
+        count = max(int(np.ceil(max(way / spacing, turn / angle))), 1)
         result += [pose_between(first, second, part) for part in np.linspace(0, 1, count + 1)[1:]]
     return np.array(result)

@@ -2,7 +2,7 @@
 
 Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
 is turned by 180 degrees about z) and the flange. All functions are vectorised over poses. Poses
-here are homogeneous matrices; :func:`matrices` and :func:`pose_vectors` go between them and the
+here are homogeneous matrices; :mod:`limber.core.numerics.rigid` goes between them and the
 ``(x, y, z, rotation vector)`` of the rest of Limber.
 """
 
@@ -101,39 +101,6 @@ def singularity_distance(arm: Arm, joints: np.ndarray) -> np.ndarray:
     joints = np.asarray(joints, float)
     distances = _singularity_distance(arm.table, arm.reach, for_kernels(joints.reshape(-1, 6)))
     return distances.reshape(*joints.shape[:-1], 3)
-
-
-def matrices(poses: np.ndarray) -> np.ndarray:
-    """Return homogeneous matrices [..., 4, 4] of poses [..., 6] in m and rad."""
-    from scipy.spatial.transform import Rotation
-
-    poses = np.asarray(poses, float)
-    frames = np.zeros((*poses.shape[:-1], 4, 4))
-    turns = Rotation.from_rotvec(poses[..., 3:].reshape(-1, 3)).as_matrix()
-    frames[..., :3, :3] = turns.reshape(*poses.shape[:-1], 3, 3)
-    frames[..., :3, 3] = poses[..., :3]
-    frames[..., 3, 3] = 1.0
-    return frames
-
-
-def pose_vectors(frames: np.ndarray) -> np.ndarray:
-    """Return poses [..., 6] in m and rad of homogeneous matrices [..., 4, 4]."""
-    from scipy.spatial.transform import Rotation
-
-    frames = np.asarray(frames, float)
-    turns = Rotation.from_matrix(frames[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
-    return np.concatenate([frames[..., :3, 3], turns.reshape(*frames.shape[:-2], 3)], axis=-1)
-
-
-def inverted(frames: np.ndarray) -> np.ndarray:
-    """Return the inverses of rigid transforms [..., 4, 4]."""
-    frames = np.asarray(frames, float)
-    result = np.zeros_like(frames)
-    turned = np.swapaxes(frames[..., :3, :3], -1, -2)
-    result[..., :3, :3] = turned
-    result[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, frames[..., :3, 3])
-    result[..., 3, 3] = 1.0
-    return result
 
 
 @compiled

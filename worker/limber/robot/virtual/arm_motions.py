@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from limber.core.numerics.rigid import angle_between, inverted, matrices, pose_between
 from limber.robot.ur.arms import Arm
-from limber.robot.ur.kinematics import forward, inverse, inverted, jacobian, matrices
+from limber.robot.ur.kinematics import forward, inverse, jacobian
 from limber.robot.virtual.step_kernels import servo_step
 
 JOINT_ACCELERATION = 40.0
@@ -210,7 +210,7 @@ def line_move(arm: Arm, start: np.ndarray, start_pose: np.ndarray, waypoints: li
         Unreachable: part of the way is out of reach, or passes a singularity.
     """
     corners = [start_pose, *(np.asarray(waypoint.target, float) for waypoint in waypoints)]
-    curve = _rounded(np.array(corners), waypoints, _pose_distance, _between_poses)
+    curve = _rounded(np.array(corners), waypoints, _pose_distance, pose_between)
     solutions = inverse(arm, matrices(curve.points) @ inverted(tool), start)
     offset = np.abs((solutions[0] - start + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
     offset[np.isnan(solutions).any(axis=(0, 2))] = np.inf
@@ -319,20 +319,10 @@ def _between_joints(first: np.ndarray, second: np.ndarray, parts: np.ndarray) ->
     return first + parts[:, None] * (second - first)
 
 
-def _between_poses(first: np.ndarray, second: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Poses [n, 6] between two, or between rows of two, on straight lines and shortest turns."""
-    begin = Rotation.from_rotvec(first[..., 3:])
-    turn = (Rotation.from_rotvec(second[..., 3:]) * begin.inv()).as_rotvec()
-    turned = (Rotation.from_rotvec(parts[:, None] * turn) * begin).as_rotvec()
-    positions = first[..., :3] + parts[:, None] * (second[..., :3] - first[..., :3])
-    return np.hstack([positions, turned])
-
-
 def _pose_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Way of the tool [m]; its angle [rad] where it only turns, as the controller counts it."""
     way = np.linalg.norm(second[:, :3] - first[:, :3], axis=1)
-    turn = (Rotation.from_rotvec(second[:, 3:]) * Rotation.from_rotvec(first[:, 3:]).inv())
-    return np.where(way > 1e-9, way, turn.magnitude())
+    return np.where(way > 1e-9, way, angle_between(first[:, 3:], second[:, 3:]))
 
 
 def _tool_jacobian(arm: Arm, joints: np.ndarray, tool: np.ndarray) -> np.ndarray:

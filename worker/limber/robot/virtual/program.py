@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.robot.ur.kinematics import forward
 from limber.robot.virtual.arm_motions import (
     Braking,
     Motion,

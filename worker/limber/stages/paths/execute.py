@@ -311,7 +311,7 @@ def _summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
 def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: Cell,
                    motion: RobotMotion) -> None:
     """What the robot would do, for the viewport: poses in the branch's frame, joints, forces."""
-    from limber.robot.ur.kinematics import matrices, pose_vectors
+    from limber.core.numerics.rigid import matrices, pose_vectors
 
     base = matrices(np.array(cell.base.pose))
     rows = []
@@ -336,10 +336,10 @@ def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: C
 def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
            options: ExecuteOptions, motion: RobotMotion, summary: dict[str, Any],
            progress: Progress) -> dict[str, Any]:
+    from limber.core.numerics.rigid import matrices
     from limber.robot.driver.link import COLUMNS, RobotLink
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import followed
-    from limber.robot.ur.kinematics import matrices
 
     log = f"executions/{name}/samples.csv"
     with branch.writing(f"the execution of {name}"):

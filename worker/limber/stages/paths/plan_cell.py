@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, NoPathError
+from limber.core.numerics.rigid import inverted, matrices
 from limber.core.present import present
 from limber.core.progress import Progress
 from limber.geometry.io.surfaces import usable_surface
@@ -22,7 +23,7 @@ from limber.robot.cell.compatibility import check_branch
 from limber.robot.motion.execution import Blocked, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import inverse, inverted, matrices
+from limber.robot.ur.kinematics import inverse
 from limber.store import Branch
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}

@@ -81,10 +81,11 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     """The settings with the cell's base, and what the cell says of its robot."""
     if settings.cell is None:
         return settings, None
+    from limber.core.numerics.rigid import matrices, pose_vectors
     from limber.recordings.importing import RobotKnown
     from limber.robot.cell.cell import read_cell
     from limber.robot.recorder import known_errors, known_noise
-    from limber.robot.ur.kinematics import forward, matrices, pose_vectors
+    from limber.robot.ur.kinematics import forward
 
     cell = read_cell(Path(settings.cell))
     tool = matrices(np.array(cell.tool.grasp_pose))

@@ -232,7 +232,7 @@ def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
 def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
           settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
     """The motion of the gripper from where a sample of the robot has it."""
-    from limber.robot.ur.kinematics import matrices
+    from limber.core.numerics.rigid import matrices
     from limber.stages.pulls.record_path import (
         suggested_pull,
         there_and_back,

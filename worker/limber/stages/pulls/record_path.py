@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.core.errors import InputError, SafetyStop
 from limber.core.files.reading import read_columns, read_json_as
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.cell.cell import Cell
@@ -14,7 +15,6 @@ from limber.robot.motion.execution import Blocked
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.start_check import different_joints, in_degrees
 from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.ur.kinematics import inverted, matrices, pose_vectors
 from limber.store import Branch
 
 GRASP_RADIUS_M = 0.012
