@@ -180,11 +180,23 @@ def stages() -> dict[str, Stage]:
     Raises:
         RuntimeError: the file is of another version than this add-on.
     """
+    return {name: _stage(name, told) for name, told in _content()["stages"].items()}
+
+
+def species() -> dict[str, Any]:
+    """Return the species presets: ``source``, and ``presets`` by name, with ``title``, ``young``
+    and ``strength`` [Pa], and ``density`` [kg/m^3], which may be None.
+    """
+    return _content()["species"]
+
+
+@cache
+def _content() -> dict[str, Any]:
     content = json.loads(_FILE.read_text(encoding="utf-8"))
     if content.get("format") != FORMAT:
         raise RuntimeError(f"{_FILE.name} has format {content.get('format')}, this add-on reads "
                            f"{FORMAT}. Install the add-on again.")
-    return {name: _stage(name, told) for name, told in content["stages"].items()}
+    return content
 
 
 def number_text(value: Any) -> str:

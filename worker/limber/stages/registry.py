@@ -12,7 +12,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -185,8 +185,12 @@ def stage_schema(name: str) -> dict[str, Any]:
 
 
 def all_schemas() -> dict[str, Any]:
-    """Return the schemas of all stages by name, with the format's version."""
+    """Return the schemas of all stages by name, the format's version, and species presets."""
+    from limber.mechanics.materials.species import SOURCE, SPECIES
+
     return {"format": FORMAT,
+            "species": {"source": SOURCE,
+                        "presets": {name: asdict(known) for name, known in SPECIES.items()}},
             "stages": {name: stage_schema(name) for name in stage_summaries()}}
 
 

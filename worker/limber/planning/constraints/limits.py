@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.mechanics.materials.species import strain_limit
 from limber.planning.constraints.obstacles import Obstacle, closeness, closest
-from limber.planning.constraints.strain_presets import strain_limit
 from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays, GraspSamples
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
