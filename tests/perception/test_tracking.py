@@ -11,7 +11,6 @@ from limber.perception.tracking import (
     Anchor,
     CurveTracker,
     rest_offset,
-    visible_surface_points,
 )
 from limber.recordings.masks import segment_by_depth
 
@@ -131,13 +130,3 @@ def test_curve_keeps_its_length_and_its_derivative_is_exact(scene):
     ahead, behind = (curve.turned(sign * 1e-6 * direction).nodes for sign in (1, -1))
     expected = np.einsum("nika,ka->ni", curve.jacobian(), direction)
     assert np.allclose((ahead - behind) / 2e-6, expected, atol=1e-8)
-
-
-def test_nearest_visible_surface_point(scene):
-    """The paper's choice at rest: on the camera's side, about a radius from the axis."""
-    cloud = depth_to_cloud(scene.camera, scene.depth(0.0, None))
-    axis = scene.control_points(0.0)
-    off = visible_surface_points(cloud, axis) - axis
-    radius = np.interp(FRACTIONS, np.linspace(0, 1, len(scene.radius)), scene.radius)
-    assert np.allclose(np.linalg.norm(off, axis=1), radius, atol=6e-4)
-    assert (off @ [0.0, 1.0, 0.0] < 1e-3).all()

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from benchmarks.reduced_motion import simulate_reduced
 from limber.core.errors import InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics import BranchModel, Grasp, RayleighDamping, solve_static
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
-from limber.reduced.reduced_dynamics import ReducedStepper, simulate_reduced
-from limber.reduced.reduced_model import ReducedSettings, build_reduced, reduce_snapshots
-from limber.reduced.refresh import RefreshingModel, checked, estimate_error, estimate_motion_error
+from limber.reduced.reduced_dynamics import ReducedStepper
+from limber.reduced.reduced_model import ReducedSettings, build_reduced
+from limber.reduced.refresh import RefreshingModel, checked
 from limber.reduced.training import Snapshots, TrainingSettings
 
 YOUNG = np.array([1e8])
@@ -165,22 +166,3 @@ def test_snapshots_go_through_plain_arrays(trained):
     again = Snapshots.from_arrays(arrays)
     assert len(again) == len(trained[1])
     np.testing.assert_array_equal(again.pose_tangents, trained[1].pose_tangents)
-
-
-def test_error_estimate_sees_inertia(model, grasp, trained):
-    """At rest it is the static estimate; a model for statics alone fails under inertia loads."""
-    snapshots = trained[1]
-    weights = np.ones((model.mesh.tet_count, 1))
-    still = reduce_snapshots(model, grasp, weights, YOUNG, snapshots.without_vibrations(),
-                             ReducedSettings(size=30, vibration_count=0, field_count=60))
-    state = still.solve_static(snapshots.poses[3])
-    resting = ReducedStepper(still, state)
-    at_rest = estimate_motion_error(model, weights, still, resting)
-    static = estimate_error(model, weights, still, state)
-    assert at_rest.position == pytest.approx(static.position, rel=1e-6)
-    assert at_rest.energy == pytest.approx(static.energy, rel=1e-6)
-    # Shaken: the free end lags behind, which states at rest never did.
-    resting.state.acceleration = resting.state.acceleration.copy()
-    resting.state.acceleration[:3] = [60.0, 0, 0]
-    shaken = estimate_motion_error(model, weights, still, resting)
-    assert shaken.position > 3 * static.position

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import mechanics_reduced
+from benchmarks.prescribed import solve_prescribed
 from benchmarks.table import Asked, Row, Setting
 from limber.core.numerics.rigid import rotation_matrix
 from limber.geometry.tets.cylinder_mesh import straight_beam
@@ -25,7 +26,6 @@ from limber.mechanics import (
 )
 from limber.mechanics.elements import shapes as fe
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
-from limber.mechanics.statics.solve import solve_prescribed
 
 ELASTICA = Path(__file__).parents[3] / "shared" / "data" / "elastica"
 LENGTH, RADIUS, YOUNG, DENSITY = 0.6, 0.004, 5e7, 900.0

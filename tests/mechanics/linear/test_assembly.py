@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 from tests.subjects.meshes import box_mesh
 
+from benchmarks.prescribed import solve_prescribed
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -15,7 +16,6 @@ from limber.mechanics.linear import equations as equations_module
 from limber.mechanics.linear import factor
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.linear.fronts import make_fronts, postordered
-from limber.mechanics.statics.solve import solve_prescribed
 from limber.mechanics.strain import deformation_gradients, principal_stretch
 
 MATERIALS = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")

@@ -118,15 +118,6 @@ class CurveTracker:
         return SeenCloud(cloud.points[kept], cloud.sigma[kept], cloud.view[kept])
 
 
-def visible_surface_points(cloud: SeenCloud, control_points: np.ndarray) -> np.ndarray:
-    """Return the cloud's point nearest to each control point [m], shape [K, 3].
-
-    The paper's choice of control points on the real plant, at rest (section Branch Parameter
-    Estimation); such a point lies about a radius in front of the axis.
-    """
-    return cloud.points[cKDTree(cloud.points).query(control_points)[1]]
-
-
 def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np.ndarray]:
     """Find how a cloud of the branch at rest lies against its skeleton: the camera pose's error.
 

@@ -18,7 +18,6 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.problem import StaticProblem, make_result
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult
 from limber.mechanics.status import Status
-from limber.reduced.reduced_dynamics import ReducedStepper
 from limber.reduced.reduced_model import (
     ReducedModel,
     ReducedSettings,
@@ -73,8 +72,24 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
         weights: From control points to tetrahedra.
     """
     full = model.with_young(weights @ state.young)
-    return _corrected(full, reduced, reduced.displacement(state), state.strain_energy,
-                      full.weight_force)
+    start = reduced.displacement(state)
+    equations = full.equations([reduced.grasp])
+    now = full.internal(start)
+    u, increment, certain, first = start, None, False, now
+    for _ in range(_CORRECTIONS):
+        try:
+            tangent = equations.tangent(full, u, increment=increment)
+        except NotPositiveDefiniteError:
+            certain = False
+            break
+        certain = tangent.is_positive_definite
+        increment = tangent.solve(equations.free_part(full.weight_force - now.force))
+        u = u + increment
+        now = full.internal(u)
+    off = float(np.linalg.norm(u - start, axis=1).max()) / full.extent
+    energy = state.strain_energy / max(now.strain_energy, 1e-12) - 1
+    return ErrorEstimate(off, energy, first.min_det_f,
+                         bool(certain and np.isfinite(off + energy)), u)
 
 
 def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance: float = _POSITION,
@@ -98,43 +113,6 @@ def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance:
     else:
         doubt = ""
     return replace(state, trusted=not doubt, doubt=doubt)
-
-
-def estimate_motion_error(model: BranchModel, weights: np.ndarray, reduced: ReducedModel,
-                          stepper: ReducedStepper) -> ErrorEstimate:
-    """Return the error of a reduced model in motion at the instant its stepper has reached.
-
-    The full model is put in balance with the inertia loads of the reduced motion (d'Alembert):
-    what the basis cannot do under them shows, a free end that swings for one. What went wrong
-    in the time before does not, and the damping of the strain rate is left out.
-    """
-    full = model.with_young(weights @ reduced.young)
-    moving = stepper.state
-    slowed = reduced.displacement_of(moving.acceleration + full.damping.mass * moving.velocity)
-    load = full.weight_force - full.mass_matrix @ slowed
-    return _corrected(full, reduced, reduced.displacement_of(moving.coordinates),
-                      stepper.strain_energy, load)
-
-
-def _corrected(full: BranchModel, reduced: ReducedModel, start: np.ndarray, strain_energy: float,
-               load: np.ndarray) -> ErrorEstimate:
-    equations = full.equations([reduced.grasp])
-    now = full.internal(start)
-    u, increment, certain, first = start, None, False, now
-    for _ in range(_CORRECTIONS):
-        try:
-            tangent = equations.tangent(full, u, increment=increment)
-        except NotPositiveDefiniteError:
-            certain = False
-            break
-        certain = tangent.is_positive_definite
-        increment = tangent.solve(equations.free_part(load - now.force))
-        u = u + increment
-        now = full.internal(u)
-    off = float(np.linalg.norm(u - start, axis=1).max()) / full.extent
-    energy = strain_energy / max(now.strain_energy, 1e-12) - 1
-    return ErrorEstimate(off, energy, first.min_det_f,
-                         bool(certain and np.isfinite(off + energy)), u)
 
 
 def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedState,

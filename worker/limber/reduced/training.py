@@ -111,10 +111,6 @@ class Snapshots:
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__
                       if name != "failed"}, failed=int(arrays["failed"]))
 
-    def for_known_young(self) -> "Snapshots":
-        """Return the same without the derivatives to Young's modulus."""
-        return replace(self, young_tangents=self.young_tangents[:, :0])
-
     def without_vibrations(self) -> "Snapshots":
         """Return the same for statics alone."""
         return replace(self, vibrations=self.vibrations[:0],

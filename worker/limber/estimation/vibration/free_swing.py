@@ -39,7 +39,6 @@ _GONE = 0.3
 """Part of its way at which a branch has surely been let go."""
 _MARGIN = 0.1
 """Deviation of how much a marker moves, where the registration is not known."""
-STARTS = ("held", "loaded")
 
 
 @dataclass(frozen=True)

@@ -83,22 +83,6 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
     return results
 
 
-def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
-                     nodal_forces: np.ndarray | None = None,
-                     settings: StaticSettings = DEFAULT_SETTINGS,
-                     ) -> StaticResult:
-    """Find the equilibrium with the model's fixed nodes moved by ``displacement``.
-
-    Args:
-        displacement: [m], shape [node_count, 3]; rows of nodes that are not fixed are unused.
-    """
-    problem = StaticProblem(model, None, False, settings)
-    goal = problem.target(None, None, nodal_forces)
-    held = np.where(model.fixed[:, None], displacement, 0.0)
-    begin = np.zeros_like(held)
-    return _walked(Path(problem, begin, replace(goal, held=held), None), SILENT)
-
-
 def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
             strain: np.ndarray | None = None) -> StaticResult:
     """Return where a way leads, with what is doubtful about it."""
