@@ -167,13 +167,13 @@ class Estimate:
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
-               log: EvaluationLog, cache: Path | None = None, digest: str = "",
+               log: EvaluationLog, cache: Path | None = None,
                progress: Progress = SILENT) -> Estimate:
     """Estimate Young's modulus of a branch from its pulls.
 
     Args:
         log: Remembers evaluations; what a stopped run left there is taken over.
-        cache, digest: As for :func:`fit_pulls`.
+        cache: As for :func:`fit_pulls`.
 
     Raises:
         InputError: pulls that cannot tell Young's modulus.
@@ -189,7 +189,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
                               log=log, force_sigma=[pull.entry.sensor.force_sigma_n
                                                     for pull in pulls], progress=progress,
                               expected_count=20 if chosen.method == "gauss-newton" else 200)
-        return fit_pulls(objective, branch.start, chosen, progress, cache=cache, digest=digest)
+        return fit_pulls(objective, branch.start, chosen, progress, cache=cache)
 
     def fitted(branch: Subject) -> Estimate:
         try:

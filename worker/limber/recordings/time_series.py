@@ -41,7 +41,7 @@ class _Rows:
     warnings: list[str] = field(default_factory=list)
 
 
-def read_stream(path: str | Path, time_column: str = "t_s") -> Stream:
+def read_stream(path: str | Path) -> Stream:
     """Read a CSV file with a header and a column of time stamps [s].
 
     An unfinished last line is dropped, rows are brought into the order of time, of rows with the
@@ -54,14 +54,14 @@ def read_stream(path: str | Path, time_column: str = "t_s") -> Stream:
     """
     path = Path(path)
     rows = _read_rows(path)
-    if time_column not in rows.header:
+    if "t_s" not in rows.header:
         raise InputError(f"{path} has the columns {', '.join(rows.header)}.",
-                         f"A column {time_column} with time stamps in seconds was expected.",
+                         "A column t_s with time stamps in seconds was expected.",
                          "Rename the column, or bring the file in with `limber import-pull`.")
     table = np.array(rows.numbers, float).reshape(-1, len(rows.header))
-    at = rows.header.index(time_column)
+    at = rows.header.index("t_s")
     times, values = table[:, at], np.delete(table, at, axis=1)
-    columns = tuple(name for name in rows.header if name != time_column)
+    columns = tuple(name for name in rows.header if name != "t_s")
     times, values = in_order(path, times, values, rows.warnings)
     if len(times) < 2:
         raise InputError(f"{path} has {len(times)} complete rows.",

@@ -12,7 +12,7 @@ How far to trust it: :mod:`limber.reduced.refresh`.
 
 import copy
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -552,8 +552,7 @@ def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bo
     return np.full(len(right), np.nan), False
 
 
-def as_control_points(model: BranchModel, points: Sequence[np.ndarray] | None = None,
-                      ) -> tuple[np.ndarray, np.ndarray]:
+def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
     """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
 
     Control points are the mesh's; where the field is not what they can give (or there are none)
@@ -562,11 +561,10 @@ def as_control_points(model: BranchModel, points: Sequence[np.ndarray] | None = 
     from limber.mechanics.materials.young_field import young_weights
 
     marks = model.mesh.point_data.get("control_point")
-    if points is None and marks is not None and (marks >= 0).any():
+    if marks is not None and (marks >= 0).any():
         order = np.argsort(marks[marks >= 0])
         points = model.mesh.nodes[np.flatnonzero(marks >= 0)[order]]
-    if points is not None:
-        weights = young_weights(model.mesh, np.asarray(points))
+        weights = young_weights(model.mesh, points)
         young = np.linalg.lstsq(weights, model.young, rcond=None)[0]
         if (young > 0).all() and np.abs(weights @ young / model.young - 1).max() < 1e-6:
             return weights, young

@@ -282,9 +282,8 @@ class _Course:
 
 
 def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None = None,
-              memory_mb_each: float = 0.0, limits: Limits | None = None,
               progress: Progress = SILENT, message: str = "") -> list:
-    """Return ``[function(*task) for task in tasks]``: side by side where cores and memory allow.
+    """Return ``[function(*task) for task in tasks]``: side by side where cores allow.
 
     Where they do not, or there is one task, it is computed here, without a process: the results
     are the same. See :meth:`Pool.map`.
@@ -293,16 +292,13 @@ def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None
         function: May take ``progress``.
         tasks: Its arguments, once for each call.
         workers: At most so many processes; by default the core budget.
-        memory_mb_each: What a call may need.
-        limits: Of each call; with limits there is always a process.
         progress: Of all together.
         message: What is being done.
     """
-    count = worker_count(len(tasks), wanted=workers, memory_mb_each=memory_mb_each)
-    if count > 1 or limits is not None:
+    count = worker_count(len(tasks), wanted=workers)
+    if count > 1:
         with Pool(count, name=message or "the computation") as pool:
-            return pool.map(function, tasks, limits=limits or UNLIMITED, progress=progress,
-                            message=message)
+            return pool.map(function, tasks, progress=progress, message=message)
     course = _Course(len(tasks), progress, message)
     results = []
     for number, task in enumerate(tasks):

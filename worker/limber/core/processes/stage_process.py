@@ -22,8 +22,7 @@ _GRACE_SECONDS = 10.0
 _TICK_SECONDS = 0.1
 
 
-def run_stage(arguments: Sequence[str], progress: Progress = SILENT, *,
-              limits: Limits = UNLIMITED, cores: int | None = None) -> dict[str, Any]:
+def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str, Any]:
     """Run ``limber ARGUMENTS`` in a process of its own and return its JSON result.
 
     Memory and native crashes stay in that process. A cancel of ``progress``, or Ctrl-C, ends it.
@@ -31,8 +30,6 @@ def run_stage(arguments: Sequence[str], progress: Progress = SILENT, *,
     Args:
         arguments: The stage and its options.
         progress: Gets what it reports.
-        limits: What it may take.
-        cores: How many of our cores it may use; all of them by default.
 
     Raises:
         LimberError: the stage's own error, by its exit code; :class:`WorkError` if it crashed or
@@ -40,7 +37,7 @@ def run_stage(arguments: Sequence[str], progress: Progress = SILENT, *,
     """
     command = [sys.executable, "-m", "limber", *map(str, arguments),
                "--json", "--progress", "json"]
-    return run_json_process(arguments[0], command, progress, limits=limits, cores=cores,
+    return run_json_process(arguments[0], command, progress,
                             fix=f"Run it alone to see more: limber {' '.join(map(str, arguments))}")
 
 
@@ -55,7 +52,7 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
             process ends, and ``LIMBER_PARENT_PIPE=stdin`` to tell it so.
         progress: Gets what it reports.
         limits: What it may take.
-        cores: As in :func:`run_stage`.
+        cores: How many of our cores it may use; all of them by default.
         fix: What to do when it ends without a word.
 
     Raises:

@@ -27,7 +27,7 @@ from limber.mechanics.added_masses import PointMass
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
-from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
+from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
 
 
@@ -83,13 +83,12 @@ class LoadedBranch:
         return Grasp.from_mesh(self.mesh, mode, self.grasp_point)
 
     def equilibrium(self, grasp: Grasp | None, pose: np.ndarray | None, *,
-                    start: StaticResult | np.ndarray | None = None,
-                    settings: StaticSettings = DEFAULT_SETTINGS) -> StaticResult:
+                    start: StaticResult | np.ndarray | None = None) -> StaticResult:
         """Return the state with the grasp at a pose [m, rad]; without one the hanging state.
 
         Energy and force are the module's; it never raises for want of convergence.
         """
-        return solve_static(self.model, grasp=grasp, pose=pose, start=start, settings=settings)
+        return solve_static(self.model, grasp=grasp, pose=pose, start=start)
 
     def target_positions(self, displacement: np.ndarray) -> np.ndarray:
         """Return where the targets are [m], shape [targets, 3].

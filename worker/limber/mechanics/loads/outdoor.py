@@ -139,10 +139,9 @@ class LoadedOutdoors:
         air = at.T @ _air_damping(ways, radius, np.array(self._loads.wind), self._loads.drag) @ at
         return swaying(self._model_under(1.0), result.displacement, self._wind, tip, damping, air)
 
-    def rest(self, share: float = 1.0, start: np.ndarray | None = None) -> StaticResult:
+    def rest(self, share: float = 1.0) -> StaticResult:
         """Return where it comes to rest under ``share`` of all loads."""
-        return solve_static(self._model_under(share), nodal_forces=share * self._forces,
-                            start=start)
+        return solve_static(self._model_under(share), nodal_forces=share * self._forces)
 
     def bent(self, result: StaticResult, share: float = 1.0) -> Bent:
         """Return what a state does to the wood, and how it swings about it."""

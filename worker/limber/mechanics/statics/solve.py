@@ -51,11 +51,9 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
 
 
 def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.ndarray, *,
-                 nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
                  guess: np.ndarray | None = None, guess_strain: np.ndarray | None = None,
-                 settings: StaticSettings = DEFAULT_SETTINGS,
-                 progress: Progress = SILENT) -> list[StaticResult]:
+                 settings: StaticSettings = DEFAULT_SETTINGS) -> list[StaticResult]:
     """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
 
     After a pose that fails the next starts from the last converged state.
@@ -70,8 +68,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
     displacement = problem.displacement_of(start)
     results = []
     for number, pose in enumerate(poses):
-        progress(number / len(poses), "following poses", pose=number)
-        goal = problem.target(pose, None, nodal_forces)
+        goal = problem.target(pose, None, None)
         result = _walked(Path(problem, displacement, goal, pose), SILENT,
                          *((guess, guess_strain) if number == 0 else ()))
         if settings.verify and result.converged:
@@ -79,7 +76,6 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
         if result.converged:
             displacement = result.displacement
         results.append(result)
-    progress(1.0, "following poses")
     return results
 
 
