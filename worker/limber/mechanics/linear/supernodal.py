@@ -241,125 +241,106 @@ def _subtract_six(columns, a, height, row, begin, runs, target, t0, t1, t2):
 
 
 @compiled
+def _sizes(first, row_start, s):
+    """Of a front: its first unknown, its pivots, padded, its rows below, padded, and the height."""
+    width, below = 3 * (first[s + 1] - first[s]), row_start[s + 1] - row_start[s]
+    pivots = (width + PAD - 1) // PAD * PAD
+    padded = (3 * below + PAD - 1) // PAD * PAD
+    return 3 * first[s], width, pivots, below, padded, pivots + padded
+
+
+@compiled
+def _room(row_start):
+    """Zeros for the rows below the tallest front."""
+    tallest = 0
+    for s in range(len(row_start) - 1):
+        tallest = max(tallest, row_start[s + 1] - row_start[s])
+    return np.zeros(3 * tallest + PAD)
+
+
+@compiled
+def _columns(factor, at, height):
+    """Three columns of a front."""
+    return (factor[at:at + height], factor[at + height:at + 2 * height],
+            factor[at + 2 * height:at + 3 * height])
+
+
+@compiled
 def _down_one(first, row_start, rows, panel, factor, inverse, x):
     """Solve in place with the factor: down through the fronts."""
-    count = len(first) - 1
-    tallest = 0
-    for s in range(count):
-        tallest = max(tallest, row_start[s + 1] - row_start[s])
-    t = np.zeros(3 * tallest + PAD)
-    for s in range(count):
-        width, start = 3 * (first[s + 1] - first[s]), 3 * first[s]
-        if not x[start:start + width].any():
+    t = _room(row_start)
+    for s in range(len(first) - 1):
+        start, width, pivots, below, padded, height = _sizes(first, row_start, s)
+        own = x[start:start + width]
+        if not own.any():
             continue  # forces on a patch: nothing comes down to most fronts
-        below = row_start[s + 1] - row_start[s]
-        pivots = (width + PAD - 1) // PAD * PAD
-        runs = (3 * below + PAD - 1) // PAD
-        height = pivots + PAD * runs
-        base = panel[s]
-        t[:PAD * runs] = 0.0
+        t[:padded] = 0.0
         for j in range(0, width, 3):
-            at = base + j * height
-            x0 = x[start + j] * inverse[start + j]
-            x1 = (x[start + j + 1] - factor[at + j + 1] * x0) * inverse[start + j + 1]
-            x2 = (x[start + j + 2] - factor[at + j + 2] * x0
-                  - factor[at + height + j + 2] * x1) * inverse[start + j + 2]
-            x[start + j], x[start + j + 1], x[start + j + 2] = x0, x1, x2
-            one, two, three = (factor[at:at + height], factor[at + height:at + 2 * height],
-                               factor[at + 2 * height:at + 3 * height])
-            own = x[start:start + width]
+            one, two, three = _columns(factor, panel[s] + j * height, height)
+            x0, x1, x2 = _down(x, start + j, one, two, j, inverse)
             for i in range(j + 3, width):
                 own[i] -= one[i] * x0 + two[i] * x1 + three[i] * x2
             one, two, three = one[pivots:], two[pivots:], three[pivots:]
-            for i in range(PAD * runs):
+            for i in range(padded):
                 t[i] += one[i] * x0 + two[i] * x1 + three[i] * x2
         for k in range(below):
             to = 3 * rows[row_start[s] + k]
-            x[to] -= t[3 * k]
-            x[to + 1] -= t[3 * k + 1]
-            x[to + 2] -= t[3 * k + 2]
+            for axis in range(3):
+                x[to + axis] -= t[3 * k + axis]
 
 
 @compiled
 def _up_one(first, row_start, rows, panel, factor, inverse, x):
     """Solve in place with its transpose: up again."""
-    count = len(first) - 1
-    tallest = 0
-    for s in range(count):
-        tallest = max(tallest, row_start[s + 1] - row_start[s])
-    t = np.zeros(3 * tallest + PAD)
-    for s in range(count - 1, -1, -1):
-        width, start = 3 * (first[s + 1] - first[s]), 3 * first[s]
-        below = row_start[s + 1] - row_start[s]
-        pivots = (width + PAD - 1) // PAD * PAD
-        runs = (3 * below + PAD - 1) // PAD
-        height = pivots + PAD * runs
-        base = panel[s]
-        t[:PAD * runs] = 0.0
+    t = _room(row_start)
+    for s in range(len(first) - 2, -1, -1):
+        start, width, pivots, below, padded, height = _sizes(first, row_start, s)
+        t[:padded] = 0.0
         for k in range(below):
             to = 3 * rows[row_start[s] + k]
-            t[3 * k] = x[to]
-            t[3 * k + 1] = x[to + 1]
-            t[3 * k + 2] = x[to + 2]
+            for axis in range(3):
+                t[3 * k + axis] = x[to + axis]
         own = x[start:start + width]
         for j in range(width - 3, -1, -3):
-            at = base + j * height
-            one, two, three = (factor[at:at + height], factor[at + height:at + 2 * height],
-                               factor[at + 2 * height:at + 3 * height])
+            one, two, three = _columns(factor, panel[s] + j * height, height)
             s0, s1, s2 = own[j], own[j + 1], own[j + 2]
             for i in range(j + 3, width):
                 s0 -= one[i] * own[i]
                 s1 -= two[i] * own[i]
                 s2 -= three[i] * own[i]
             low, middle, high = one[pivots:], two[pivots:], three[pivots:]
-            for i in range(PAD * runs):
+            for i in range(padded):
                 s0 -= low[i] * t[i]
                 s1 -= middle[i] * t[i]
                 s2 -= high[i] * t[i]
-            x2 = s2 * inverse[start + j + 2]
-            x1 = (s1 - two[j + 2] * x2) * inverse[start + j + 1]
-            x0 = (s0 - one[j + 1] * x1 - one[j + 2] * x2) * inverse[start + j]
-            own[j], own[j + 1], own[j + 2] = x0, x1, x2
+            _up(own, j, s0, s1, s2, one, two, inverse, start)
 
 
 @compiled
 def _down_three(first, row_start, rows, panel, factor, inverse, x, y, z):
     """As ``_down_one``, of three right sides at once."""
-    count = len(first) - 1
-    tallest = 0
-    for s in range(count):
-        tallest = max(tallest, row_start[s + 1] - row_start[s])
-    t, u, v = (np.zeros(3 * tallest + PAD), np.zeros(3 * tallest + PAD),
-               np.zeros(3 * tallest + PAD))
-    for s in range(count):
-        width, start = 3 * (first[s + 1] - first[s]), 3 * first[s]
-        if not (x[start:start + width].any() or y[start:start + width].any()
-                or z[start:start + width].any()):
+    t, u, v = _room(row_start), _room(row_start), _room(row_start)
+    for s in range(len(first) - 1):
+        start, width, pivots, below, padded, height = _sizes(first, row_start, s)
+        own, other, last = (x[start:start + width], y[start:start + width],
+                            z[start:start + width])
+        if not (own.any() or other.any() or last.any()):
             continue  # forces on a patch: nothing comes down to most fronts
-        below = row_start[s + 1] - row_start[s]
-        pivots = (width + PAD - 1) // PAD * PAD
-        runs = (3 * below + PAD - 1) // PAD
-        height = pivots + PAD * runs
-        base = panel[s]
-        t[:PAD * runs] = 0.0
-        u[:PAD * runs] = 0.0
-        v[:PAD * runs] = 0.0
+        t[:padded] = 0.0
+        u[:padded] = 0.0
+        v[:padded] = 0.0
         for j in range(0, width, 3):
-            at = base + j * height
-            one, two, three = (factor[at:at + height], factor[at + height:at + 2 * height],
-                               factor[at + 2 * height:at + 3 * height])
+            one, two, three = _columns(factor, panel[s] + j * height, height)
             x0, x1, x2 = _down(x, start + j, one, two, j, inverse)
             y0, y1, y2 = _down(y, start + j, one, two, j, inverse)
             z0, z1, z2 = _down(z, start + j, one, two, j, inverse)
-            own, other, last = (x[start:start + width], y[start:start + width],
-                                z[start:start + width])
             for i in range(j + 3, width):
                 a, b, c = one[i], two[i], three[i]
                 own[i] -= a * x0 + b * x1 + c * x2
                 other[i] -= a * y0 + b * y1 + c * y2
                 last[i] -= a * z0 + b * z1 + c * z2
             one, two, three = one[pivots:], two[pivots:], three[pivots:]
-            for i in range(PAD * runs):
+            for i in range(padded):
                 a, b, c = one[i], two[i], three[i]
                 t[i] += a * x0 + b * x1 + c * x2
                 u[i] += a * y0 + b * y1 + c * y2
@@ -375,22 +356,12 @@ def _down_three(first, row_start, rows, panel, factor, inverse, x, y, z):
 @compiled
 def _up_three(first, row_start, rows, panel, factor, inverse, x, y, z):
     """As ``_up_one``, of three at once."""
-    count = len(first) - 1
-    tallest = 0
-    for s in range(count):
-        tallest = max(tallest, row_start[s + 1] - row_start[s])
-    t, u, v = (np.zeros(3 * tallest + PAD), np.zeros(3 * tallest + PAD),
-               np.zeros(3 * tallest + PAD))
-    for s in range(count - 1, -1, -1):
-        width, start = 3 * (first[s + 1] - first[s]), 3 * first[s]
-        below = row_start[s + 1] - row_start[s]
-        pivots = (width + PAD - 1) // PAD * PAD
-        runs = (3 * below + PAD - 1) // PAD
-        height = pivots + PAD * runs
-        base = panel[s]
-        t[:PAD * runs] = 0.0
-        u[:PAD * runs] = 0.0
-        v[:PAD * runs] = 0.0
+    t, u, v = _room(row_start), _room(row_start), _room(row_start)
+    for s in range(len(first) - 2, -1, -1):
+        start, width, pivots, below, padded, height = _sizes(first, row_start, s)
+        t[:padded] = 0.0
+        u[:padded] = 0.0
+        v[:padded] = 0.0
         for k in range(below):
             to = 3 * rows[row_start[s] + k]
             for axis in range(3):
@@ -400,9 +371,7 @@ def _up_three(first, row_start, rows, panel, factor, inverse, x, y, z):
         own, other, last = (x[start:start + width], y[start:start + width],
                             z[start:start + width])
         for j in range(width - 3, -1, -3):
-            at = base + j * height
-            one, two, three = (factor[at:at + height], factor[at + height:at + 2 * height],
-                               factor[at + 2 * height:at + 3 * height])
+            one, two, three = _columns(factor, panel[s] + j * height, height)
             x0, x1, x2 = own[j], own[j + 1], own[j + 2]
             y0, y1, y2 = other[j], other[j + 1], other[j + 2]
             z0, z1, z2 = last[j], last[j + 1], last[j + 2]
@@ -418,7 +387,7 @@ def _up_three(first, row_start, rows, panel, factor, inverse, x, y, z):
                 z1 -= b * last[i]
                 z2 -= c * last[i]
             low, middle, high = one[pivots:], two[pivots:], three[pivots:]
-            for i in range(PAD * runs):
+            for i in range(padded):
                 a, b, c = low[i], middle[i], high[i]
                 x0 -= a * t[i]
                 x1 -= b * t[i]
