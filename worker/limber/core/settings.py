@@ -9,11 +9,12 @@ import difflib
 import math
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic_core import core_schema
 
 from limber.core.errors import InputError
 
@@ -28,6 +29,25 @@ def _with_length(vector: tuple[float, float, float]) -> tuple[float, float, floa
 
 Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
 """A direction: three numbers that are not all 0; of any length."""
+
+
+class OneOf:
+    """Annotates a text that is one of a registry's names, asked for when they are needed."""
+
+    def __init__(self, names: Callable[[], tuple[str, ...]]):
+        self.names = names
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.no_info_after_validator_function(self._known, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return {**handler(schema), "enum": list(self.names())}
+
+    def _known(self, name: str) -> str:
+        if name not in self.names():
+            raise ValueError(f"it must be one of {', '.join(self.names())}")
+        return name
+
 
 Groups = dict[str, tuple[str, ...]]
 """Title to the names of the fields that stand under it."""

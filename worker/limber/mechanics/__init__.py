@@ -19,7 +19,7 @@ _PLACES = {
     "BranchModel": "model",
     "DynamicResult": "dynamics.integration",
     "Grasp": "grasp",
-    "Material": "materials.materials",
+    "MaterialLaw": "materials.law",
     "EnergyMomentumSettings": "dynamics.motion",
     "NewmarkSettings": "dynamics.motion",
     "ParameterSet": "sensitivities",
@@ -34,6 +34,7 @@ _PLACES = {
     "solve_static": "statics.solve",
     "static_sensitivities": "sensitivities",
     "unloaded_rest_shape": "statics.rest_shape",
+    "register_material": "materials.registry",
     "young_weights": "materials.young_field",
 }
 

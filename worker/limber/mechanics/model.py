@@ -28,14 +28,20 @@ from limber.mechanics.elements.principal import largest_principal_strains
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.grip import stiffening
 from limber.mechanics.linear.equations import Equations, Viscous
+from limber.mechanics.materials.law import (
+    MULTIPLICITY,
+    MaterialLaw,
+    hooke_strain,
+    hooke_stress,
+)
 from limber.mechanics.materials.materials import (
-    Material,
     RayleighDamping,
     check_poisson,
     check_young,
     lame,
     per_tet,
 )
+from limber.mechanics.materials.registry import material_named
 from limber.mechanics.prestress import Hanging, carried
 
 _NO_MEMORY = np.zeros((0, 0, 6))
@@ -110,7 +116,7 @@ class BranchModel:
         density: Density [kg/m^3], likewise.
         fixed: Fixed nodes, mask [node_count] or indices; default the mesh's point data ``fixed``.
         gravity: Acceleration [m/s^2], or None.
-        material: Name of a limber.mechanics.materials.materials.Material.
+        material: A law (limber.mechanics.materials), or the name of one.
         damping: Rayleigh damping, used in dynamics.
         point_masses: Added masses, and twigs (:class:`limber.mechanics.added_masses.HungTwig`).
         lumped_mass: Diagonal mass matrix instead of the consistent one, but for twigs.
@@ -133,13 +139,13 @@ class BranchModel:
     def __init__(self, mesh: TetMesh, *, young: float | np.ndarray, poisson: float | np.ndarray,
                  density: float | np.ndarray, fixed: np.ndarray | None = None,
                  gravity: Sequence[float] | None = GRAVITY,
-                 material: str | Material = "st_venant_kirchhoff",
+                 material: str | MaterialLaw = "st_venant_kirchhoff",
                  damping: RayleighDamping = DEFAULT_DAMPING,
                  point_masses: Iterable[PointMass] = (), lumped_mass: bool = False):
         check_mesh(mesh)
         self._data = _MeshData(mesh, fixed_mask(mesh, fixed))
         self.gravity = np.zeros(3) if gravity is None else np.asarray(gravity, float)
-        self.material = Material.named(material)
+        self.material = material_named(material)
         self.damping = damping
         self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
@@ -238,14 +244,15 @@ class BranchModel:
     def linear(self, young: float, poisson: float) -> "BranchModel":
         """Return the branch of one linear material, without what it carries and what grips it."""
         other = copy.copy(self)
-        other.hanging, other.material, other.stiffening = None, Material.linear, 1.0
+        other.hanging, other.stiffening = None, 1.0
+        other.material = material_named("linear")
         other._set(young, poisson, self.density)
         return other
 
-    def with_material(self, material: Material) -> "BranchModel":
+    def with_material(self, material: str | MaterialLaw) -> "BranchModel":
         """Return the model with another law of the same Lamé coefficients."""
         other = copy.copy(self)
-        other.material = material
+        other.material = material_named(material)
         return other
 
     def with_point_masses(self, masses: Iterable[PointMass]) -> "BranchModel":
@@ -304,10 +311,17 @@ class BranchModel:
         lam, mu = lame_pair or (self.lame_lambda, self.lame_mu)
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         force, energies = np.empty((self.mesh.node_count, 3)), np.empty(self.mesh.tet_count)
-        layout = data.layout
+        layout, of_law = data.layout, None
+        if not self.material.is_compiled:
+            strain = self.strains(displacement)
+            of_law = (data.weights * self.material.energy(strain, lam[:, None], mu[:, None])
+                      ).sum(axis=1)
+            growth, memory = 0.0, self.bearing_strain(strain, viscous, lame_pair)
+            lam, mu = self.lame_lambda, self.lame_mu
         det = internal_force(for_kernels(displacement), layout.gradients,
                              layout.weights, layout.per_element(lam), layout.per_element(mu),
-                             layout.nodes, int(self.material), growth, memory, force, energies)
+                             layout.nodes, self.material.kernel, growth, memory, force, energies)
+        energies = energies if of_law is None else of_law
         if lame_pair is not None or self.weight_stiffness is None:
             return InternalState(force, energies, float(det))
         lifted = self._weight_times(displacement)
@@ -317,22 +331,62 @@ class BranchModel:
     def tangent_times(self, displacement: np.ndarray, direction: np.ndarray,
                       viscous: Viscous | None = None) -> np.ndarray:
         """Return the exact derivative of the internal force [N] along ``direction`` [m]."""
-        data = self._data
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         product = np.empty((self.mesh.node_count, 3))
-        layout = data.layout
+        layout, of_moduli = self._data.layout, None
+        if not self.material.is_compiled:
+            strain = self.strains(displacement)
+            growth, memory = 0.0, self.bearing_strain(strain, viscous)
+            of_moduli = self._of_moduli(displacement, direction, strain, viscous)
         tangent_times(for_kernels(displacement), for_kernels(direction), layout.gradients,
                       layout.weights, layout.per_element(self.lame_lambda),
-                      layout.per_element(self.lame_mu), layout.nodes, int(self.material), growth,
+                      layout.per_element(self.lame_mu), layout.nodes, self.material.kernel, growth,
                       memory, self.mesh.tet_count, product)
+        if of_moduli is not None:
+            product += of_moduli
         return product if self.weight_stiffness is None else product + self._weight_times(direction)
+
+    def bearing_strain(self, strain: np.ndarray, viscous: Viscous | None = None,
+                       lame_pair: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
+        """Return the strain at which Hooke's stress is the law's at ``strain``, [tet_count, q, 6].
+
+        The kernels take the stress of a law that they do not know in this form.
+
+        Args:
+            strain: As of :meth:`strains`.
+            viscous: Viscous part in motion.
+            lame_pair: Lamé coefficients of the stress instead of the model's.
+        """
+        if self.material.is_hookean:
+            return strain if viscous is None else viscous.growth * strain + viscous.memory
+        own = (self.lame_lambda[:, None], self.lame_mu[:, None])
+        lam, mu = own if lame_pair is None else (lame_pair[0][:, None], lame_pair[1][:, None])
+        stress = self.material.stress(strain, lam, mu)
+        if viscous is not None:
+            stress = stress + hooke_stress((viscous.growth - 1) * strain + viscous.memory, lam, mu)
+        return hooke_strain(stress, *own)
+
+    def _of_moduli(self, displacement: np.ndarray, direction: np.ndarray, strain: np.ndarray,
+                   viscous: Viscous | None) -> np.ndarray:
+        """Return the forces [N] of the stress' change along ``direction``, by the law's moduli."""
+        change = self.strain_changes(displacement, direction)
+        lam, mu = self.lame_lambda[:, None], self.lame_mu[:, None]
+        stress = np.einsum("eqkl,eql->eqk", self.material.moduli(strain, lam, mu),
+                           change * MULTIPLICITY)
+        bearing = hooke_strain(stress, lam, mu)
+        if viscous is not None:
+            bearing = bearing + (viscous.growth - 1) * change
+        # Lamé coefficients that are given leave the weight out.
+        return self.with_material("st_venant_kirchhoff").internal(
+            displacement, viscous=Viscous(0.0, bearing),
+            lame_pair=(self.lame_lambda, self.lame_mu)).force
 
     def strains(self, displacement: np.ndarray) -> np.ndarray:
         """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12)."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
         strains(for_kernels(displacement), data.layout.gradients,
-                data.layout.nodes, int(self.material), out)
+                data.layout.nodes, self.material.kernel, out)
         return out
 
     def largest_stretch(self, displacement: np.ndarray) -> tuple[float, int]:
@@ -363,16 +417,16 @@ class BranchModel:
         data = self._data
         out = np.empty((*data.weights.shape, 6))
         strain_changes(for_kernels(displacement), for_kernels(direction), data.layout.gradients,
-                       data.layout.nodes, int(self.material), out)
+                       data.layout.nodes, self.material.kernel, out)
         return out
 
     @property
     def weight_stiffness(self) -> sp.csr_matrix | None:
         """Geometric stiffness of the carried weight [N/m], each axis; None where it carries none.
 
-        At small strains (Material.linear) a weight that is carried has no effect.
+        At small strains a weight that is carried has no effect.
         """
-        if self.hanging is None or self.material == Material.linear:
+        if self.hanging is None or self.material.is_linear:
             return None
         return self.hanging.total.stiffness
 

@@ -1,10 +1,11 @@
 """Settings of a simulated pull; they load nothing heavy."""
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Groups, Settings
+from limber.core.settings import Groups, OneOf, Settings
+from limber.mechanics.materials.registry import material_names
 
 Point = tuple[float, float, float]
 PointLoad = tuple[float, float, float, float, float, float]
@@ -71,7 +72,7 @@ class SimulateSettings(Settings):
         True, description="The branch bears its own weight, and was scanned so.")
     rest_shape: bool = Field(
         True, description="Take the scan as already sagging under gravity; else gravity bends it.")
-    material: Literal["st_venant_kirchhoff", "stable_neo_hookean", "linear"] = Field(
+    material: Annotated[str, OneOf(material_names)] = Field(
         "st_venant_kirchhoff", description="Material law.")
     damping_mass: float = Field(0.5, ge=0, description="Damping on velocity [1/s].")
     damping_stiffness: float = Field(0.002, ge=0, description="Damping on strain rate [s].")

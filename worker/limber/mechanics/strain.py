@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from limber.mechanics.materials.materials import Material
+from limber.mechanics.materials.law import MULTIPLICITY, hooke_stress
 from limber.mechanics.model import BranchModel
 
 ALL = slice(None)
-_UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # tensors in one row: 00 11 22 01 02 12
-_TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 _NEAR_STRAIN = 0.57
 _NEAR_STRESS = 0.3  # less: the norm is taken of the stress before it is turned and stretched
 
@@ -82,9 +80,9 @@ def peak_load(model: BranchModel, displacement: np.ndarray) -> tuple[float, int,
     green = np.einsum("eq,eqk->ek", part, model.strains(displacement))
     carried = carried_strain(model)
     strain = green if carried is None else green + carried
-    lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
-    stress = lam * strain[:, :3].sum(axis=1, keepdims=True) * _UNIT + 2.0 * mu * strain
-    near = np.zeros(len(strain), bool)
+    stress = hooke_stress(strain, model.lame_lambda, model.lame_mu)
+    # A law from outside may be far from Hooke's: all of its tetrahedra are looked at.
+    near = np.full(len(strain), not model.material.is_compiled)
     for size, enough in ((_norms(strain), _NEAR_STRAIN), (_norms(stress), _NEAR_STRESS)):
         near |= size >= enough * size.max()
     tets = np.flatnonzero(near)
@@ -96,7 +94,7 @@ def peak_load(model: BranchModel, displacement: np.ndarray) -> tuple[float, int,
 
 
 def _norms(tensors: np.ndarray) -> np.ndarray:
-    return np.sqrt(tensors**2 @ _TWICE)
+    return np.sqrt(tensors**2 @ MULTIPLICITY)
 
 
 def _means(model: BranchModel, displacement: np.ndarray, tets: np.ndarray | slice,
@@ -111,7 +109,8 @@ def _means(model: BranchModel, displacement: np.ndarray, tets: np.ndarray | slic
     carried = _carried(model, tets)
     strain = np.einsum("eq,eqij->eij", part, green + strain_of(model, carried, tets))
     det = np.linalg.det(F)
-    cauchy = _cauchy(model, F, green, tets) + F @ carried @ F_t / det[..., None, None]
+    lam, mu = (values[tets, None] for values in (model.lame_lambda, model.lame_mu))
+    cauchy = model.material.cauchy(F, lam, mu) + F @ carried @ F_t / det[..., None, None]
     return strain, np.einsum("eq,eqij->eij", part, cauchy), det
 
 
@@ -137,22 +136,6 @@ def _carried(model: BranchModel, tets: np.ndarray | slice = ALL) -> np.ndarray:
     if model.hanging is None:
         return np.zeros((*model.weights[tets].shape, 3, 3))
     return model.hanging.total.stress[tets][..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
-
-
-def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray, tets: np.ndarray | slice,
-            ) -> np.ndarray:
-    lam, mu = (values[tets, None, None, None] for values in (model.lame_lambda, model.lame_mu))
-    eye = np.eye(3)
-    if model.material == Material.linear:
-        small = 0.5 * (F + np.swapaxes(F, 2, 3)) - eye
-        trace = np.trace(small, axis1=2, axis2=3)[..., None, None]
-        return lam * trace * eye + 2 * mu * small
-    det = np.linalg.det(F)[..., None, None]
-    left = F @ np.swapaxes(F, 2, 3)
-    if model.material == Material.stable_neo_hookean:
-        return mu / det * left + ((lam + mu) * (det - 1) - mu) * eye
-    trace = np.trace(green, axis1=2, axis2=3)[..., None, None]
-    return F @ (lam * trace * eye + 2 * mu * green) @ np.swapaxes(F, 2, 3) / det
 
 
 def gradient_metric(model: BranchModel) -> sp.csr_matrix:

@@ -21,7 +21,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.numerics.compiled import compiled
 from limber.core.present import present
-from limber.mechanics.materials.materials import Material, lame
+from limber.mechanics.materials.materials import lame
 from limber.mechanics.model import BranchModel
 from limber.reduced.basis import (
     SWING_STRAIN_SHARE,
@@ -190,7 +190,7 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
     Raises:
         InputError: the material is not St. Venant-Kirchhoff.
     """
-    if model.material != Material.st_venant_kirchhoff:
+    if not model.material.has_cubic_force:
         raise InputError(f"A reduced model of material {model.material.name}.",
                          "Only St. Venant-Kirchhoff's force is a cubic polynomial.",
                          "Use the full model, or st_venant_kirchhoff.")

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import click
 from pydantic import BaseModel
 
-from limber.core.settings import Settings, checked_settings
+from limber.core.settings import OneOf, Settings, checked_settings
 from limber.stages.registry import StageDescription
 
 
@@ -206,7 +206,9 @@ def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) 
         return click.option(f"{flag}/--no-{flag[2:]}", destination, **common)
     if typing.get_origin(kind) is tuple:
         return _tuple_option([*flags, destination], typing.get_args(kind), common)
-    return click.option(*flags, destination, type=_click_type(kind), **common)
+    names = next((part.names for part in field.metadata if isinstance(part, OneOf)), None)
+    return click.option(*flags, destination,
+                        type=click.Choice(names()) if names else _click_type(kind), **common)
 
 
 def _tuple_option(names: list[str], items: tuple, common: dict[str, Any]) -> Callable:

@@ -25,7 +25,8 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig, PointMass
 from limber.mechanics.loads.loaded_branch import LoadedBranch, NamedTarget, hang, target_masses
-from limber.mechanics.materials.materials import Material, RayleighDamping
+from limber.mechanics.materials.law import MaterialLaw
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.recordings.recording import Pull, read_pull
@@ -149,7 +150,7 @@ def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
 class ModelOptions(TypedDict, total=False):
     """Options of a branch's model, as of BranchModel."""
 
-    material: str | Material
+    material: str | MaterialLaw
     damping: RayleighDamping
     lumped_mass: bool
 

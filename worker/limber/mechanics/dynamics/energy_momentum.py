@@ -23,7 +23,7 @@ from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
-from limber.mechanics.materials.materials import Material, neo_hookean_energy, neo_hookean_stress
+from limber.mechanics.materials.law import contracted, hooke_strain
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
 
@@ -34,6 +34,7 @@ _GOOD_TANGENT = 0.3
 _FRESH = 3
 """Tangents made anew in one step, at most: later ones would be of nearly the same state. Both
 chosen, not measured."""
+_NOTHING = np.zeros(6)
 
 
 class EnergyMomentumStepper(Stepper):
@@ -42,10 +43,11 @@ class EnergyMomentumStepper(Stepper):
     def __init__(self, drive: Drive, settings: MotionSettings):
         super().__init__(drive, settings)
         self._balances: deque[tuple[float, np.ndarray]] = deque(maxlen=2)
-        self._is_polynomial = self.model.material != Material.stable_neo_hookean
+        law = self.model.material
         # Its stress is given through the strain that St. Venant-Kirchhoff would have it at.
-        self._bearing = (self.model if self._is_polynomial
-                         else self.model.with_material(Material.st_venant_kirchhoff))
+        self._bearing = (self.model if law.is_hookean
+                         else self.model.with_material("st_venant_kirchhoff"))
+        self._stiff = self._bearing if law.is_compiled else self.model
 
     def begin(self, start: MotionState, out: np.ndarray) -> None:
         """Begin where the holds bear ``out`` [N] on each node, shape [node_count, 3]."""
@@ -124,23 +126,21 @@ class EnergyMomentumStepper(Stepper):
     def _bearing_strain(self, before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
         """Return the strain whose linear elastic stress is that of the step, viscosity and all."""
         mean, change = 0.5 * (before + after), after - before
-        if not self._is_polynomial:
-            mean = self._neo_hookean_bearing(before, after)
+        if not self.model.material.is_hookean:
+            mean = self._bearing_mean(before, after)
         return mean + self.model.damping.stiffness / dt * change
 
-    def _neo_hookean_bearing(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        model = self.model
+    def _bearing_mean(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the strain whose linear elastic stress, times the change, is the energy's."""
+        model, law = self.model, self.model.material
         lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
         change = after - before
-        stress = neo_hookean_stress(0.5 * (before + after), lam, mu)
-        size = _contracted(change, change)
-        left = (neo_hookean_energy(after, lam, mu) - neo_hookean_energy(before, lam, mu)
-                - _contracted(stress, change))
+        stress = law.stress(0.5 * (before + after), lam, mu)
+        size = contracted(change, change)
+        left = (law.energy(after, lam, mu) - law.energy(before, lam, mu)
+                - contracted(stress, change))
         part = np.where(size > _STRAIN_CHANGE**2, left / np.maximum(size, _STRAIN_CHANGE**2), 0.0)
-        stress = stress + part[..., None] * change
-        trace = stress[..., :3].sum(axis=-1, keepdims=True)
-        spread = (lam / (3 * lam + 2 * mu))[..., None] * trace
-        return (stress - spread * np.array([1.0, 1, 1, 0, 0, 0])) / (2 * mu[..., None])
+        return hooke_strain(stress + part[..., None] * change, lam, mu)
 
     def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
         new.velocity = 2 / dt * (new.displacement - old.displacement) - old.velocity
@@ -159,13 +159,14 @@ class EnergyMomentumStepper(Stepper):
                       bearing: np.ndarray, dt: float) -> bool:
         damping = self.model.damping
         growth = 1 + 2 * damping.stiffness / dt
-        memory = bearing - growth * self._bearing.strains(middle)
+        model = self._stiff
+        memory = bearing - model.bearing_strain(model.strains(middle), Viscous(growth, _NOTHING))
         # The mean strain is quadratic in the increment with twice the factor of the strain itself.
         mixed = None if increment is None else np.sqrt(2) * increment
         self.tangent = None
         try:
             self.tangent = self.equations.tangent(
-                self._bearing, middle, increment=mixed, viscous=Viscous(growth, memory),
+                model, middle, increment=mixed, viscous=Viscous(growth, memory),
                 mass_factor=4 / dt**2 + 2 * damping.mass / dt)
         except NotPositiveDefiniteError:
             return False
@@ -188,9 +189,3 @@ class EnergyMomentumStepper(Stepper):
         new.acceleration = (new.velocity - old.velocity) / new.step_before
         self._balances.append((0.5 * (old.time + new.time), -out))
         return new
-
-
-def _contracted(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the double contraction of symmetric tensors (00 11 22 01 02 12)."""
-    product = one * two
-    return product[..., :3].sum(axis=-1) + 2 * product[..., 3:].sum(axis=-1)

@@ -9,7 +9,7 @@ Shared arguments:
     displacement: Node displacements [m], shape [node_count, 3].
     gradients, weights, nodes: From :class:`ForceLayout`.
     lame_lambda, lame_mu: Lamé coefficients [Pa], shape [batch, LANES].
-    material: limber.mechanics.materials.materials.Material as int.
+    material: ``kernel`` of a limber.mechanics.materials.law.MaterialLaw.
     growth, memory: In motion the stress is that of the strain ``growth * E + memory``: viscous
         stress (Kelvin-Voigt) follows the strain's rate, and a difference formula gives that rate
         from the strain now and the strains before, which are the memory, [tet_count, q, 6] (00
@@ -26,9 +26,7 @@ import numpy as np
 from limber.core.numerics.compiled import compiled
 from limber.mechanics.elements.stiffness import deformation, gather, gradient, green_strain
 from limber.mechanics.elements.stiffness_pairs import LANES
-
-_NEO_HOOKE = 1
-_LINEAR = 2
+from limber.mechanics.materials.law import NEO_HOOKE, SMALL_STRAIN
 
 
 class ForceLayout:
@@ -73,7 +71,7 @@ def internal_force(displacement, gradients, weights, lame_lambda, lame_mu, nodes
     local, pull = np.empty(3 * node_count * LANES), np.empty(3 * node_count * LANES)
     F, P, E = np.empty(9 * LANES), np.empty(9 * LANES), np.empty(6 * LANES)
     energy, det = np.empty(LANES), np.empty(LANES)
-    factor = growth - 1.0 if material == _NEO_HOOKE else growth
+    factor = growth - 1.0 if material == NEO_HOOKE else growth
     is_viscous = memory.shape[0] > 0
     force[:] = 0.0
     lowest = np.inf
@@ -88,21 +86,21 @@ def internal_force(displacement, gradients, weights, lame_lambda, lame_mu, nodes
             _determinant(F, det)
             for l in range(LANES):
                 lowest = min(lowest, det[l])
-            if material == _LINEAR:
+            if material == SMALL_STRAIN:
                 _small_strain(F, E)
             else:
                 green_strain(F, E)
             P[:] = 0.0
-            if material == _NEO_HOOKE:
+            if material == NEO_HOOKE:
                 _volume_stress(F, det, lam, mu, weight, energy, P)
             else:
                 _strain_energy(E, lam, mu, weight, energy)
-            if material != _NEO_HOOKE or is_viscous:
+            if material != NEO_HOOKE or is_viscous:
                 for k in range(6 * LANES):
                     E[k] *= factor
                 if is_viscous:
                     _remember(memory, batch, q, E)
-                if material == _LINEAR:
+                if material == SMALL_STRAIN:
                     _identity(F)
                 _add_stress(F, E, lam, mu, weight, P)
             for a in range(node_count):
@@ -125,7 +123,7 @@ def tangent_times(displacement, direction, gradients, weights, lame_lambda, lame
     pull = np.empty(3 * node_count * LANES)
     F, H, P = np.empty(9 * LANES), np.empty(9 * LANES), np.empty(9 * LANES)
     E, D = np.empty(6 * LANES), np.empty(6 * LANES)
-    factor = growth - 1.0 if material == _NEO_HOOKE else growth
+    factor = growth - 1.0 if material == NEO_HOOKE else growth
     is_viscous = memory.shape[0] > 0
     product[:] = 0.0
     for batch in range(batch_count):
@@ -135,22 +133,22 @@ def tangent_times(displacement, direction, gradients, weights, lame_lambda, lame
         pull[:] = 0.0
         for q in range(point_count):
             weight = weights[batch, q]
-            if material == _LINEAR:
+            if material == SMALL_STRAIN:
                 _identity(F)
             else:
                 deformation(local, flat[batch, q], node_count, F)
             gradient(change, flat[batch, q], node_count, H)
             P[:] = 0.0
-            if material == _NEO_HOOKE:
+            if material == NEO_HOOKE:
                 _add_volume_change(F, H, lam, mu, weight, P)
-            if material != _NEO_HOOKE or is_viscous:
+            if material != NEO_HOOKE or is_viscous:
                 # F is the identity where the material is linear, and E then zero.
                 green_strain(F, E)
                 _strain_rate(F, H, D)
                 for k in range(6 * LANES):
                     E[k] *= factor
                     D[k] *= factor
-                if is_viscous and material != _LINEAR:
+                if is_viscous and material != SMALL_STRAIN:
                     _remember(memory, batch, q, E)
                 _add_stress(H, E, lam, mu, weight, P)
                 _add_stress(F, D, lam, mu, weight, P)
@@ -170,7 +168,7 @@ def strains(displacement, gradients, nodes, material, out):
         gather(displacement, nodes[batch], local)
         for q in range(point_count):
             deformation(local, flat[batch, q], node_count, F)
-            if material == _LINEAR:
+            if material == SMALL_STRAIN:
                 _small_strain(F, E)
             else:
                 green_strain(F, E)
@@ -191,7 +189,7 @@ def strain_changes(displacement, direction, gradients, nodes, material, out):
         gather(displacement, nodes[batch], local)
         gather(direction, nodes[batch], change)
         for q in range(point_count):
-            if material == _LINEAR:
+            if material == SMALL_STRAIN:
                 _identity(F)
             else:
                 deformation(local, flat[batch, q], node_count, F)

@@ -29,9 +29,7 @@ from limber.mechanics.elements.stiffness_pairs import (
     volume_pairs_2,
     volume_pairs_4,
 )
-
-_NEO_HOOKE = 1
-_LINEAR = 2
+from limber.mechanics.materials.law import NEO_HOOKE, SMALL_STRAIN
 
 
 @compiled
@@ -65,10 +63,10 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
     E, C = np.empty(6 * LANES), np.empty(9 * LANES)
     root, lam, mu, both = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
     block = np.empty(9 * LANES)
-    mixed = material != _LINEAR and increment.shape[0] > 0
-    has_memory = memory.shape[0] > 0 and material != _LINEAR
-    factor = growth - 1.0 if material == _NEO_HOOKE else growth
-    has_strain = material != _NEO_HOOKE or memory.shape[0] > 0
+    mixed = material != SMALL_STRAIN and increment.shape[0] > 0
+    has_memory = memory.shape[0] > 0 and material != SMALL_STRAIN
+    factor = growth - 1.0 if material == NEO_HOOKE else growth
+    has_strain = material != NEO_HOOKE or memory.shape[0] > 0
     for batch in range(batch_count):
         gather(displacement, nodes[batch], local)
         if mixed:
@@ -77,7 +75,7 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
             lam[l], mu[l] = factor * lame_lambda[batch, l], factor * lame_mu[batch, l]
             both[l] = lame_lambda[batch, l] + lame_mu[batch, l]
         for q in range(point_count):
-            if material == _LINEAR:
+            if material == SMALL_STRAIN:
                 F[:] = 0.0
                 for l in range(LANES):
                     F[l] = F[4 * LANES + l] = F[8 * LANES + l] = 1.0
@@ -101,7 +99,7 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
                 for a in range(node_count):
                     _strain_rows(F, E, root, flat[batch, q, 3 * a * LANES:],
                                  strain_rows[a, q * STRAIN_ROWS * LANES:])
-            if material == _NEO_HOOKE:
+            if material == NEO_HOOKE:
                 _volume_terms(F, lame_mu[batch], both, weights[batch, q], C,
                               volume_terms[q * VOLUME_TERMS * LANES:])
                 for a in range(node_count):
@@ -114,7 +112,7 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
                 if has_strain:
                     _add_strain_pairs(strain_rows[a], strain_rows[b], strain_terms, lam, mu,
                                       point_count, block)
-                if material == _NEO_HOOKE:
+                if material == NEO_HOOKE:
                     _add_volume_pairs(volume_rows[a], volume_rows[b], volume_terms, both,
                                       point_count, block)
                 scatter_block(block, slots[batch, pair], lengths[batch, pair], a == b, values)

@@ -11,12 +11,12 @@ import scipy.sparse as sp
 
 from limber.core.numerics.compiled import for_kernels
 from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.mechanics.elements.general import moduli_stiffness
 from limber.mechanics.elements.stiffness import tangent_stiffness
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.factor import Factor, make_factor
 from limber.mechanics.linear.pattern import LaneLayout, Pattern
 from limber.mechanics.linear.supernodal import SupernodalFactor
-from limber.mechanics.materials.materials import Material
 
 if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel
@@ -209,9 +209,10 @@ class Equations:
         """Return tangent stiffness plus ``mass_factor`` [1/s^2] times the mass, factorised.
 
         Args:
-            increment: The last increment [m], for mixed-point Newton (StVK only).
+            increment: The last increment [m], for mixed-point Newton; where the force is not
+                cubic it changes nothing.
             strain: At whose stress the geometric part is taken instead, shape [tet_count, q, 6]
-                (StVK only).
+                (St. Venant-Kirchhoff only).
             viscous: Viscous part in motion.
             drag: Part of the mean diagonal that is added to the diagonal.
 
@@ -266,13 +267,30 @@ class Equations:
         elif strain is not None:
             memory = layout.per_point(strain - model.strains(displacement))
         mixed = _NO_INCREMENT
-        if increment is not None and model.material == Material.st_venant_kirchhoff:
+        law = model.material
+        if increment is not None and law.has_cubic_force:
             mixed = for_kernels(increment)
+        if not law.is_compiled:
+            growth, memory = self._add_moduli(model, displacement, viscous)
         tangent_stiffness(for_kernels(displacement), mixed, layout.gradients, layout.weights,
-                          lam, mu, layout.nodes, int(model.material), growth, memory,
+                          lam, mu, layout.nodes, law.kernel, growth, memory,
                           layout.slots, layout.lengths, self._values)
         self._add_pins()
         return self._values[:self.pattern.value_count]
+
+    def _add_moduli(self, model: "BranchModel", displacement: np.ndarray,
+                    viscous: Viscous | None) -> tuple[float, np.ndarray]:
+        """Add the stiffness of a law's own moduli.
+
+        Return growth and memory with which Hooke's kernel adds that of its stress and viscosity.
+        """
+        layout, strain = self.layout, model.strains(displacement)
+        moduli = model.material.moduli(strain, model.lame_lambda[:, None], model.lame_mu[:, None])
+        moduli_stiffness(for_kernels(displacement), layout.gradients, layout.weights,
+                         layout.per_point(moduli.reshape(*strain.shape[:2], -1)), layout.nodes,
+                         layout.slots, layout.lengths, self._values)
+        growth = 0.0 if viscous is None else viscous.growth - 1
+        return growth, layout.per_point(model.bearing_strain(strain, viscous) - growth * strain)
 
     def free_part(self, force: np.ndarray) -> np.ndarray:
         """Return forces without what the constraints bear: held nodes, means of pinned patches."""

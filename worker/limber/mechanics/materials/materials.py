@@ -1,11 +1,6 @@
-"""Materials: Lamé coefficients, what is allowed, damping.
-
-All three materials are linear in both Lamé coefficients, hence in Young's modulus; sensitivities
-and the reduced model rest on that.
-"""
+"""Lamé coefficients, what is allowed of a material's numbers, damping."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import overload
 
 import numpy as np
@@ -14,33 +9,6 @@ from limber.core.errors import InputError
 
 MAX_POISSON = 0.495
 """Above this the tetrahedra lock; at 0.5 the Lamé coefficients are infinite."""
-
-
-class Material(IntEnum):
-    """What the kernels tell apart.
-
-    st_venant_kirchhoff: the paper's, eq. (5): quadratic in the Green-Lagrange strain.
-    stable_neo_hookean: Smith, de Goes and Kim (2018) without the logarithmic barrier,
-        mu/2 (I_C - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2; bears strong compression.
-    linear: small strains, for checks.
-    """
-
-    st_venant_kirchhoff = 0
-    stable_neo_hookean = 1
-    linear = 2
-
-    @classmethod
-    def named(cls, name: "str | Material") -> "Material":
-        """Return the material called ``name``.
-
-        Raises:
-            InputError: there is none of that name.
-        """
-        try:
-            return name if isinstance(name, Material) else cls[name]
-        except KeyError:
-            raise InputError(f"There is no material {name!r}.", "It must be one of those known: "
-                             + ", ".join(cls.__members__) + ".", "Choose one.") from None
 
 
 @dataclass(frozen=True)
@@ -109,42 +77,3 @@ def check_poisson(poisson: np.ndarray) -> None:
                          f"It must lie above -1 and not above {MAX_POISSON}: at 0.5 the material"
                          " is incompressible and these elements lock.",
                          "Wood has 0.3 to 0.45.")
-
-
-def neo_hookean_energy(strain: np.ndarray, lame_lambda: np.ndarray,
-                       lame_mu: np.ndarray) -> np.ndarray:
-    """Return the energy density [J/m^3] of the stable neo-Hookean at a Green-Lagrange strain.
-
-    Args:
-        strain: Shape [..., 6] (00 11 22 01 02 12).
-        lame_lambda, lame_mu: [Pa], shapes that go with [...].
-    """
-    change = np.sqrt(_determinant(_right_cauchy_green(strain))) - 1
-    return (lame_mu * (strain[..., :3].sum(axis=-1) - change)
-            + 0.5 * (lame_lambda + lame_mu) * change**2)
-
-
-def neo_hookean_stress(strain: np.ndarray, lame_lambda: np.ndarray,
-                       lame_mu: np.ndarray) -> np.ndarray:
-    """Return its second Piola-Kirchhoff stress [Pa], shape [..., 6]; arguments as its energy."""
-    c = _right_cauchy_green(strain)
-    det = np.sqrt(_determinant(c))
-    pressure = ((lame_lambda + lame_mu) * (det - 1) - lame_mu) / det
-    stress = pressure[..., None] * _cofactor(c)
-    stress[..., :3] += lame_mu[..., None]
-    return stress
-
-
-def _right_cauchy_green(strain: np.ndarray) -> np.ndarray:
-    return 2 * strain + np.array([1.0, 1, 1, 0, 0, 0])
-
-
-def _cofactor(c: np.ndarray) -> np.ndarray:
-    """Return the cofactors of symmetric tensors [..., 6]: determinant times inverse."""
-    c00, c11, c22, c01, c02, c12 = np.moveaxis(c, -1, 0)
-    return np.stack([c11 * c22 - c12**2, c00 * c22 - c02**2, c00 * c11 - c01**2,
-                     c02 * c12 - c01 * c22, c01 * c12 - c02 * c11, c01 * c02 - c12 * c00], axis=-1)
-
-
-def _determinant(c: np.ndarray) -> np.ndarray:
-    return (c[..., [0, 3, 4]] * _cofactor(c)[..., [0, 3, 4]]).sum(axis=-1)

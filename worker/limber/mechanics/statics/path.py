@@ -8,7 +8,6 @@ from limber.core.numerics.rigid import pose_between
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import Progress
 from limber.mechanics.linear.equations import Tangent
-from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import InternalState
 from limber.mechanics.statics.problem import StaticProblem, Target, make_result, strain_warnings
 from limber.mechanics.statics.result import StaticResult
@@ -332,11 +331,10 @@ class Path:
 
     def _softening(self) -> str:
         """Say so where the material, not the branch, is what gives way."""
-        if (self.model.material != Material.st_venant_kirchhoff
-                or self.state.min_det_f > _SOFT_DET_F):
+        told = self.model.material.softening
+        if not told or self.state.min_det_f > _SOFT_DET_F:
             return ""
-        return (f"; it is compressed to {100 * self.state.min_det_f:.0f} % of its volume, where St."
-                " Venant-Kirchhoff goes soft: stable_neo_hookean bears more")
+        return f"; it is compressed to {100 * self.state.min_det_f:.0f} % of its volume, {told}"
 
 
 def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:

@@ -9,7 +9,6 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.linear.equations import Equations
-from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import BranchModel, InternalState
 from limber.mechanics.statics.result import StaticResult, StaticSettings
 from limber.mechanics.status import Status
@@ -45,7 +44,7 @@ class StaticProblem:
                              "Give the grasp too.")
         self.is_held = is_held
         self.equations: Equations = model.equations(self.grasps if is_held else ())
-        self.mixed = settings.mixed and model.material == Material.st_venant_kirchhoff
+        self.mixed = settings.mixed and model.material.has_cubic_force
 
     def poses(self, pose: np.ndarray) -> list[np.ndarray]:
         poses = np.asarray(pose, float).reshape(-1, 6) if np.size(pose) % 6 == 0 else [pose]

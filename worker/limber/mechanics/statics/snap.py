@@ -11,7 +11,6 @@ import numpy as np
 
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.mechanics.linear.equations import Equations
-from limber.mechanics.materials.materials import Material
 from limber.mechanics.model import BranchModel
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def settle(path: "Path", part: float) -> float | None:
     Each creep is a step of implicit Euler on the gradient flow of the potential, so it only ever
     goes down. Return the length taken; None where the branch does not come to rest.
     """
-    if path.model.material == Material.linear:
+    if path.model.material.is_linear:
         return None
     target, pins = path.constraint_at(part)
     load, before = path.load_at(part), (path.status, path.trouble)

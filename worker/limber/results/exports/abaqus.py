@@ -3,6 +3,7 @@
 import numpy as np
 
 from limber.mechanics.model import BranchModel
+from limber.results.exports.elastic import require_elastic
 
 _STEP = 0.005
 """Moduli within such a share of each other have one material."""
@@ -22,7 +23,11 @@ def inp_text(model: BranchModel, name: str, tip: int, load: np.ndarray | None = 
         tip: Node that is loaded, and named TIP.
         load: On that node [N], shape [3]; None: no static step.
         mode_count: Frequencies asked for; 0: no such step.
+
+    Raises:
+        InputError: the model's material is not one of *ELASTIC.
     """
+    require_elastic(model.material, "Abaqus' *ELASTIC", at_any_strain=True)
     mesh = model.mesh
     kind = "C3D10" if mesh.is_quadratic else "C3D4"
     lines = ["*HEADING", f"{name}: branch of Limber, units m, kg, s, Pa. The shape hangs under its "

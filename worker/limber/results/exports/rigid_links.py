@@ -19,6 +19,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.model import BranchModel
+from limber.results.exports.elastic import require_elastic
 
 _SAMPLES_A_SEGMENT = 12
 _SPLITS = 1
@@ -134,8 +135,9 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
         spacing: Length of a link [m]; forks cut links, too.
 
     Raises:
-        InputError: a link would hold none of the mesh.
+        InputError: a link would hold none of the mesh, or springs cannot be made of its material.
     """
+    require_elastic(model.material, "A rod's spring")
     points, volume, tet = _sampled(model.mesh)
     wood = cKDTree(points)
     segments, samples, owner, before = _laid_out(skeleton, spacing, wood)

@@ -13,6 +13,7 @@ import numpy as np
 
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
+from limber.results.exports.elastic import require_elastic
 from limber.results.exports.rigid_links import tip_compliance
 
 if TYPE_CHECKING:
@@ -50,7 +51,11 @@ def as_deformable(model: BranchModel, tip: int) -> Deformable:
     Args:
         model: Of the hanging branch; its shape carries the weight, so none acts on it here.
         tip: Node at which both are compared.
+
+    Raises:
+        InputError: PhysX has no such material.
     """
+    require_elastic(model.material, "PhysX")
     bare = model.without_point_masses().with_parameters(gravity=(0.0, 0.0, 0.0))
     parts = _PARTS if bare.mesh.is_quadratic else np.array([[0, 1, 2, 3]])
     linear = replace(bare.mesh, tets=bare.mesh.tets[:, parts].reshape(-1, 4),

@@ -1,0 +1,88 @@
+"""The stiffness of any law's moduli, LANES elements at a time.
+
+Stress needs no kernel of its own: Hooke's kernels take that of any law as the strain that it
+belongs to (BranchModel.bearing_strain). Moduli of 21 numbers a point take a few times as long as
+Hooke's two.
+"""
+
+import numpy as np
+
+from limber.core.numerics.compiled import compiled
+from limber.mechanics.elements.stiffness import deformation, gather
+from limber.mechanics.elements.stiffness_pairs import LANES, scatter_block
+
+
+@compiled
+def moduli_stiffness(displacement, gradients, weights, moduli, nodes, slots, lengths, values):
+    """Add the integral of B^T C B [N/m] of all elements to ``values``, B the strain's change.
+
+    Args:
+        moduli: C by rows, 00 11 22 and shear angles 01 02 12 [Pa], shape [batch, q, 36, LANES].
+        displacement, gradients, weights, nodes, slots, lengths, values: See
+            limber.mechanics.elements.stiffness.
+    """
+    batch_count, point_count = weights.shape[0], weights.shape[1]
+    node_count = nodes.shape[1]
+    flat = gradients.reshape(batch_count, point_count, 3 * node_count * LANES)
+    local, F = np.empty(3 * node_count * LANES), np.empty(9 * LANES)
+    changes = np.empty((node_count, 18 * LANES))
+    stresses = np.empty((node_count, 18 * LANES))
+    blocks = np.empty((node_count * (node_count + 1) // 2, 9 * LANES))
+    for batch in range(batch_count):
+        gather(displacement, nodes[batch], local)
+        blocks[:] = 0.0
+        for q in range(point_count):
+            deformation(local, flat[batch, q], node_count, F)
+            for a in range(node_count):
+                _strain_changes(F, flat[batch, q, 3 * a * LANES:], changes[a])
+                _stress_changes(moduli[batch, q], weights[batch, q], changes[a], stresses[a])
+            pair = 0
+            for a in range(node_count):
+                for b in range(a + 1):
+                    _add_block(changes[a], stresses[b], blocks[pair])
+                    pair += 1
+        pair = 0
+        for a in range(node_count):
+            for b in range(a + 1):
+                scatter_block(blocks[pair], slots[batch, pair], lengths[batch, pair], a == b,
+                              values)
+                pair += 1
+
+
+@compiled
+def _strain_changes(F, gradients, out):
+    """Write how strain and shear angles change as a node moves along each axis, by axes."""
+    for i in range(3):
+        for l in range(LANES):
+            x, y, z = gradients[l], gradients[LANES + l], gradients[2 * LANES + l]
+            f0, f1 = F[3 * i * LANES + l], F[(3 * i + 1) * LANES + l]
+            f2 = F[(3 * i + 2) * LANES + l]
+            k = 6 * i * LANES + l
+            out[k] = f0 * x
+            out[k + LANES] = f1 * y
+            out[k + 2 * LANES] = f2 * z
+            out[k + 3 * LANES] = f0 * y + f1 * x
+            out[k + 4 * LANES] = f0 * z + f2 * x
+            out[k + 5 * LANES] = f1 * z + f2 * y
+
+
+@compiled
+def _stress_changes(moduli, weight, changes, out):
+    out[:] = 0.0
+    for i in range(3):
+        for row in range(6):
+            for column in range(6):
+                for l in range(LANES):
+                    out[(6 * i + row) * LANES + l] += (
+                        weight[l] * moduli[6 * row + column, l]
+                        * changes[(6 * i + column) * LANES + l])
+
+
+@compiled
+def _add_block(changes, stresses, block):
+    for j in range(3):
+        for i in range(3):
+            for k in range(6):
+                for l in range(LANES):
+                    block[(3 * j + i) * LANES + l] += (
+                        changes[(6 * i + k) * LANES + l] * stresses[(6 * j + k) * LANES + l])

@@ -1,0 +1,195 @@
+"""What a hyperelastic material law is: an energy, and what follows from it.
+
+A law is a subclass of :class:`MaterialLaw` with a name and an energy density:
+
+>>> from limber.mechanics.materials.law import MaterialLaw
+>>> class Cubic(MaterialLaw):
+...     name = "cubic"
+...     def energy(self, strain, lame_lambda, lame_mu):
+...         trace = strain[..., :3].sum(axis=-1)
+...         squares = (strain**2 @ [1.0, 1, 1, 2, 2, 2])
+...         return 0.5 * lame_lambda * (trace**2 + trace**3) + lame_mu * squares
+
+:func:`~limber.mechanics.materials.registry.register_material` makes it known by its name.
+Tensors are written in one row, 00 11 22 01 02 12.
+"""
+
+import numpy as np
+
+from limber.core.errors import InputError
+
+GREEN_STRAIN, NEO_HOOKE, SMALL_STRAIN = 0, 1, 2
+"""What the compiled kernels tell apart: Hooke's stress of the Green-Lagrange strain, the stable
+neo-Hookean stress, Hooke's stress of the small strain."""
+
+UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+MULTIPLICITY = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+"""How often a number of the row stands in the tensor; a shear angle is twice its strain."""
+_ONE_EACH = np.diag(1 / MULTIPLICITY)
+"""Strains that change by one each, or by one shear angle."""
+_IMAGINARY = 1e-30
+_STEP = 1e-6
+"""Of central differences: its square is as far below 1 as a difference's round-off."""
+_TRIED = 0.02
+"""Size of the strains at which a new law is checked."""
+
+
+class MaterialLaw:
+    """A hyperelastic law of the Green-Lagrange strain.
+
+    The energy must be linear in both Lamé coefficients together, so that all stiffness grows with
+    Young's modulus: estimates and sensitivities rest on that. A law's own constants are therefore
+    numbers without a unit. Arrays: ``strain`` has shape [..., 6]; ``lame_lambda`` and ``lame_mu``
+    [Pa] broadcast to [...].
+
+    Attributes:
+        name: How settings and commands call it.
+        is_linear: Small strains: a carried weight has no effect, nothing snaps.
+        is_hookean: The stress is lambda tr(E) 1 + 2 mu E of the law's strain.
+        has_cubic_force: The force is a cubic polynomial of the displacement; mixed-point Newton
+            and the reduced model rest on that.
+        is_compiled: The kernels compute it themselves. All others are computed by the methods
+            here, and Hooke's kernel takes their stress.
+        kernel: What the kernels compute: for a law that is not compiled, what takes its stress.
+        softening: What to tell a user who has compressed it too far; empty: nothing.
+    """
+
+    name: str
+    is_linear = False
+    is_hookean = False
+    has_cubic_force = False
+    is_compiled = False
+    kernel = GREEN_STRAIN
+    softening = ""
+
+    def energy(self, strain: np.ndarray, lame_lambda: np.ndarray,
+               lame_mu: np.ndarray) -> np.ndarray:
+        """Return the energy density [J/m^3], shape [...].
+
+        Where :meth:`stress` is not given too, it is differentiated by a complex step: the formula
+        must take complex strain and be analytic (no ``abs``, no comparison).
+        """
+        raise NotImplementedError
+
+    def stress(self, strain: np.ndarray, lame_lambda: np.ndarray,
+               lame_mu: np.ndarray) -> np.ndarray:
+        """Return the second Piola-Kirchhoff stress [Pa], shape [..., 6]; exact by default."""
+        return np.stack([
+            self.energy(strain + 1j * _IMAGINARY * step, lame_lambda, lame_mu).imag
+            for step in _ONE_EACH], axis=-1) / _IMAGINARY
+
+    def moduli(self, strain: np.ndarray, lame_lambda: np.ndarray,
+               lame_mu: np.ndarray) -> np.ndarray:
+        """Return the stress' derivative to 00 11 22 and the shear angles 01 02 12 [Pa].
+
+        Shape [..., 6, 6]. By default differences of the stress, to about ten digits.
+        """
+        changes = np.stack([
+            self.stress(strain + _STEP * step, lame_lambda, lame_mu)
+            - self.stress(strain - _STEP * step, lame_lambda, lame_mu)
+            for step in _ONE_EACH], axis=-1) / (2 * _STEP)
+        return 0.5 * (changes + np.swapaxes(changes, -1, -2))
+
+    def cauchy(self, gradient: np.ndarray, lame_lambda: np.ndarray,
+               lame_mu: np.ndarray) -> np.ndarray:
+        """Return the Cauchy stress [Pa] at a deformation gradient, both [..., 3, 3]."""
+        turned = np.swapaxes(gradient, -1, -2)
+        green = 0.5 * (turned @ gradient - np.eye(3))
+        row = self.stress(green[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+                          lame_lambda, lame_mu)
+        # The order in memory decides how products are summed, hence the last digits.
+        stress = np.ascontiguousarray(row[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]])
+        return gradient @ stress @ turned / np.linalg.det(gradient)[..., None, None]
+
+
+def hooke_stress(strain: np.ndarray, lame_lambda: np.ndarray,
+                 lame_mu: np.ndarray) -> np.ndarray:
+    """Return Hooke's stress lambda tr(E) 1 + 2 mu E [Pa]; arguments as a law's."""
+    trace = strain[..., :3].sum(axis=-1, keepdims=True)
+    return lame_lambda[..., None] * trace * UNIT + 2 * lame_mu[..., None] * strain
+
+
+def hooke_strain(stress: np.ndarray, lame_lambda: np.ndarray,
+                 lame_mu: np.ndarray) -> np.ndarray:
+    """Return the strain whose Hooke's stress [Pa] this is; arguments as a law's."""
+    trace = stress[..., :3].sum(axis=-1, keepdims=True)
+    spread = (lame_lambda / (3 * lame_lambda + 2 * lame_mu))[..., None] * trace
+    return (stress - spread * UNIT) / (2 * lame_mu[..., None])
+
+
+def contracted(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Return the double contraction of symmetric tensors [..., 6], shape [...]."""
+    product = one * two
+    return product[..., :3].sum(axis=-1) + 2 * product[..., 3:].sum(axis=-1)
+
+
+def right_cauchy_green(strain: np.ndarray) -> np.ndarray:
+    """Return C = 1 + 2 E, both [..., 6]."""
+    return 2 * strain + UNIT
+
+
+def cofactor(c: np.ndarray) -> np.ndarray:
+    """Return the cofactors of symmetric tensors [..., 6]: determinant times inverse."""
+    c00, c11, c22, c01, c02, c12 = np.moveaxis(c, -1, 0)
+    return np.stack([c11 * c22 - c12**2, c00 * c22 - c02**2, c00 * c11 - c01**2,
+                     c02 * c12 - c01 * c22, c01 * c12 - c02 * c11, c01 * c02 - c12 * c00], axis=-1)
+
+
+def determinant(c: np.ndarray) -> np.ndarray:
+    """Return the determinants of symmetric tensors [..., 6], shape [...]."""
+    return (c[..., [0, 3, 4]] * cofactor(c)[..., [0, 3, 4]]).sum(axis=-1)
+
+
+def is_hookean_at_rest(law: MaterialLaw) -> bool:
+    """Whether the law's moduli without strain are those of Young's modulus and Poisson's ratio."""
+    lam, mu = np.array(1.5), np.array(1.0)
+    hooke = np.stack([hooke_stress(step, lam, mu) for step in _ONE_EACH], axis=-1)
+    return bool(np.abs(law.moduli(np.zeros(6), lam, mu) - hooke).max() < 1e-6)
+
+
+def check_law(law: MaterialLaw) -> None:
+    """Try a law from outside at a few strains.
+
+    Raises:
+        InputError: it is stressed at rest, its derivatives are not those of its energy, it is
+            not linear in the Lamé coefficients, or it is unstable at rest.
+    """
+    rng = np.random.default_rng(0)
+    strain = _TRIED * rng.standard_normal((8, 6))
+    lam, mu, other = rng.uniform(1.0, 3.0, (3, 8))
+    energy = law.energy(strain, lam, mu)
+    if np.shape(energy) != (8,) or not np.isfinite(energy).all():
+        raise _wrong(law, f"gives an energy of shape {np.shape(energy)}, or not finite, for"
+                     " strains of shape (8, 6)", "Return one finite number a strain.")
+    rest = np.zeros((8, 6))
+    if np.abs(law.stress(rest, lam, mu)).max() > 1e-9 or np.abs(
+            law.energy(rest, lam, mu)).max() > 1e-9:
+        raise _wrong(law, "has energy or stress without strain",
+                     "Add the terms that make both 0 there.")
+    if not np.allclose(law.stress(strain, lam, mu), _slopes(law, strain, lam, mu), atol=1e-7):
+        raise _wrong(law, "gives a stress that is not the derivative of its energy",
+                     "Use no abs, conjugate or comparison of the strain in the energy, or give the"
+                     " stress; the derivative to a shear strain counts half.")
+    step = _STEP * strain / _TRIED
+    change = (law.stress(strain + step, lam, mu) - law.stress(strain - step, lam, mu)) / 2
+    if not np.allclose(np.einsum("nkl,nl->nk", law.moduli(strain, lam, mu), step * MULTIPLICITY),
+                       change, rtol=1e-4, atol=1e-12):
+        raise _wrong(law, "gives moduli that are not the derivative of its stress",
+                     "Their columns are derivatives to the shear angles, twice the shear strains.")
+    if not np.allclose(law.energy(strain, lam + 2 * other, mu + 2 * mu),
+                       energy + 2 * law.energy(strain, other, mu), rtol=1e-9, atol=1e-15):
+        raise _wrong(law, "is not linear in both Lamé coefficients",
+                     "Give its own constants as ratios to them.")
+    if np.linalg.eigvalsh(law.moduli(rest, lam, mu)).min() <= 0:
+        raise _wrong(law, "is not stable without strain", "Its moduli must be positive there.")
+
+
+def _slopes(law: MaterialLaw, strain: np.ndarray, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
+    return np.stack([(law.energy(strain + _STEP * step, lam, mu)
+                      - law.energy(strain - _STEP * step, lam, mu)) / (2 * _STEP)
+                     for step in _ONE_EACH], axis=-1)
+
+
+def _wrong(law: MaterialLaw, what: str, remedy: str) -> InputError:
+    return InputError(f"The material {law.name!r} {what}.",
+                      "Solvers would find other states than those of least energy.", remedy)

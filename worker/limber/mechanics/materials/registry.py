@@ -1,0 +1,74 @@
+"""Material laws by their names: those built in, and those from outside.
+
+A law from outside is known to a program that calls :func:`register_material`. An installed package
+makes its laws known to every command by the entry point group ``limber.materials``: a name, and
+where an object or class of :class:`~limber.mechanics.materials.law.MaterialLaw` stands. Nothing
+here is heavy before a law is asked for.
+"""
+
+import re
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING
+
+from limber.core.errors import InputError
+
+if TYPE_CHECKING:
+    from limber.mechanics.materials.law import MaterialLaw
+
+BUILT_IN = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")
+_GROUP = "limber.materials"
+_registered: dict[str, "MaterialLaw"] = {}
+
+
+def register_material(law: "MaterialLaw") -> "MaterialLaw":
+    """Make a law known by its name, instead of one from outside that had that name; return it.
+
+    Raises:
+        InputError: the name cannot be an option's value or is a built-in law's, the law says of
+            itself what only a built-in one is, or its methods do not fit together (see
+            :func:`limber.mechanics.materials.law.check_law`).
+    """
+    from limber.mechanics.materials.law import check_law
+
+    name = getattr(law, "name", "")
+    if not re.fullmatch(r"[a-z]\w*", name) or name in BUILT_IN:
+        raise InputError(f"A material cannot be called {name!r}.",
+                         "A name is of small letters, digits and _, and not a built-in one's.",
+                         "Choose another.")
+    if law.is_compiled or law.is_linear or law.is_hookean or law.has_cubic_force or law.kernel:
+        raise InputError(f"The material {name!r} takes itself for a built-in one.",
+                         "The kernels do not know it.", "Leave those attributes as they are.")
+    check_law(law)
+    _registered[name] = law
+    return law
+
+
+def material_names() -> tuple[str, ...]:
+    """Return the names of all laws; imports none of them."""
+    return tuple(dict.fromkeys((*BUILT_IN, *_registered, *entry_points(group=_GROUP).names)))
+
+
+def material_named(name: "str | MaterialLaw") -> "MaterialLaw":
+    """Return the law of that name; a law is returned as it is.
+
+    Raises:
+        InputError: there is none of that name, or a package's cannot be used.
+    """
+    if not isinstance(name, str):
+        return name
+    if name in BUILT_IN:
+        from limber.mechanics.materials.built_in import LAWS
+
+        return LAWS[BUILT_IN.index(name)]
+    if name in _registered:
+        return _registered[name]
+    for entry in entry_points(group=_GROUP, name=name):
+        found = entry.load()
+        law = found() if isinstance(found, type) else found
+        if law.name != name:
+            raise InputError(f"{entry.value} is called {law.name!r}, not {name!r}.",
+                             "Its entry point has another name.", "Give both the same name.")
+        return register_material(law)
+    raise InputError(f"There is no material {name!r}.", "It must be one of those known: "
+                     + ", ".join(material_names()) + ".",
+                     "Choose one, or register it (limber.mechanics.register_material).")

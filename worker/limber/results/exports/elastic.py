@@ -1,0 +1,21 @@
+"""Which material laws other programs can be told of."""
+
+from limber.core.errors import InputError
+from limber.mechanics.materials.law import MaterialLaw, is_hookean_at_rest
+
+
+def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = False) -> None:
+    """Refuse a law that Young's modulus and Poisson's ratio do not describe.
+
+    Args:
+        program: That is told these two numbers.
+        at_any_strain: Whether it computes large strains with them, too.
+
+    Raises:
+        InputError: the law is another.
+    """
+    if law.is_hookean or (not at_any_strain and is_hookean_at_rest(law)):
+        return
+    raise InputError(f"{program} has no material {law.name!r}.",
+                     "The file gives Young's modulus and Poisson's ratio, which are another law's.",
+                     "Export the branch with st_venant_kirchhoff.")
