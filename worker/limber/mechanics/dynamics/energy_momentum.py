@@ -135,10 +135,12 @@ class EnergyMomentumStepper(Stepper):
         model, law = self.model, self.model.material
         lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
         change = after - before
-        stress = law.stress(0.5 * (before + after), lam, mu)
-        size = contracted(change, change)
-        left = (law.energy(after, lam, mu) - law.energy(before, lam, mu)
-                - contracted(stress, change))
+        # A motion that grows without bound is found, and told, by its imbalance.
+        with np.errstate(over="ignore", invalid="ignore"):
+            size = contracted(change, change)
+            stress = law.stress(0.5 * (before + after), lam, mu)
+            left = (law.energy(after, lam, mu) - law.energy(before, lam, mu)
+                    - contracted(stress, change))
         part = np.where(size > _STRAIN_CHANGE**2, left / np.maximum(size, _STRAIN_CHANGE**2), 0.0)
         return hooke_strain(stress + part[..., None] * change, lam, mu)
 

@@ -67,16 +67,17 @@ class MaterialLaw:
         """Return the energy density [J/m^3], shape [...].
 
         Where :meth:`stress` is not given too, it is differentiated by a complex step: the formula
-        must take complex strain and be analytic (no ``abs``, no comparison).
+        must take complex strain and be analytic (no ``abs``, no comparison). A law that gives its
+        stress, too, is several times as fast.
         """
         raise NotImplementedError
 
     def stress(self, strain: np.ndarray, lame_lambda: np.ndarray,
                lame_mu: np.ndarray) -> np.ndarray:
         """Return the second Piola-Kirchhoff stress [Pa], shape [..., 6]; exact by default."""
-        return np.stack([
-            self.energy(strain + 1j * _IMAGINARY * step, lame_lambda, lame_mu).imag
-            for step in _ONE_EACH], axis=-1) / _IMAGINARY
+        steps = np.expand_dims(_ONE_EACH, tuple(range(1, np.ndim(strain))))
+        moved = self.energy(strain + 1j * _IMAGINARY * steps, lame_lambda, lame_mu)
+        return np.moveaxis(moved.imag, 0, -1) / _IMAGINARY
 
     def moduli(self, strain: np.ndarray, lame_lambda: np.ndarray,
                lame_mu: np.ndarray) -> np.ndarray:
