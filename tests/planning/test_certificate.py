@@ -12,8 +12,9 @@ from limber.planning.certificate.lower_bound import certify
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import among_obstacles
 from limber.planning.field.trust import TrustRegion
-from limber.planning.goals.goal import GraspGoal, TargetGoal
+from limber.planning.goals.grasp import GraspGoal
 from limber.planning.goals.regions import Ball
+from limber.planning.goals.target import TargetGoal
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle

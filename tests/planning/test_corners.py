@@ -11,7 +11,8 @@ from limber.planning.certificate.feasibility import judge
 from limber.planning.cost import CostWeights
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import GraspSamples, fit_field
-from limber.planning.goals.goal import GraspGoal, allowed_points
+from limber.planning.goals.allowed_poses import allowed_points
+from limber.planning.goals.grasp import GraspGoal
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem

@@ -12,7 +12,8 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_field
-from limber.planning.goals.goal import GraspGoal
+from limber.planning.goals.chosen import default_goal
+from limber.planning.goals.grasp import GraspGoal
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
@@ -107,7 +108,7 @@ def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
 def narrow(planned_branch):
     """The small branch's field, a goal on it, and the force that the goal takes."""
     field = EnergyField.read(planned_branch / "energy.npz")
-    goal = planning.default_goal(field, 0.01)
+    goal = default_goal(field, 0.01)
     return field, goal, float(np.linalg.norm(field.force(np.array([goal.position])), axis=1)[0])
 
 

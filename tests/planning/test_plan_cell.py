@@ -10,7 +10,7 @@ from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import region_of, require_taken
+from limber.stages.paths.plan_cell import places_in
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
@@ -112,14 +112,15 @@ def test_a_second_arm_reaches_as_far_as_it_can():
     """Its region is the ball about its shoulder; within it inverse kinematics decides."""
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)}, second_arm={
         "model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0)})
-    region = region_of(cell, PlanSettings(second_arm=True))
+    place = places_in(cell)["second_arm"]
+    region = place.region
     assert region.middle == pytest.approx([1.0, 0.0, 0.15185])
     assert 0.5 < region.radius < 0.6
-    require_taken(cell, np.array([1.0, 0.3, 0.3]))
+    place.require(np.array([1.0, 0.3, 0.3]))
     with pytest.raises(NoPathError, match="second arm"):
-        require_taken(cell, np.array([1.0, 0.9, 0.3]))
+        place.require(np.array([1.0, 0.9, 0.3]))
     with pytest.raises(NoPathError, match="directions"):
-        require_taken(cell, np.array([1.0, 0.0, 0.15]))
+        place.require(np.array([1.0, 0.0, 0.15]))
 
 
 def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):

@@ -21,9 +21,9 @@ from limber.core.errors import (
 from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals.goal import default_goal, hemisphere_goal
-from limber.planning.make_plan import _doubts
+from limber.planning.goals.chosen import default_goal, hemisphere_goal
 from limber.planning.path_on_full_model import resolve_path
+from limber.planning.plan_summary import doubts_of
 from limber.planning.two_paths import PlanSettings
 from limber.results.report.plan_figures import convergence, report_figures
 from limber.stages.paths.energy import EnergySettings, sample_energy_field
@@ -288,9 +288,9 @@ def test_a_field_too_coarse_for_the_asked_bound_is_told():
     summary = {"baseline": {"field_energy_error": 0.1, "length_m": 0.1},
                "plan": {"field_energy_error": 0.05, "length_m": 0.11},
                "certificate": {"gap_percent": 1.0}, "planner": "eikonal"}
-    told = _doubts(summary, 3.0)
+    told = doubts_of(summary, 3.0)
     assert len(told) == 1 and "5 %" in told[0] and "over the 3 %" in told[0]
-    assert _doubts(summary, 6.0) == []
+    assert doubts_of(summary, 6.0) == []
 
 
 def test_a_shortest_path_that_is_longer_is_named():
@@ -298,10 +298,10 @@ def test_a_shortest_path_that_is_longer_is_named():
     summary = {"baseline": {"field_energy_error": 0.0, "length_m": 0.028},
                "plan": {"field_energy_error": 0.0, "length_m": 0.0024},
                "certificate": {"gap_percent": 411.0}, "planner": "eikonal"}
-    wide, longer = _doubts(summary, 6.0)
+    wide, longer = doubts_of(summary, 6.0)
     assert "411.0 % more" in wide and "eikonal" not in wide
     assert "longer than the gentle one" in longer
-    assert "eikonal" in _doubts(summary | {"planner": "d-rrt-star"}, 6.0)[0]
+    assert "eikonal" in doubts_of(summary | {"planner": "d-rrt-star"}, 6.0)[0]
 
 
 @pytest.mark.slow

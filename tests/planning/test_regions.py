@@ -7,9 +7,12 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.planning.field.energy_field import fit_field
-from limber.planning.goals.goal import TargetGoal, goal_points
-from limber.planning.goals.regions import Ball, BoxRegion, View
-from limber.planning.make_plan import _goal
+from limber.planning.goals.allowed_poses import goal_points
+from limber.planning.goals.camera_view import View
+from limber.planning.goals.goal import GoalRequest
+from limber.planning.goals.kinds import goal_of
+from limber.planning.goals.regions import Ball, BoxRegion
+from limber.planning.goals.target import TargetGoal
 from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import plan_pair
 
@@ -97,4 +100,5 @@ def test_a_start_in_the_goal_stays_there(ridge_field):
 ])
 def test_goals_that_make_no_sense_are_refused(small_model, ridge_field, settings, words):
     with pytest.raises(InputError, match=words):
-        _goal(ridge_field, small_model, PlanSettings(**settings), None)
+        goal_of(GoalRequest(ridge_field, small_model, PlanSettings(**settings),
+                            ridge_field.limited(), {}))

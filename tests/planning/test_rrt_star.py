@@ -9,8 +9,11 @@ import pytest
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
 from limber.planning.cost import CostWeights, measure_path
-from limber.planning.goals.goal import GraspGoal, TargetGoal, default_goal, goal_points
+from limber.planning.goals.allowed_poses import goal_points
+from limber.planning.goals.chosen import default_goal
+from limber.planning.goals.grasp import GraspGoal
 from limber.planning.goals.regions import Ball
+from limber.planning.goals.target import TargetGoal
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import plan_path

@@ -11,15 +11,13 @@ from limber.planning.certificate.lower_bound import Certificate
 from limber.planning.constraints.limits import UNITS, Limits
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.goals.goal import (
-    Goal,
+from limber.planning.goals.allowed_poses import (
     GoalOverLimitsError,
-    GraspGoal,
     allowed_points,
     goal_points,
-    over_limits,
-    unit_doubt,
 )
+from limber.planning.goals.goal import Goal
+from limber.planning.goals.grasp import near
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
@@ -28,6 +26,7 @@ from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, found_again, plan_path
 from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
+from limber.planning.start import check_start
 
 _SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
 _AT_START = 1e-4  # [m] the approach ends that near
@@ -82,7 +81,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
         NoPathError: the goal cannot be reached; says why, and whether that is proven.
     """
     margins = limits.margins(field)
-    _check_start(field, start, limits.on(field))
+    check_start(field, start, limits.on(field))
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     # A start near its limit leaves room for a part of the margins only.
@@ -144,8 +143,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         InputError: the start is not allowed.
         NoPathError: the goal cannot be reached; says why, and whether that is proven.
     """
-    limits = limits or limits_of(field, settings)
-    _check_start(field, start, limits)
+    limits = limits or Limits.of(settings).on(field)
+    check_start(field, start, limits)
     if goal.distance(field, start[None])[0] <= goal.tolerance:
         return _staying(field, start, goal, settings, limits, beyond)
     nobody: GoalOverLimitsError | None = None
@@ -279,7 +278,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
         return field.rest[None]
     cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
                                deformation=max(settings.deformation_weight, 1.0))
-    there = GraspGoal(tuple(map(float, start)), _AT_START)
+    there = near(start, _AT_START)
     way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there,
                         beyond=problem.beyond)
     line = np.linspace(field.rest, start, 40)
@@ -297,11 +296,6 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     return np.concatenate([points, start[None]])
 
 
-def limits_of(field: EnergyField, settings: PlanSettings) -> FieldArrays:
-    """Return the field's arrays with the settings' limits; none given means no limit."""
-    return Limits.of(settings).on(field)
-
-
 def chosen_engine(engine: str) -> str:
     """Return ``ompl`` or ``own`` for the setting.
 
@@ -311,40 +305,3 @@ def chosen_engine(engine: str) -> str:
     if engine == "auto":
         return "own" if ompl_missing() else "ompl"
     return engine
-
-
-def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: int) -> np.ndarray:
-    """Return a random deformed configuration far from rest and from the goal, shape [3].
-
-    The paper's trials start from "randomized initial configurations"; it does not say how they
-    were drawn. Here: uniform over the allowed region, at least half the largest deflection away
-    from rest, and outside the goal by as much.
-
-    Raises:
-        NoPathError: no such configuration was found.
-    """
-    generator = np.random.default_rng([seed, 7])
-    points = field.region.draw(4000, generator)
-    half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
-    fit = np.linalg.norm(points - field.rest, axis=1) >= half
-    fit &= goal.distance(field, points) >= half
-    fit &= allowed_points(points, limits_of(field, settings))
-    if not fit.any():
-        raise NoPathError("No deformed start lies far from rest, far from the goal and allowed.",
-                          f"Far is {half:.3f} m.", "Give a --start, or relax the limits.")
-    return points[np.flatnonzero(fit)[0]]
-
-
-def _check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> None:
-    if allowed_points(start[None], limits)[0]:
-        return
-    place = ", ".join(f"{value:.3f}" for value in start)
-    if not field.region.contains(start)[0]:
-        away = float(np.linalg.norm(start - field.rest))
-        raise InputError(f"The start ({place}) m lies outside the sampled region"
-                         f"{unit_doubt(away, field)}.",
-                         "The branch's energy is not known there.",
-                         "Choose a start nearer to rest, or sample farther (`limber energy "
-                         "--deflection`).")
-    raise InputError(f"At the start {over_limits(field, start[None], limits)}.",
-                     "A start must keep the limits.", "Raise the limit, or choose another start.")

@@ -10,7 +10,8 @@ from limber.planning.constraints.limits import UNITS, Limits, sizes
 from limber.planning.cost import STEP, resample
 from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.goal import Goal, GraspGoal
+from limber.planning.goals.goal import Goal
+from limber.planning.goals.grasp import near
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.problem import NoWayError
@@ -37,7 +38,7 @@ def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarra
     approach = field.rest[None]
     if np.linalg.norm(start - field.rest) >= STEP:
         there = easiest_way(field, limits.on(field), field.rest.copy(),
-                            GraspGoal(tuple(map(float, start)), STEP))
+                            near(start, STEP))
         approach = approach if there is None else np.concatenate([there.points, start[None]])
     solved = resolve_path(grasp_model, resample(way.points, STEP), approach, progress)
     found = learnt(field, grasp_model, solved, limits)

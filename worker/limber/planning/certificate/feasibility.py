@@ -26,7 +26,7 @@ from limber.planning.cost import resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import LOADS, FieldArrays
 from limber.planning.field.trust import nearest_of
-from limber.planning.goals.goal import allowed_points
+from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.problem import GentleProblem
 
 _ALONG, _ACROSS = 20, 40  # cells along the shell, each way, and off it

@@ -7,7 +7,7 @@ import numpy as np
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.goal import Goal, TargetGoal
+from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 
 _APART = 0.01  # [m] between states of a path that become samples
@@ -36,10 +36,10 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
     told = told[:1] + ([f"and at {len(told) - 1} more poses"] if len(told) > 1 else [])
     whole = path.approach.joined(path.solved)
     told += [str(broken) for broken in limits.broken(whole)]
-    if path.is_whole and isinstance(goal, TargetGoal):
+    if path.is_whole:
         off = goal.missed_by(path.solved)
         if off > goal.tolerance * _SLACK:
-            told.append(f"the {goal.name} ends {1e3 * off:.1f} mm outside its goal")
+            told.append(f"{goal.what} ends {1e3 * off:.1f} mm outside its goal")
     if met := limits.met(whole, nodes):
         told.append(met)
     return told

@@ -1,4 +1,4 @@
-"""Regions of space that a place on the branch may be brought into: a ball, a box, a camera's view.
+"""Regions of space that a place on the branch may be brought into.
 
 Each has a signed distance: negative inside, and outside at most the true one.
 """
@@ -60,7 +60,7 @@ class Ball:
         return {"position_m": list(map(float, self.centre)), "tolerance_m": self.radius}
 
 
-class _Convex:
+class Convex:
     """What is below planes ``n . x + c`` with unit normals; ``planes`` [k, 4]."""
 
     planes: np.ndarray
@@ -83,7 +83,7 @@ class _Convex:
 
 
 @dataclass(frozen=True)
-class BoxRegion(_Convex):
+class BoxRegion(Convex):
     """The box from ``low`` to ``high`` [m]."""
 
     low: tuple[float, float, float]
@@ -102,62 +102,6 @@ class BoxRegion(_Convex):
 
     def describe(self) -> dict:
         return {"low_m": list(map(float, self.low)), "high_m": list(map(float, self.high))}
-
-
-@dataclass(frozen=True)
-class View(_Convex):
-    """What a pinhole camera sees within a range of distances along its axis.
-
-    Attributes:
-        frame: The camera's in the branch's: x right, y down, z ahead, shape [4, 4].
-        slopes: x / z and y / z at the picture's borders: left, right, top, bottom.
-        range_m: Least and greatest z [m].
-    """
-
-    frame: np.ndarray
-    slopes: tuple[float, float, float, float]
-    range_m: tuple[float, float]
-
-    @property
-    def planes(self) -> np.ndarray:
-        left, right, top, bottom = self.slopes
-        near, far = self.range_m
-        own = np.array([[-1, 0, left, 0], [1, 0, -right, 0], [0, -1, top, 0], [0, 1, -bottom, 0],
-                        [0, 0, -1, near], [0, 0, 1, -far]], float)
-        own /= np.linalg.norm(own[:, :3], axis=1, keepdims=True)
-        normals = own[:, :3] @ self.frame[:3, :3].T
-        return np.column_stack([normals, own[:, 3] - normals @ self.frame[:3, 3]])
-
-    @property
-    def corners(self) -> np.ndarray:
-        left, right, top, bottom = self.slopes
-        own = np.array([[x * z, y * z, z] for z in self.range_m for x in (left, right)
-                        for y in (top, bottom)])
-        return own @ self.frame[:3, :3].T + self.frame[:3, 3]
-
-    def describe(self) -> dict:
-        return {"camera_m": self.frame[:3, 3].tolist(), "axis": self.frame[:3, 2].tolist(),
-                "range_m": list(self.range_m)}
-
-    def hidden_by(self, triangles: np.ndarray, place: np.ndarray, slack: float) -> bool:
-        """Return whether a surface lies between the camera and ``place`` [3].
-
-        ``triangles`` are [f, 3, 3]; what is within ``slack`` [m] of the place is the place's own.
-        Moeller and Trumbore 1997.
-        """
-        eye = self.frame[:3, 3]
-        way = np.asarray(place, float) - eye
-        first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-        across = np.cross(way, second)
-        volume = np.einsum("ij,ij->i", first, across)
-        safe = np.where(np.abs(volume) > 1e-30, volume, np.inf)
-        to_eye = eye - triangles[:, 0]
-        u = np.einsum("ij,ij->i", to_eye, across) / safe
-        turned = np.cross(to_eye, first)
-        v = (turned @ way) / safe
-        t = np.einsum("ij,ij->i", second, turned) / safe
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-        return bool((hit & (t < 1.0 - slack / np.linalg.norm(way))).any())
 
 
 def ball(count: int, generator: np.random.Generator) -> np.ndarray:

@@ -31,7 +31,7 @@ from limber.store import Branch, Stage
 if TYPE_CHECKING:
     from limber.planning.constraints.limits import Limits
     from limber.planning.field.grasp_model import GraspModel
-    from limber.planning.goals.regions import Region
+    from limber.planning.goals.goal import CellPlace
     from limber.planning.make_plan import PlannedMotion
     from limber.planning.plan_file import Way
     from limber.planning.timing import Pace
@@ -79,7 +79,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.make_plan import plan_motion
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
-    from limber.stages.paths.plan_cell import reached_by, require_taken
+    from limber.stages.paths.plan_cell import reached_by
     from limber.stages.paths.plan_uncertainty import young_doubt
     from limber.store.loading import known_damping, load_grasp_model
 
@@ -109,7 +109,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     doubt = None if settings.confidence is None else young_doubt(branch, grasp_model, asked)
     in_cell = None
     if cell_file is not None:
-        in_cell = _InCell.of(branch, cell_file, settings, asked, progress)
+        in_cell = _InCell.of(branch, cell_file, asked, progress)
         digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
     reads = ["energy.npz"]
@@ -126,7 +126,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         if in_cell is not None:
             pace = in_cell.slowed(pace)
         found = plan_motion(field, grasp_model, settings, limits=limits,
-                            region=None if in_cell is None else in_cell.region, doubt=doubt,
+                            cell=None if in_cell is None else in_cell.places, doubt=doubt,
                             pace=pace, workers=workers, progress=progress)
         if found.summary["stopped"]:
             progress = progress.to_the_end()
@@ -137,8 +137,6 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
-            if settings.second_arm:
-                require_taken(in_cell.cell, np.array(found.summary["target_end_m"]))
             found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
                                                 limits.obstacles, pace.speed)
         progress(0.95, "writing")
@@ -166,17 +164,15 @@ class _InCell:
 
     cell: Cell
     limits: Limits
-    region: Region | None
+    places: dict[str, CellPlace]
 
     @classmethod
-    def of(cls, branch: Branch, path: Path, settings: PlanSettings, limits: Limits,
-           progress: Progress) -> _InCell:
-        from limber.stages.paths.plan_cell import cell_for, cell_obstacles, limits_in, region_of
+    def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress) -> _InCell:
+        from limber.stages.paths.plan_cell import cell_for, cell_obstacles, limits_in, places_in
 
         cell = cell_for(branch, path, progress)
         return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)),
-                   region_of(cell, settings))
-
+                   places_in(cell))
 
     def slowed(self, pace: Pace) -> Pace:
         """Return the pace, no faster than the cell allows."""
@@ -187,13 +183,15 @@ class _InCell:
     def check_goal(self, settings: PlanSettings) -> None:
         """Raise NoPathError where the goal that is given lies inside an obstacle."""
         from limber.planning.constraints.obstacles import closest
+        from limber.planning.goals.kinds import asked_kinds
 
-        goal = settings.goal or settings.tip_goal
-        hit = goal and closest(self.limits.obstacles, np.array([goal], float))
-        if hit:
-            raise NoPathError(f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
-                              "Nothing can be brought there.",
-                              "Choose another goal, or correct the obstacle in the cell file.")
+        for place in (kind.place(settings) for kind in asked_kinds(settings)):
+            hit = place and closest(self.limits.obstacles, np.array([place], float))
+            if hit:
+                raise NoPathError(
+                    f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
+                    "Nothing can be brought there.",
+                    "Choose another goal, or correct the obstacle in the cell file.")
 
 
 def _stiffer(branch: Branch) -> float:

@@ -1,5 +1,6 @@
 """What a robot's cell asks of a plan: its workspace, its obstacles, and that the arm reaches."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,12 @@ from limber.geometry.io.surfaces import usable_surface
 from limber.geometry.surface.surface import Surface
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
-from limber.planning.goals.regions import Ball, Region, View
+from limber.planning.goals.camera_view import View
+from limber.planning.goals.goal import CellPlace
+from limber.planning.goals.regions import Ball
 from limber.planning.plan_file import Way
-from limber.planning.settings import PlanSettings
 from limber.robot.cell.arm_shape import rods_of
-from limber.robot.cell.cell import BoxEntry, Cell, read_cell
+from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
 from limber.robot.motion.execution import Blocked, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
@@ -70,22 +72,22 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
     return tuple(found)
 
 
-def region_of(cell: Cell, settings: PlanSettings) -> Region | None:
-    """Return what the settings ask of the cell: its camera's view or its second arm's reach."""
-    if settings.in_view:
-        return _view_of(cell)
-    if not settings.second_arm or cell.second_arm is None:
-        return None
-    arm = arm_named(cell.second_arm.model)
-    shoulder = (matrices(np.array(cell.second_arm.base_pose)) @ [0.0, 0.0, arm.d[0], 1.0])[:3]
-    x, y, z = map(float, shoulder)
-    return Ball((x, y, z), arm.reach)
+def places_in(cell: Cell) -> dict[str, CellPlace]:
+    """Return what goals may ask of the cell: its camera's view and its second arm's reach."""
+    found = {}
+    if (view := _view_of(cell)) is not None:
+        found["in_view"] = CellPlace(view)
+    if cell.second_arm is not None:
+        arm = arm_named(cell.second_arm.model)
+        shoulder = matrices(np.array(cell.second_arm.base_pose)) @ [0.0, 0.0, arm.d[0], 1.0]
+        x, y, z = map(float, shoulder[:3])
+        found["second_arm"] = CellPlace(Ball((x, y, z), arm.reach),
+                                        partial(require_taken, cell.second_arm))
+    return found
 
 
-def require_taken(cell: Cell, place: np.ndarray) -> None:
+def require_taken(entry: SecondArmEntry, place: np.ndarray) -> None:
     """Raise NoPathError where the second arm can take nothing at ``place`` [3] from any side."""
-    entry = cell.second_arm
-    assert entry is not None
     arm = arm_named(entry.model)
     turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
     frames = np.tile(np.eye(4), (_TURNS, 1, 1))

@@ -1,0 +1,106 @@
+"""A kind of goal from outside: one file, with its own setting, planned to as any other."""
+
+import json
+import shutil
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from limber.core.errors import InputError, NoPathError
+from limber.core.settings import Groups
+from limber.planning.goals.goal import GoalKind
+from limber.planning.goals.kinds import KINDS
+from limber.planning.plan_file import read_plan
+from limber.planning.settings import PlanSettings
+from limber.results.scene.paths import _goal as drawn
+from limber.stages.paths.plan import plan as plan_paths
+
+
+class SideSettings(PlanSettings):
+    """Those of a plan, and how far to the side."""
+
+    groups: ClassVar[Groups] = {"start and goal": ("goal_side",)}
+    goal_side: float | None = Field(None, description="How far along x the grasp shall be [m].")
+
+
+@dataclass(frozen=True)
+class SideGoal:
+    """The grasp within ``tolerance`` [m] of the plane at ``x`` [m]."""
+
+    x: float
+    tolerance: float
+    what = "the grasp"
+
+    def distance(self, field, points):
+        return np.abs(np.asarray(points)[:, 0] - self.x)
+
+    def doubt(self, field):
+        return 0.0
+
+    def guess(self, field, count, generator):
+        drawn = field.region.draw(20 * count, generator)
+        return drawn[self.distance(field, drawn) <= self.tolerance][:count]
+
+    def centre(self, field):
+        points = self.guess(field, 200, np.random.default_rng(0))
+        return points[np.argmin(field.energy(points))]
+
+    def missed_by(self, states):
+        return abs(states.poses[-1, 0] - self.x) - self.tolerance
+
+    def drawn_in(self, states):
+        return self
+
+    def require_end(self, grasp_model, states):
+        if states.energies[-1] > 1.0:
+            raise NoPathError("The branch is bent too far there.", "", "")
+
+    def describe(self):
+        return {"kind": "side", "x_m": self.x, "position_m": [self.x, 0.0, 0.4],
+                "tolerance_m": self.tolerance}
+
+    def describe_end(self, states):
+        return {"side_end_m": states.poses[-1, 0]}
+
+
+@pytest.fixture
+def side():
+    """The kind, known while a test runs."""
+    kind = GoalKind("goal_side", lambda asked: SideGoal(
+        asked.settings.goal_side, asked.settings.goal_tolerance))
+    KINDS.append(kind)
+    yield kind
+    KINDS.remove(kind)
+
+
+@pytest.mark.usefixtures("side", "coarse_bound")
+def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
+    """The stage plans to it; the end is in it on the full model, no path costs less than the bound
+    says, and file and picture show it."""
+    folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
+    rest = read_plan(folder / "plans/there.json").motion.poses[0]
+    settings = SideSettings(goal_side=rest[0] + 0.08, iterations=100, field_error=20.0)
+    done = plan_paths(folder, settings, name="side", workers=1)
+    told = json.loads((folder / "plans/side.json").read_text())
+    assert told["goal"] == {"kind": "side", "x_m": settings.goal_side, "chosen": False,
+                            "position_m": [settings.goal_side, 0.0, 0.4], "tolerance_m": 0.01}
+    assert abs(told["plan"]["poses"][-1][0] - settings.goal_side) <= 0.01 * 1.001
+    assert told["side_end_m"] == told["plan"]["poses"][-1][0]
+    bound = done["certificate"]
+    assert 0.0 < bound["lower_bound"] <= bound["upper_bound"]
+    assert bound["full_model"]["lower_bound"] <= bound["full_model"]["cost"]
+    assert read_plan(folder / "plans/side.json").summary["goal"]["kind"] == "side"
+    assert drawn(told["goal"], None)["kind"] == "side"
+    assert plan_paths(folder, settings, name="side") == done
+
+
+@pytest.mark.usefixtures("side")
+def test_it_is_refused_beside_another_goal(planned_branch):
+    """By the name of its option, as any two; a target needs one that is of a target."""
+    for more, words in (({"goal": (0, 0, 1)}, "--goal and --goal-side"),
+                        ({"target": "flower"}, "without a place")):
+        with pytest.raises(InputError, match=words):
+            plan_paths(planned_branch, SideSettings(goal_side=0.1, **more), name="bad")

@@ -1,0 +1,94 @@
+"""Poses of a goal that keep the limits; and what is said where there are none."""
+
+import numpy as np
+
+from limber.core.errors import NoPathError
+from limber.core.numerics.compiled import compiled
+from limber.planning.field.energy_field import (
+    LOADS,
+    EnergyField,
+    FieldArrays,
+    allowed_at,
+    energy_at,
+)
+from limber.planning.goals.goal import Goal
+
+_MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
+
+
+class GoalOverLimitsError(NoPathError):
+    """None of the poses that were drawn in the goal region keeps the limits."""
+
+
+def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: int = 200,
+                seed: int = 0) -> np.ndarray:
+    """Return allowed grasp positions in the goal region, at most ``count``, shape [n, 3].
+
+    Raises:
+        NoPathError: the region is out of reach. GoalOverLimitsError: none was drawn that keeps the
+            limits; in a narrow valley one may.
+    """
+    points = goal.guess(field, count, np.random.default_rng(seed))
+    reached = points[goal.distance(field, points) <= goal.tolerance]
+    trusted = reached[field.region.contains(reached)]
+    if len(trusted) == 0:
+        raise _out_of_reach(goal, field, seed)
+    allowed = trusted[allowed_points(trusted, limits)]
+    if len(allowed) == 0:
+        raise GoalOverLimitsError(
+            f"No pose in the goal region keeps the limits: {over_limits(field, trusted, limits)}.",
+            f"{len(trusted)} poses in it were drawn.",
+            "Raise the limit (--max-energy, --max-force and others, the workspace), or choose a "
+            "goal nearer to the rest pose.")
+    return np.ascontiguousarray(allowed)
+
+
+def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
+    """Return in words which limits none of ``points`` [n, 3] keeps, and by how much."""
+    outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
+    found = [("energy", field.energy(points), limits.max_energy, " J"),
+             ("force", np.linalg.norm(field.force(points), axis=1), limits.max_force, " N")]
+    found += [(name.replace("_", " "), np.abs(field.load(points, name)), limit, unit)
+              for name, limit, unit in zip(LOADS, limits.max_loads, ("", " Pa", " N", " Nm", ""),
+                                           strict=True) if limit < np.inf]
+    told = [f"the {name} is at least {values.min():.3g}{unit} where {limit:.3g}{unit} is allowed"
+            for name, values, limit, unit in found if values.min() > limit]
+    if outside.min() > 0.0:
+        told.append(f"the workspace is {outside.min():.3f} m away"
+                    + unit_doubt(outside.min(), field))
+    return " and ".join(told) or "each pose breaks one or the other"
+
+
+@compiled
+def allowed_points(points: np.ndarray, limits: FieldArrays) -> np.ndarray:
+    """Return whether each of ``points`` [n, 3] is trusted and within the limits, bool [n]."""
+    allowed = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        allowed[i] = allowed_at(points[i], energy_at(points[i], limits), limits)
+    return allowed
+
+
+def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
+    points = field.region.draw(2000, np.random.default_rng(seed))
+    distance = goal.distance(field, points)
+    nearest = points[np.argmin(distance)]
+    place = ", ".join(f"{value:.3f}" for value in nearest)
+    return NoPathError(
+        f"No sampled pose brings {goal.what} to the goal; the nearest misses it by "
+        f"{distance.min():.3f} m, with the grasp at ({place})"
+        f"{unit_doubt(float(distance.min()), field)}.",
+        f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
+        f"{_place(field.region.low)} to {_place(field.region.high)}.",
+        "Choose a goal nearer to that, widen --goal-tolerance, or sample farther (`limber "
+        "energy --deflection`).")
+
+
+def unit_doubt(off: float, field: EnergyField) -> str:
+    """Return words of doubt about the unit where something is so far ``off`` [m] that it can hardly
+    be in metres; nothing else."""
+    size = float(np.linalg.norm(field.region.high - field.region.low))
+    return " (in millimetres? Lengths are in metres)" if off > _MILLIMETRES * size else ""
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.3f}" for value in point) + ")"

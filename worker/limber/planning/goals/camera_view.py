@@ -1,0 +1,96 @@
+"""The target in the view of the cell's camera: ``--in-view``."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError, NoPathError
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.goals.goal import GoalKind, GoalRequest
+from limber.planning.goals.regions import Convex
+from limber.planning.goals.target import TargetGoal, target_of
+from limber.planning.path_on_full_model import SolvedPoses
+
+_OWN = 0.003  # [m] of the surface about a target that does not hide it
+
+
+@dataclass(frozen=True)
+class View(Convex):
+    """What a pinhole camera sees within a range of distances along its axis.
+
+    Attributes:
+        frame: The camera's in the branch's: x right, y down, z ahead, shape [4, 4].
+        slopes: x / z and y / z at the picture's borders: left, right, top, bottom.
+        range_m: Least and greatest z [m].
+    """
+
+    frame: np.ndarray
+    slopes: tuple[float, float, float, float]
+    range_m: tuple[float, float]
+
+    @property
+    def planes(self) -> np.ndarray:
+        left, right, top, bottom = self.slopes
+        near, far = self.range_m
+        own = np.array([[-1, 0, left, 0], [1, 0, -right, 0], [0, -1, top, 0], [0, 1, -bottom, 0],
+                        [0, 0, -1, near], [0, 0, 1, -far]], float)
+        own /= np.linalg.norm(own[:, :3], axis=1, keepdims=True)
+        normals = own[:, :3] @ self.frame[:3, :3].T
+        return np.column_stack([normals, own[:, 3] - normals @ self.frame[:3, 3]])
+
+    @property
+    def corners(self) -> np.ndarray:
+        left, right, top, bottom = self.slopes
+        own = np.array([[x * z, y * z, z] for z in self.range_m for x in (left, right)
+                        for y in (top, bottom)])
+        return own @ self.frame[:3, :3].T + self.frame[:3, 3]
+
+    def describe(self) -> dict:
+        return {"camera_m": self.frame[:3, 3].tolist(), "axis": self.frame[:3, 2].tolist(),
+                "range_m": list(self.range_m)}
+
+    def hidden_by(self, triangles: np.ndarray, place: np.ndarray, slack: float) -> bool:
+        """Return whether a surface lies between the camera and ``place`` [3].
+
+        ``triangles`` are [f, 3, 3]; what is within ``slack`` [m] of the place is the place's own.
+        Moeller and Trumbore 1997.
+        """
+        eye = self.frame[:3, 3]
+        way = np.asarray(place, float) - eye
+        first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+        across = np.cross(way, second)
+        volume = np.einsum("ij,ij->i", first, across)
+        safe = np.where(np.abs(volume) > 1e-30, volume, np.inf)
+        to_eye = eye - triangles[:, 0]
+        u = np.einsum("ij,ij->i", to_eye, across) / safe
+        turned = np.cross(to_eye, first)
+        v = (turned @ way) / safe
+        t = np.einsum("ij,ij->i", second, turned) / safe
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+        return bool((hit & (t < 1.0 - slack / np.linalg.norm(way))).any())
+
+
+@dataclass(frozen=True)
+class SeenGoal(TargetGoal):
+    """A target in a camera's view, and not behind the branch."""
+
+    region: View
+
+    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
+        nodes = grasp_model.mesh.nodes + states.displacements[-1]
+        if self.region.hidden_by(nodes[grasp_model.mesh.surface_faces()], self.place(states),
+                                 _OWN):
+            raise NoPathError(
+                f"At the path's end the branch hides {self.what} from the camera.",
+                "Limber checks the line of sight at a path's end, but cannot plan for it yet.",
+                "Choose a --target-box on the camera's side, or move the camera.")
+
+
+def _in_view(asked: GoalRequest) -> SeenGoal:
+    if "in_view" not in asked.cell:
+        raise InputError("--in-view is given, but no cell with a [camera] that stands still.",
+                         "The cell file says where it stands.", "Give --cell with one.")
+    return SeenGoal(asked.cell["in_view"].region, *target_of(asked))
+
+
+IN_VIEW = GoalKind("in_view", _in_view, is_of_target=True)

@@ -1,0 +1,68 @@
+"""A grasp pose that is chosen: drawn from the paper's hemisphere, ``--goal-seed``, or a far one."""
+
+import numpy as np
+
+from limber.core.errors import NoPathError
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.goals.allowed_poses import allowed_points
+from limber.planning.goals.goal import GoalKind, GoalRequest
+from limber.planning.goals.grasp import GraspGoal, near
+from limber.planning.goals.regions import ball
+
+
+def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
+    """Return a goal worth planning for: far from rest, and reached without force.
+
+    Of the samples deflected by over three quarters of the largest deflection, the one with the
+    least energy, drawn a little towards the rest pose so that the region lies where the field is
+    trusted. The trusted region is a shell, often thinner than the tolerance: what counts is how
+    much of the goal lies in it along the shell.
+    """
+    chart = field.region.chart.plain
+    samples = chart.map(field.samples.positions)
+    rest = chart.map(field.rest)[0]
+    away = np.linalg.norm(field.samples.positions - field.rest, axis=1)
+    far = np.flatnonzero(away >= 0.75 * away.max())
+    around = ball(100, np.random.default_rng(0)) * tolerance
+    if chart.radius > 0.0:
+        around[:, 2] = 0.0
+    for index in far[np.argsort(field.samples.energies[far])]:
+        for shrink in (1.0, 0.95, 0.9, 0.85):
+            centre = rest + shrink * (samples[index] - rest)
+            position = chart.curved(centre[None])[0]
+            if (field.region.contains(chart.curved(centre + around)).mean() > 0.5
+                    and field.region.contains(position)[0]):
+                return near(position, tolerance)
+    raise NoPathError("No far pose lies well inside the sampled region.",
+                      f"Too few of {len(away)} accepted samples are far from the rest pose.",
+                      "Sample more poses with `limber energy --samples`, or name a --goal.")
+
+
+def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,
+                    tolerance: float, seed: int) -> GraspGoal:
+    """Return a goal as the paper draws its candidates: evenly from the half ball above the branch's
+    ``base`` [m] with its ``length`` [m] as radius; of those, one that the field knows, that keeps
+    the limits and lies at least half the largest deflection away from rest.
+
+    Raises:
+        NoPathError: no such pose was found.
+    """
+    points = field.region.draw(4000, np.random.default_rng([seed, 13]))
+    half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
+    fit = (np.linalg.norm(points - base, axis=1) <= length) & (points[:, 2] >= base[2])
+    fit &= np.linalg.norm(points - field.rest, axis=1) >= half
+    fit &= allowed_points(points, limits)
+    if not fit.any():
+        raise NoPathError("No pose of the hemisphere lies far from rest and keeps the limits.",
+                          f"Far is {half:.3f} m; the hemisphere's radius is {length:.3f} m.",
+                          "Give a --goal, or relax the limits.")
+    return near(points[np.flatnonzero(fit)[0]], tolerance)
+
+
+def _drawn(asked: GoalRequest) -> GraspGoal:
+    reach, settings = asked.grasp_model.reach, asked.settings
+    return hemisphere_goal(asked.field, reach.base, reach.arc_length, asked.limits,
+                           settings.goal_tolerance, settings.goal_seed)
+
+
+DRAWN = GoalKind("goal_seed", _drawn)

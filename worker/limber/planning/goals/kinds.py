@@ -1,0 +1,40 @@
+"""The kinds of goals, and the one that a plan's settings ask for."""
+
+from limber.core.errors import InputError
+from limber.planning.goals.camera_view import IN_VIEW
+from limber.planning.goals.chosen import DRAWN, default_goal
+from limber.planning.goals.goal import Goal, GoalKind, GoalRequest
+from limber.planning.goals.grasp import AT_PLACE
+from limber.planning.goals.second_arm import SECOND_ARM
+from limber.planning.goals.target import IN_BALL, IN_BOX
+from limber.planning.settings import PlanSettings
+
+KINDS = [AT_PLACE, IN_BALL, IN_BOX, IN_VIEW, SECOND_ARM, DRAWN]
+"""A kind from outside is appended to it."""
+
+
+def asked_kinds(settings: PlanSettings) -> list[GoalKind]:
+    """Return the kinds of goals that settings ask for."""
+    return [kind for kind in KINDS if kind.is_asked(settings)]
+
+
+def goal_of(request: GoalRequest) -> Goal:
+    """Return the goal that is asked for; a far pose where none is.
+
+    Raises:
+        InputError: two are asked for, or one that makes no sense.
+        NoPathError: there is no far pose.
+    """
+    settings = request.settings
+    asked = asked_kinds(settings)
+    if len(asked) > 1:
+        raise InputError(f"{' and '.join(kind.option for kind in asked)} are given.",
+                         "A path ends in one goal.", "Give one of them.")
+    if settings.target is not None and not any(kind.is_of_target for kind in asked):
+        *others, last = [kind.option for kind in KINDS if kind.is_of_target]
+        raise InputError(f"--target {settings.target} is given without a place for it.",
+                         "A target alone says not where it shall be.",
+                         f"Give {', '.join(others)} or {last} as well.")
+    if not asked:
+        return default_goal(request.field, settings.goal_tolerance)
+    return asked[0].make(request)

@@ -1,0 +1,140 @@
+"""A place on the branch, its tip or a named target, in a region: ``--tip-goal``, ``--target-box``.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.goals.goal import GoalKind, GoalRequest
+from limber.planning.goals.regions import Ball, BoxRegion, Region
+from limber.planning.path_on_full_model import SolvedPoses
+
+
+@dataclass(frozen=True)
+class TargetGoal:
+    """A place on the branch within a region of space.
+
+    Attributes:
+        region: Where it shall be.
+        target: Number of the named target; None: the branch's tip.
+        name: Of the target.
+        inset: What plans stay off the region's outside by [m]: as far as the field was off there.
+    """
+
+    region: Region
+    target: int | None = None
+    name: str = "tip"
+    inset: float = 0.0
+
+    @property
+    def tolerance(self) -> float:
+        """Distance of the region's middle from its outside [m]."""
+        return self.region.depth
+
+    @property
+    def what(self) -> str:
+        return f"the {self.name}"
+
+    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        outside = self.region.distance(field.tip(points, self.target))
+        return outside + self.tolerance + self.inset
+
+    def doubt(self, field: EnergyField) -> float:
+        return self.inset + field.place_error(self.target)
+
+    def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
+        # A small region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
+        # Who is in it already stays: in a large one a walk may lead out of the samples.
+        drawn = field.region.draw(20 * count, generator)
+        distance = self.distance(field, drawn)
+        points = drawn[distance <= self.tolerance][:count]
+        return np.concatenate([points, self._walked(
+            field, drawn[np.argsort(distance)[len(points):count]], generator)])
+
+    def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
+                ) -> np.ndarray:
+        """Return ``points`` [n, 3] moved so that the target comes towards places in the region."""
+        wanted = self.region.draw(len(points), generator)
+        for _ in range(8):
+            outside = self.distance(field, points) > 0.5 * self.tolerance
+            steps = _damped_steps(field.tip_gradient(points, self.target),
+                                  wanted - field.tip(points, self.target))
+            points = points + np.where(outside[:, None], steps, 0.0)
+        return points
+
+    def centre(self, field: EnergyField) -> np.ndarray:
+        points = self.guess(field, 50, np.random.default_rng(0))
+        trusted = points[field.region.contains(points)]
+        points = trusted if len(trusted) else points
+        return points[np.argmin(self.distance(field, points))]
+
+    def place(self, states: SolvedPoses) -> np.ndarray:
+        """Return where the target is in the last of the states [m], shape [3]."""
+        return states.tips[-1] if self.target is None else states.targets[-1, self.target]
+
+    def missed_by(self, states: SolvedPoses) -> float:
+        """Return how far outside the region the target is in the last state [m]; inside: below 0.
+        """
+        return float(self.region.distance(self.place(states)[None])[0])
+
+    def drawn_in(self, states: SolvedPoses) -> Self:
+        """Return the goal further in by what the last of the states misses it by, at most half."""
+        missed = max(self.missed_by(states), 0.0)
+        return replace(self, inset=min(self.inset + 1.5 * missed, 0.5 * self.tolerance))
+
+    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
+        pass
+
+    def describe(self) -> dict:
+        return {"kind": "tip" if self.target is None else "target", "target": self.name,
+                "position_m": self.region.middle.tolist(), "tolerance_m": self.tolerance,
+                "region": self.region.describe()}
+
+    def describe_end(self, states: SolvedPoses) -> dict:
+        return {"target_end_m": self.place(states)}
+
+
+def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Gauss-Newton steps [n, 3] for d tip_c / d x_k = ``slope`` [n, k, c], damped where flat."""
+    normal = slope @ slope.transpose(0, 2, 1) + 1e-3 * np.eye(3)
+    return np.linalg.solve(normal, slope @ missing[:, :, None])[:, :, 0]
+
+
+def target_of(asked: GoalRequest) -> tuple[int | None, str]:
+    """Return number and name of the target that is asked for.
+
+    Raises:
+        InputError: the branch has none of that name.
+    """
+    name = asked.settings.target
+    names = [target.name for target in asked.grasp_model.branch.targets]
+    if name is None:
+        return None, "tip"
+    if name not in names:
+        raise InputError(f"The branch has no target {name}.",
+                         f"It has: {', '.join(names) or 'none'}.",
+                         "Name one with `limber target`.")
+    return names.index(name), name
+
+
+def _in_ball(asked: GoalRequest) -> TargetGoal:
+    region = Ball(asked.settings.tip_goal, asked.settings.goal_tolerance)
+    return TargetGoal(region, *target_of(asked))
+
+
+def _in_box(asked: GoalRequest) -> TargetGoal:
+    low, high = asked.settings.target_box[:3], asked.settings.target_box[3:]
+    if not np.all(np.less(low, high)):
+        raise InputError(f"The box from {low} to {high} m is empty.",
+                         "Its lower corner must be below the upper one in x, y and z.",
+                         "Correct --target-box.")
+    return TargetGoal(BoxRegion(low, high), *target_of(asked))
+
+
+IN_BALL = GoalKind("tip_goal", _in_ball, is_of_target=True,
+                   place=lambda settings: settings.tip_goal)
+IN_BOX = GoalKind("target_box", _in_box, is_of_target=True)

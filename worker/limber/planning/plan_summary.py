@@ -1,0 +1,122 @@
+"""What is said of a plan: its measures beside the shortest path's, its bound, and doubts."""
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from limber.planning.constraints.full_model_check import field_error
+from limber.planning.cost import STEP, PathMeasures, measure_path, resample
+from limber.planning.field.energy_field import EnergyField
+from limber.planning.goals.goal import Goal
+from limber.planning.goals.kinds import asked_kinds
+from limber.planning.path_on_full_model import ResolvedPath
+from limber.planning.settings import PlanSettings
+from limber.planning.two_paths import PathPair, chosen_engine
+
+_CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
+_STILL = 1e-9  # [m] a path that is no longer has no length
+_WIDE_GAP = 5.0  # percent, above which a warning says so
+_LONGER = 1.05  # a smoothed gentle path may be a little shorter than an unsmoothed RRT* path
+
+
+def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
+               baseline: ResolvedPath, plan: ResolvedPath, settings: PlanSettings,
+               ) -> dict[str, Any]:
+    """Return what a plan's file says beside its columns, as far as it is known without rounds."""
+    before, after = baseline.measures, plan.measures
+    return {
+        "goal": goal.describe() | {"chosen": not asked_kinds(settings)},
+        "start_m": start, "seed": settings.seed, "planner": settings.planner,
+        "engine": chosen_engine(settings.engine),
+        "certificate": pair.certificate.describe() | {"full_model": _on_full_model(
+            field, goal, pair, after)},
+        "paths_on_field": {name: asdict(_on_field(field, points)) | {
+            "peak_strain": float(np.abs(field.load(resample(points, STEP), "strain")).max())}
+            for name, points in pair.compared.items()},
+        "margins": pair.margins,
+        "detour": pair.detour and pair.detour.describe(),
+        "weights": {"deformation": settings.deformation_weight,
+                    "distance": pair.cost.distance,
+                    "energy_scale_j": pair.cost.energy_scale,
+                    "length_scale_m": pair.cost.length_scale},
+        "zero_of_energy": "the hanging state: the branch as scanned, the gripper open; an energy "
+        "is the potential of strain and weight, and the gripper's force is its gradient",
+        "baseline": asdict(before) | _checked(field, baseline),
+        "plan": asdict(after) | _checked(field, plan),
+        **(dict.fromkeys(_CHANGES) if pair.stays else dict(zip(_CHANGES, (
+            _change(before.energy_integral_jm, after.energy_integral_jm, -1),
+            _change(before.peak_energy_j, after.peak_energy_j, -1),
+            _change(before.length_m, after.length_m, 1)), strict=True))),
+        "convergence": {"baseline": pair.baseline.history, "plan": pair.plan.history},
+    }
+
+
+def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMeasures,
+                   ) -> dict[str, Any]:
+    """Return what the bound says of every branch whose energy is nowhere farther below the field's
+    than 95 % of the samples were, each left out in turn, and how far above that the plan is.
+
+    With c = w E + l and E less an error e, but not below 0, c is nowhere less than l / (l + w e) of
+    what it was, and so is the bound. Of a goal for a target it says nothing: where the target is
+    the field does not know well enough.
+    """
+    weights = pair.cost.weights
+    cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
+    missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])
+    error = float(np.quantile(missed, 0.95)) if len(missed) else float(
+        np.abs(field.missed[:, 0]).max())
+    cost = weights.energy * found.energy_integral_jm + weights.length * found.length_m
+    if not np.isfinite(error) or goal.doubt(field) > 0.0:
+        return {"field_error_j": error if np.isfinite(error) else None, "lower_bound": None,
+                "cost": cost, "gap_percent": None}
+    lower = pair.certificate.lower * weights.length / (weights.length + weights.energy * error)
+    return {"field_error_j": error, "lower_bound": lower, "cost": cost,
+            "gap_percent": 100.0 * (cost / lower - 1.0) if lower > 0.0 else None}
+
+
+def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:
+    """Return the peak strain, and how far the field was from the full model along the path."""
+    solved = path.solved
+    off = field.energy(solved.poses[:, :3]) - np.maximum(solved.energies, 0.0)
+    return {"peak_strain": float(solved.strains.max()),
+            "tip_end_m": solved.tips[-1],
+            "field_energy_error": field_error(field, solved),
+            "field_energy_error_max_j": float(np.abs(off).max()),
+            "unsolved_count": path.unsolved_count}
+
+
+def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
+    fine = resample(points, STEP / 5)
+    return measure_path(fine, field.energy(fine), np.linalg.norm(field.force(fine), axis=1))
+
+
+def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
+    """Return warnings about a plan, with a field that may be off by ``field_error`` [%]."""
+    if summary["plan"]["length_m"] <= _STILL:
+        return ["The start lies in the goal already: the path has no length, and there is nothing "
+                "to save."]
+    doubts = [
+        f"Along the {label} path the energy field was off by {error:.2g} % of the full model's "
+        f"energy, over the {most:g} % that may be: sample more poses with `limber energy "
+        "--samples`."
+        for key, label, most in (("baseline", "shortest", 15.0), ("plan", "gentle", field_error))
+        if (error := 100.0 * summary[key]["field_energy_error"]) > most]
+    gap = summary["certificate"]["gap_percent"]
+    if gap is not None and gap > _WIDE_GAP:
+        doubts.append(f"The path may cost up to {gap:.1f} % more than the best possible one" + (
+            "." if summary["planner"] == "eikonal" else "; `--planner eikonal` comes closest."))
+    shortest, gentle = (summary[key]["length_m"] for key in ("baseline", "plan"))
+    if shortest > _LONGER * gentle:
+        doubts.append("The path that is called shortest is longer than the gentle one: in a large "
+                      "goal RRT* aims at a few drawn poses. What is saved against it says little; "
+                      "name one goal pose (--goal) to compare paths.")
+    unsolved = sum(path.unsolved_count for path in paths)
+    if unsolved:
+        doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution and "
+                      "are left out of its measures.")
+    return doubts
+
+
+def _change(before: float, after: float, sign: int) -> float | None:
+    return 100.0 * sign * (after / before - 1.0) if before > 0.0 else None
