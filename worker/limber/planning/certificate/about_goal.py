@@ -1,0 +1,100 @@
+"""What the cells of a grid say of the goal: where it is, and what the way left to it costs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR
+from limber.planning.certificate.grid import CUT, Grid, spread
+from limber.planning.certificate.subsolution import Terrain, corner_values, second_differences
+from limber.planning.problem import GentleProblem
+
+_BEYOND = 1.2  # on the steepest measured growth of the goal's distance
+
+
+@dataclass(frozen=True)
+class AboutGoal:
+    """A signed cost of the way left, below 0 inside the goal, and where it is known.
+
+    Every point of the goal lies in a cell that has all its coefficients among those ``known``;
+    there the spline of the ``cost`` is at most ``slack``. ``inside`` are cells of the goal alone.
+    ``meets``: whether any open cell may have a point of the goal. ``near``: where the cells of the
+    next grid that are asked lie.
+    """
+
+    known: np.ndarray
+    cost: np.ndarray
+    inside: np.ndarray
+    slack: float
+    meets: bool
+    near: np.ndarray
+
+
+def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal:
+    """Return what is known about the goal.
+
+    A spline whose coefficients are a function's values differs from it by
+    ``h^2 / 8 sum_i max |second derivative|``.
+    """
+    h, shape = ground.spacing, ground.open_cells.shape
+    cells = np.argwhere(ground.active & grid.about_goal)
+    nothing = np.zeros(shape, bool)
+    if len(cells) == 0:
+        return AboutGoal(nothing, np.zeros(shape), nothing, 0.0, False, nothing)
+    away = (problem.goal.distance(problem.energy_field, grid.points(cells + 0.5))
+            - problem.goal.tolerance)
+    # In the box about them alone, with a layer in which nothing is known.
+    low, high = np.maximum(cells.min(axis=0) - 1, 0), cells.max(axis=0) + 2
+    box = tuple(map(slice, low, high))
+    open_cells = ground.open_cells[box]
+    distance = spread(open_cells.shape, cells - low, away)
+    filled = np.nan_to_num(distance, nan=np.inf)
+    growth = _growth(distance, np.abs(filled) <= 4.0 * h, h)
+    corners = tuple(map(slice, low, high + 1))
+    rate = np.where(ground.level[box], ground.floor,
+                    corner_values(ground.rate[corners]).mean(axis=0))
+    cost = _way_left(distance / growth, problem.goal.tolerance / growth, rate, h)
+    curved = CURVATURE_FACTOR / 8.0 * sum(
+        scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
+    half = 0.5 * h * np.sqrt(3.0)
+    touching = open_cells & (filled <= growth * half)
+    inside = filled < -growth * half
+    border = touching & ~inside
+    slack = float(curved[border].max()) if border.any() else 0.0
+
+    def whole(part: np.ndarray) -> np.ndarray:
+        out = np.zeros(shape, part.dtype)
+        out[box] = part
+        return out
+    # A next cell asks up to 4 of its edges away; its centre lies within ``half`` of this one's.
+    return AboutGoal(whole(filled <= growth * 3.0 * half), whole(np.nan_to_num(cost)),
+                      whole(inside), slack, bool(touching.any()),
+                      whole(filled <= growth * (half + 6.0 * h / CUT)))
+
+
+def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:
+    """Return what a ``length`` [m] to the goal costs, at the ``rate`` half-way, of cells with an
+    edge of ``h`` [m]; nan where not known.
+
+    One rate for all sides of the goal would be the least of them. Inside, where nothing is asked,
+    the length flattens out to a goal's middle ``depth`` [m] below its outside: it has no tip there.
+    """
+    flat = np.maximum(length, -depth)
+    flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
+    growing = sum(np.gradient(rate, h, axis=axis) * np.gradient(length, h, axis=axis)
+                  for axis in range(3))
+    half_way = rate - 0.5 * length * np.nan_to_num(growing)
+    return flat * np.where(length > 0.0, np.clip(half_way, 0.5 * rate, 1.5 * rate), rate)
+
+
+def _growth(distance: np.ndarray, near: np.ndarray, h: float) -> float:
+    """Return the most that the goal's distance grows a metre, among cells ``near`` it."""
+    growth = 1.0
+    for axis in range(3):
+        step = np.abs(np.diff(distance, axis=axis)) / h
+        first, second = (np.take(near, range(k, near.shape[axis] - 1 + k), axis=axis)
+                         for k in (0, 1))
+        growth = max(growth, float(np.max(step, where=first & second, initial=0.0)))
+    # A grasp's distance grows by a metre at most; a target's by what the field says, and more.
+    return growth if growth <= 1.0 + 1e-9 else growth * _BEYOND * np.sqrt(3.0)

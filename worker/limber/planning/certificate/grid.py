@@ -1,0 +1,113 @@
+"""The grid of the bound: turned so that its first axis runs from the start to the goal."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.planning.certificate.subsolution import RIM
+from limber.planning.problem import GentleProblem
+
+_FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
+CUT = 3
+"""Parts of a cell's edge from one grid to the next."""
+_PAD = RIM + 1  # closed cells about the grid, for the coefficients and second differences there
+
+
+@dataclass
+class Grid:
+    """Cells in the turned frame; corner ``(i, j, k)`` lies at ``origin + (i, j, k) h``.
+
+    How far the goal is need not be asked but in the cells ``about_goal``.
+    """
+
+    origin: np.ndarray
+    axes: np.ndarray
+    spacing: float
+    open_cells: np.ndarray
+    about_goal: np.ndarray
+
+    def points(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the positions [n, 3] of corners ``numbers`` [n, 3]; halves are centres."""
+        return self.origin + (numbers * self.spacing) @ self.axes
+
+    def along_edges(self, vectors: np.ndarray) -> np.ndarray:
+        """Return slopes [n, 3] to the position as those along a cell's edges, times their length.
+        """
+        return self.spacing * vectors @ self.axes.T
+
+    def spread(self, corners: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return ``values`` [n, ...] at ``corners`` [n, 3] of the whole grid, nan elsewhere."""
+        return spread(tuple(n + 1 for n in self.open_cells.shape), corners, values)
+
+
+def spread(shape: tuple[int, ...], places: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return ``values`` [n, ...] at ``places`` [n, 3] of an array of a shape, nan elsewhere."""
+    whole = np.full((*shape, *values.shape[1:]), np.nan)
+    whole[tuple(places.T)] = values
+    return whole
+
+
+def first_grid(problem: GentleProblem) -> tuple[Grid, np.ndarray]:
+    """Return a grid over the sampled region, and the cell in whose centre the start lies."""
+    region, start = problem.energy_field.region, problem.start
+    axes = _axes(problem.goal.centre(problem.energy_field) - start)
+    corners = (region.outline - start) @ axes.T
+    low = np.minimum(corners.min(axis=0), 0.0)
+    high = np.maximum(corners.max(axis=0), 0.0)
+    spacing = float(np.cbrt(np.prod(high - low) / _FIRST_CELLS))
+    before = np.ceil(-low / spacing - 0.5).astype(int) + _PAD
+    after = np.ceil(high / spacing - 0.5).astype(int) + _PAD + 1
+    open_cells = np.pad(np.ones(tuple(before + after - 2 * _PAD), bool), _PAD)
+    return Grid(start - ((before + 0.5) * spacing) @ axes, axes, spacing, open_cells,
+                 np.ones_like(open_cells)), before
+
+
+def _axes(direction: np.ndarray) -> np.ndarray:
+    """Return three unit rows, the first along ``direction``."""
+    length = float(np.linalg.norm(direction))
+    if length == 0.0:
+        return np.eye(3)
+    first = direction / length
+    second = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)])
+
+
+def refined(grid: Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarray,
+             ) -> tuple[Grid, np.ndarray]:
+    """Return cells of a third the edge over ``keep``, in the smallest box; and the start's.
+
+    A third, not a half: so the start stays in the centre of a cell.
+    """
+    places = np.argwhere(keep)
+    # A closed layer of whole cells about them is as deep as ``_PAD`` new ones.
+    low = np.minimum(places.min(axis=0), cell) - 1
+    high = np.maximum(places.max(axis=0), cell) + 2
+    spacing = grid.spacing / CUT
+
+    def cut(cells: np.ndarray) -> np.ndarray:
+        box = cells[tuple(map(slice, low, high))]
+        for axis in range(3):
+            box = np.repeat(box, CUT, axis=axis)
+        return box
+    origin = grid.points(low[None].astype(float))[0]
+    return (Grid(origin, grid.axes, spacing, cut(keep), cut(about_goal)),
+            CUT * (cell - low) + CUT // 2)
+
+
+def descent(grid: Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Return the way downhill from the start by cells' centres [n, 3]: the course of a path."""
+    reach = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    reach = reach[np.abs(reach).sum(axis=1) > 0]
+    length = np.linalg.norm(reach, axis=1)
+    way, here = [cell], cell
+    while u[tuple(here)] > 0.0 and len(way) < sum(u.shape):
+        near = here + reach
+        within = ((near >= 0) & (near < u.shape)).all(axis=1)
+        drop = (u[tuple(here)] - u[tuple(near[within].T)]) / length[within]
+        best = int(np.argmax(drop))
+        if not drop[best] > 0.0:
+            break
+        here = near[within][best]
+        way.append(here)
+    return grid.points(np.array(way) + 0.5)
