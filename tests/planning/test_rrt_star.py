@@ -14,14 +14,14 @@ from limber.planning.goals.chosen import default_goal
 from limber.planning.goals.grasp import GraspGoal
 from limber.planning.goals.regions import Ball
 from limber.planning.goals.target import TargetGoal
-from limber.planning.planners.ompl_engine import ompl_missing
+from limber.planning.planners.ompl_engine import OmplRrtStar
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import plan_path
 
 START = np.array([-0.13, 0.0, 0.0])
 GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)
 ENGINES = ["own", pytest.param("ompl", marks=pytest.mark.skipif(
-    bool(ompl_missing()), reason=f"OMPL: {ompl_missing()}"))]
+    bool(OmplRrtStar().missing()), reason=f"OMPL: {OmplRrtStar().missing()}"))]
 
 
 def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):

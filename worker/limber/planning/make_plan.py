@@ -248,9 +248,9 @@ class _Rounds:
                     "branch's inertia breaks a limit.")
         for message in doubts_of(summary, self.settings.field_error, baseline, plan):
             self.progress.warn(message)
-        return PlannedMotion(summary, baseline, plan, self.field, {
-            name: path.tree for name, path in pair.trees.items()}, self.pace,
-            pair.certificate.to_go)
+        trees = {name: path.tree for name, path in pair.trees.items() if path.tree is not None}
+        return PlannedMotion(summary, baseline, plan, self.field, trees, self.pace,
+                             pair.certificate.to_go)
 
 
 def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, workers: int | None,

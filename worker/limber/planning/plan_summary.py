@@ -11,8 +11,9 @@ from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.kinds import asked_kinds
 from limber.planning.path_on_full_model import ResolvedPath
+from limber.planning.planners.trees import chosen_engine
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import PathPair, chosen_engine
+from limber.planning.two_paths import PathPair
 
 _CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
 _STILL = 1e-9  # [m] a path that is no longer has no length

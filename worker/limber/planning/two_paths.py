@@ -20,10 +20,9 @@ from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp import near
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import GentlePath, plan_gentle
-from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
 from limber.planning.planners.tree_search import PathProblem, Search
-from limber.planning.planners.trees import FoundPath, found_again, plan_path
+from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
 from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
 from limber.planning.start import check_start
@@ -294,14 +293,3 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
             # A tree that misses a narrow way is no verdict: the grid finds it, or says why not.
             points = plan_gentle(way, enough=_ANY).points
     return np.concatenate([points, start[None]])
-
-
-def chosen_engine(engine: str) -> str:
-    """Return ``ompl`` or ``own`` for the setting.
-
-    Both find equally good paths in about the same time (scripts/bench planning); OMPL's is the
-    planner that others know, ours runs where OMPL has no wheel.
-    """
-    if engine == "auto":
-        return "own" if ompl_missing() else "ompl"
-    return engine

@@ -14,38 +14,48 @@ import numpy as np
 from limber.core.errors import MissingDependencyError
 from limber.core.progress import Progress
 from limber.planning.cost import edge_cost
-from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
+from limber.planning.planners.tree_search import PathProblem, Search, Searched, SearchTree
 
 _REWIRE_FACTOR = 0.05
 _REPORT_EVERY = 100  # iterations
 
 
-def ompl_missing() -> str:
-    """Return why OMPL cannot be used, or an empty string if it can."""
-    try:
-        import ompl.geometric  # noqa: F401
-    except ImportError as error:
-        return str(error)
-    return ""
+class OmplRrtStar:
+    """OMPL's; it has no wheel for Windows, and its ``solve`` keeps Python's interpreter lock: call
+    it in a worker process, as each command is one."""
+
+    def missing(self) -> str:
+        try:
+            import ompl.geometric  # noqa: F401
+        except ImportError as error:
+            return str(error)
+        return ""
+
+    def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
+        if reason := self.missing():
+            raise MissingDependencyError(
+                "OMPL is not installed.", f"Importing it says: {reason}.",
+                "Use --engine own, which needs nothing, or install the extra `planning`.")
+        from ompl import base, geometric
+        from ompl import util as ompl_util
+
+        # OMPL takes seeds from 1 on, and logs at a second call that it is late; it reseeds all the
+        # same.
+        ompl_util.setLogLevel(ompl_util.LogLevel.LOG_NONE)
+        ompl_util.RNG.setSeed(search.seed + 1)
+        setup, planner = _setup(base, geometric, problem, search)
+        watch = _Watch(planner, search, progress)
+        setup.solve(base.PlannerTerminationCondition(watch))
+        data = base.PlannerData(setup.getSpaceInformation())
+        setup.getPlannerData(data)
+        tree = _tree(data)
+        if not setup.haveExactSolutionPath():
+            return Searched(None, watch.history, tree)
+        states = setup.getSolutionPath().getStates()
+        return Searched(np.array([state[0:3] for state in states]), watch.history, tree)
 
 
-def search_with_ompl(problem: PathProblem, search: Search, progress: Progress,
-                     ) -> tuple[np.ndarray | None, list[dict[str, float]], SearchTree]:
-    """Return the best path [n, 3] or None, the cost's history and the tree.
-
-    Raises:
-        MissingDependencyError: OMPL is not installed.
-    """
-    if reason := ompl_missing():
-        raise MissingDependencyError(
-            "OMPL is not installed.", f"Importing it says: {reason}.",
-            "Use --engine own, which needs nothing, or install the extra `planning`.")
-    from ompl import base, geometric
-    from ompl import util as ompl_util
-
-    # OMPL takes seeds from 1 on and logs at a second call that it is late; it reseeds all the same.
-    ompl_util.setLogLevel(ompl_util.LogLevel.LOG_NONE)
-    ompl_util.RNG.setSeed(search.seed + 1)
+def _setup(base: object, geometric: object, problem: PathProblem, search: Search) -> tuple:
     space = _space(base, problem)
     setup = geometric.SimpleSetup(space)
     information = setup.getSpaceInformation()
@@ -63,15 +73,7 @@ def search_with_ompl(problem: PathProblem, search: Search, progress: Progress,
     planner.setGoalBias(search.goal_bias)
     setup.setPlanner(planner)
     setup.setup()
-    watch = _Watch(planner, search, progress)
-    setup.solve(base.PlannerTerminationCondition(watch))
-    data = base.PlannerData(information)
-    setup.getPlannerData(data)
-    tree = _tree(data)
-    if not setup.haveExactSolutionPath():
-        return None, watch.history, tree
-    states = setup.getSolutionPath().getStates()
-    return np.array([state[0:3] for state in states]), watch.history, tree
+    return setup, planner
 
 
 def _tree(data: object) -> SearchTree:

@@ -7,35 +7,39 @@ import numpy as np
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import Progress
 from limber.planning.cost import edge_cost
-from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
+from limber.planning.planners.tree_search import PathProblem, Search, Searched, SearchTree
 
 _CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
 
 
-def search_tree(problem: PathProblem, search: Search, progress: Progress,
-                ) -> tuple[np.ndarray | None, list[dict[str, float]], SearchTree]:
-    """Return the best polyline [k, 3] or None, its cost as the tree grew, and the tree."""
-    generator = np.random.default_rng([search.seed, 0])
-    dimension = len(problem.start)
-    tree = _Tree(search.iterations + 1, dimension)
-    tree.nodes[0] = problem.start
-    count = 1
-    reach = search.reach * problem.diagonal
-    history: list[dict[str, float]] = []
-    for done in range(0, search.iterations, _CHUNK):
-        size = min(_CHUNK, search.iterations - done)
-        samples = generator.uniform(problem.low, problem.high, (size, dimension))
-        aimed = generator.uniform(size=size) < search.goal_bias
-        samples[aimed] = problem.goals[generator.integers(len(problem.goals), size=aimed.sum())]
-        count = _grow(samples, count, *tree.arrays, reach, problem.limits, problem.weights)
+class OwnRrtStar:
+    """It runs wherever Limber does, with the same path on every system, and holds no lock."""
+
+    def missing(self) -> str:
+        return ""
+
+    def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
+        generator = np.random.default_rng([search.seed, 0])
+        dimension = len(problem.start)
+        tree = _Tree(search.iterations + 1, dimension)
+        tree.nodes[0] = problem.start
+        count = 1
+        reach = search.reach * problem.diagonal
+        history: list[dict[str, float]] = []
+        for done in range(0, search.iterations, _CHUNK):
+            size = min(_CHUNK, search.iterations - done)
+            samples = generator.uniform(problem.low, problem.high, (size, dimension))
+            aimed = generator.uniform(size=size) < search.goal_bias
+            samples[aimed] = problem.goals[generator.integers(len(problem.goals), size=aimed.sum())]
+            count = _grow(samples, count, *tree.arrays, reach, problem.limits, problem.weights)
+            best = tree.best(count, problem.in_goal)
+            numbers = {} if best is None else {"cost": float(tree.cost[best])}
+            if best is not None:
+                history.append({"iteration": done + size, "cost": float(tree.cost[best])})
+            progress((done + size) / search.iterations, "growing the tree", **numbers)
         best = tree.best(count, problem.in_goal)
-        numbers = {} if best is None else {"cost": float(tree.cost[best])}
-        if best is not None:
-            history.append({"iteration": done + size, "cost": float(tree.cost[best])})
-        progress((done + size) / search.iterations, "growing the tree", **numbers)
-    best = tree.best(count, problem.in_goal)
-    return (None if best is None else tree.branch(best)), history, SearchTree.of(
-        tree.nodes[:count].copy(), tree.parent[:count].copy())
+        return Searched(None if best is None else tree.branch(best), history, SearchTree.of(
+            tree.nodes[:count].copy(), tree.parent[:count].copy()))
 
 
 class _Tree:

@@ -1,10 +1,12 @@
-"""What a tree planner is asked: start, goals, cost, how long and how wide to search; its tree."""
+"""What a sampling planner is, what it is asked and what it answers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
+from limber.core.progress import Progress
 from limber.planning.cost import EdgeWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 
@@ -102,3 +104,38 @@ class SearchTree:
         kept = np.sort(np.argsort(-carried, kind="stable")[:most])
         return SearchTree.of(self.nodes[kept], np.searchsorted(kept, self.parents[kept])
                              - (self.parents[kept] < 0))
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search came to.
+
+    Attributes:
+        path: The best polyline of grasp positions [m], shape [k, 3]; None where none was found.
+        history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
+        tree: All that was searched; None from a planner that grows no tree.
+    """
+
+    path: np.ndarray | None
+    history: list[dict[str, float]] = field(default_factory=list)
+    tree: SearchTree | None = None
+
+
+class Planner(Protocol):
+    """Searches for the path of least cost.
+
+    It stops after a number of iterations, never a time, so that a seed gives the same path again.
+    """
+
+    def missing(self) -> str:
+        """Return why it cannot be used here, or an empty string if it can."""
+        ...
+
+    def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
+        """Return the best path that was found.
+
+        Raises:
+            MissingDependencyError: it is ``missing``.
+            Cancelled: by the progress.
+        """
+        ...

@@ -1,13 +1,8 @@
-"""RRT* (Karaman and Frazzoli 2011) over grasp positions, in two engines behind one function.
+"""RRT* (Karaman and Frazzoli 2011) over grasp positions, by the planner that is asked for.
 
-``own`` (:mod:`limber.planning.planners.rrt_star`) runs wherever Limber runs, gives the same path on
-every system and holds no lock. ``ompl`` (:mod:`limber.planning.planners.ompl_engine`) is the Open
-Motion Planning Library's, kept as the reference that others know; it has no wheel for Windows, and
-its ``solve`` keeps Python's interpreter lock, so call it in a worker process (each command is one).
-``compare.chosen_engine`` says which is taken and why.
-
-Both stop after a number of iterations, never a time, so a seed gives the same path again. Both
-end with shortcuts that lower the cost; OMPL's other simplifiers ignore it.
+``ompl`` is the Open Motion Planning Library's, kept as the reference that others know; ``own``
+stands in where OMPL has no wheel. Paths end with shortcuts that lower the cost; OMPL's other
+simplifiers ignore it.
 """
 
 from dataclasses import dataclass, field, replace
@@ -17,10 +12,21 @@ import numpy as np
 from limber.core.errors import NoPathError
 from limber.core.progress import SILENT, Progress
 from limber.planning.cost import path_cost
-from limber.planning.planners.ompl_engine import search_with_ompl
-from limber.planning.planners.rrt_star import search_tree
+from limber.planning.planners.ompl_engine import OmplRrtStar
+from limber.planning.planners.rrt_star import OwnRrtStar
 from limber.planning.planners.smoothing import polish, shortcut, slide_end
-from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
+from limber.planning.planners.tree_search import PathProblem, Planner, Search, SearchTree
+
+PLANNERS: dict[str, Planner] = {"ompl": OmplRrtStar(), "own": OwnRrtStar()}
+"""By the names of ``--engine``, that come first which ``auto`` prefers; one from outside is added
+to it."""
+
+
+def chosen_engine(engine: str) -> str:
+    """Return the name of the planner for a setting: the first that can be used for ``auto``."""
+    if engine != "auto":
+        return engine
+    return next(name for name, planner in PLANNERS.items() if not planner.missing())
 
 
 @dataclass(frozen=True)
@@ -48,20 +54,18 @@ class FoundPath:
 
 def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
               progress: Progress = SILENT) -> FoundPath:
-    """Search for the path of least cost with ``engine`` ``own`` or ``ompl``.
+    """Search for the path of least cost with one of ``PLANNERS``.
 
     Raises:
         NoPathError: no path was found within the iterations.
-        MissingDependencyError: ``ompl`` was asked for and is not installed.
+        MissingDependencyError: the planner is not installed.
     """
-    if engine == "ompl":
-        raw, history, tree = search_with_ompl(problem, search, progress)
-    else:
-        raw, history, tree = search_tree(problem, search, progress)
+    found = PLANNERS[engine].search(problem, search, progress)
+    raw, reached = found.path, len(found.tree.nodes) if found.tree else 1
     if raw is None:
         raise NoPathError(
             f"{search.iterations} iterations found no allowed path to the goal region.",
-            f"{len(tree.nodes)} poses were reached from the start; the limits, or poses that the "
+            f"{reached} poses were reached from the start; the limits, or poses that the "
             "branch model refused, may separate it from the goal.",
             "Allow more --iterations, or raise --max-energy or --max-force.")
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
@@ -70,7 +74,7 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     points = slide_end(points, problem.goals, problem.limits, problem.weights)
     points = polish(points, problem.energy_field, problem.limits, problem.weights)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
-                     history, engine, raw, tree)
+                     found.history, engine, raw, found.tree)
 
 
 def found_again(found: FoundPath, problem: PathProblem) -> FoundPath | None:
