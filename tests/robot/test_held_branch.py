@@ -18,9 +18,10 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.sensitivities import grasp_slopes
 from limber.robot.cell.cell import Cell
+from limber.robot.virtual.branch_solver import BranchSetting, BranchSolver
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.depth_camera import scanned, views_around
-from limber.robot.virtual.gripped_branch import BranchSetting, HeldBranch, _Solver
+from limber.robot.virtual.gripped_branch import HeldBranch
 from limber.robot.virtual.launch import VirtualRobot
 
 TIP = np.array([0.0, 0.0, 0.3])
@@ -114,7 +115,7 @@ def on_an_arc(beam, way: float) -> np.ndarray:
 def test_a_solution_leads_along_the_bend_of_the_branch(setting, beam):
     """8 mm on, where the branch is stiff along itself: with how its stiffness changed since the
     solution before, or when the gripper closed, at most a fifth of the tangent's error is left."""
-    solver, frame = _Solver(setting), partial(on_an_arc, beam)
+    solver, frame = BranchSolver(setting), partial(on_an_arc, beam)
     middle = frame(0.0)[:3, 3]
     solver.grasp(middle)
     tried = solver.tried()
@@ -130,7 +131,7 @@ def test_a_solution_leads_along_the_bend_of_the_branch(setting, beam):
 
 def test_a_slow_robot_is_led_by_a_solution_farther_back(setting, beam):
     """Solutions 1 mm apart tell too little of how the stiffness changes: two of them do."""
-    solver, frame = _Solver(setting), partial(on_an_arc, beam)
+    solver, frame = BranchSolver(setting), partial(on_an_arc, beam)
     solver.grasp(frame(0.0)[:3, 3])
     past = [solver.solve(frame(0.001 * k)) for k in range(10, 6, -1)]
     at = solver.solve(frame(0.011))

@@ -11,8 +11,8 @@ from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.motion.execution import across
 from limber.robot.ur.arms import arm_named
 from limber.robot.ur.kinematics import forward
+from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.controller import HOME
-from limber.robot.virtual.gripped_branch import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.pulls.virtual_pull import load_truth
 from limber.store import Branch

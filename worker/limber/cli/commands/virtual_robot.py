@@ -59,7 +59,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
 def _setting(branch_folder: Path, cell: Any, young: str | None, folder: Path) -> Any:
     from limber.core.errors import InputError
     from limber.estimation.simulated_pull import VirtualPullSettings
-    from limber.robot.virtual.gripped_branch import BranchSetting
+    from limber.robot.virtual.branch_solver import BranchSetting
     from limber.stages.pulls.virtual_pull import load_truth
     from limber.store import Branch
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from limber.core.errors import LimberError
 from limber.robot.driver.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
+from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.gripped_branch import BranchSetting, HeldBranch
+from limber.robot.virtual.gripped_branch import HeldBranch
 from limber.robot.virtual.launch import serve
 
 

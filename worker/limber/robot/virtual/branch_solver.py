@@ -1,0 +1,239 @@
+"""The process that solves the branch in the virtual gripper, and which branch that is."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.numerics.rigid_kernels import frame_of, rotation_vector
+from limber.robot.driver.real_time import claim_real_time, spare_what_is_loaded
+from limber.robot.virtual.branch_solution import NO_BENDS, Bends, Solution, joined
+
+if TYPE_CHECKING:
+    from limber.mechanics.grasp import Grasp
+
+_SOLVER_PRIORITY = 10
+_REST = 0.25  # of what a solution took: a process that never rests is held up by the system
+SAME_PLACE = 1e-6  # m, rad; over that the tangent leads on exactly
+_TOLERANCE = 1e-5  # of the residual, relative to the forces: far below what a sensor tells
+_MOST_WAYS = 2.0  # so many times the way between two solutions a change is led on
+_TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
+
+
+@dataclass(frozen=True)
+class BranchSetting:
+    """Which branch stands where beside the virtual robot.
+
+    Attributes:
+        mesh: File of the true branch: tetrahedra with ``young``, ``poisson``, ``density`` and
+            ``fixed``, as it hangs.
+        base_pose: The robot's base in the branch's frame [m, rad], shape [6].
+        grasp_pose: The gripper's middle in the flange's frame [m, rad], shape [6].
+        points: Points of the branch that are seen (markers), [m], shape [n, 3].
+        gravity: In the branch's frame [m/s^2], or zeros for a branch without weight.
+        jaw: Half width of what the gripper takes hold of along the branch [m].
+        grip: Force that the grip bears before the branch slips out [N].
+        break_strain: Greatest principal strain that the branch bears.
+        compliance: What arm, fingers and bark give way by [m/N].
+    """
+
+    mesh: Path
+    base_pose: tuple[float, ...]
+    grasp_pose: tuple[float, ...]
+    points: tuple[tuple[float, ...], ...] = ()
+    gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
+    jaw: float = 0.012
+    grip: float = 80.0
+    break_strain: float = 0.2
+    compliance: float = 0.0
+
+    @classmethod
+    def of_truth(cls, truth: Any, cell: Any, path: Path, *, poisson: float = 0.35,
+                 density: float = 900.0, wave: float = 0.0) -> BranchSetting:
+        """Return the setting of a :class:`~limber.estimation.simulated_pull.TrueBranch` in a cell.
+
+        Its mesh is written to ``path``. The seen points are the control points and the tip.
+
+        Args:
+            wave: How far log E swings to and fro between the control points about the straight
+                course that a fit takes it to have.
+        """
+        from limber.mechanics.materials.young_field import young_weights
+
+        mesh, count = truth.mesh, truth.mesh.tet_count
+        weights = young_weights(mesh, truth.control_points)
+        # 0 at the control points, largest in the middle between two of them, by turns up and down.
+        bumps = 4.0 * weights[:, :-1] * weights[:, 1:]
+        swing = wave * bumps @ (-1.0) ** np.arange(bumps.shape[1])
+        mesh.with_data(cell_data={
+            "young": np.exp(swing) * (weights @ np.asarray(truth.young, float)),
+            "poisson": np.full(count, poisson), "density": np.full(count, density)}).write(path)
+        tip = truth.skeleton.nodes[truth.skeleton.main_path()[-1]]
+        points = [*truth.control_points, tip]
+        return cls(path, tuple(cell.base.pose), tuple(cell.tool.grasp_pose),
+                   tuple(tuple(map(float, point)) for point in points),
+                   tuple(map(float, truth.gravity)), compliance=cell.tool.compliance_m_per_n)
+
+
+class BranchSolver:
+    """The branch in its process."""
+
+    def __init__(self, setting: BranchSetting):
+        from limber.geometry.tets.tet_mesh import TetMesh
+        from limber.mechanics.model import BranchModel
+        from limber.mechanics.points import point_operator
+
+        mesh = TetMesh.read(setting.mesh)
+        data = mesh.cell_data
+        model = BranchModel(mesh, young=data["young"], poisson=data["poisson"],
+                            density=data["density"], gravity=setting.gravity)
+        self._setting = setting
+        self._model = model.as_scanned() if np.any(setting.gravity) else model
+        self._points = np.asarray(setting.points, float).reshape(-1, 3)
+        self._operator = point_operator(mesh, self._points) if len(self._points) else None
+        self._grasp: Grasp | None = None
+        self._held = self._model
+        self._state = np.zeros_like(mesh.nodes)
+        self._last: Solution | None = None
+        self._follows: np.ndarray | None = None
+        # By how much that has changed since the solution before, and over which way.
+        self._turning: tuple[np.ndarray, np.ndarray] | None = None
+        self._faces: np.ndarray | None = None
+        self._rng = np.random.default_rng(0)
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Compile and factorise once before the robot's clock runs."""
+        nodes = self._model.mesh.nodes
+        root = nodes[self._model.fixed].mean(axis=0)
+        far = np.linalg.norm(nodes - root, axis=1).argmax()
+        self.grasp(nodes[far])
+        self._grasp, self._last, self._state = None, None, np.zeros_like(nodes)
+
+    def seen(self) -> np.ndarray:
+        """Where the seen points are now [m], shape [n, 3]."""
+        if self._operator is None:
+            return self._points
+        return self._points + (self._operator @ self._state.ravel()).reshape(-1, 3)
+
+    def look(self, camera: dict[str, Any], is_held: bool) -> bytes:
+        """Return what a depth camera sees of the branch, with its noise: 16 bits a pixel, packed.
+
+        Unheld the branch is at rest.
+        """
+        from limber.geometry.cloud.camera import Camera
+        from limber.perception.simulated_camera import render_depth, with_noise
+
+        made = Camera.model_validate(camera)
+        mesh = self._model.mesh
+        if self._faces is None:
+            self._faces = mesh.surface_faces()
+        moved = self._state if is_held else np.zeros_like(self._state)
+        depth = with_noise(made, render_depth(made, mesh.nodes + moved, self._faces), self._rng)
+        steps = np.clip(np.round(depth * made.depth_scale), 0, 65535).astype("<u2")
+        return zlib.compress(steps.tobytes(), 1)
+
+    def grasp(self, position: np.ndarray) -> dict[str, Any]:
+        from limber.mechanics.grasp import Grasp
+
+        self._state = np.zeros_like(self._model.mesh.nodes)
+        self._last = None
+        try:
+            self._grasp = Grasp.gripping(self._model.mesh, position, self._setting.jaw)
+        except InputError as error:
+            return {"error": error.seen}
+        self._held = self._model.gripped(self._grasp)
+        frame = np.eye(4)
+        frame[:3, 3] = self._grasp.centre
+        return {"centre": self._grasp.centre, "solution": self.solve(frame)}
+
+    def tried(self) -> Bends:
+        """How the stiffness changes both ways across the branch, turned as it turns by itself."""
+        solution, state, follows = self._last, self._state, self._follows
+        if solution is None:
+            return NO_BENDS
+        stiffness = solution.stiffness
+        axes = np.linalg.eigh(stiffness[:3, :3] + stiffness[:3, :3].T)[1]
+        bends = NO_BENDS
+        for way in _TRIED_WAY * axes.T[:2]:
+            turn = -np.linalg.solve(stiffness[3:, 3:], stiffness[3:, :3] @ way)
+            there = self.solve(frame_of(np.r_[solution.frame[:3, 3] + way, turn]))
+            bends = joined(bends, there.bend_from(solution))
+        self._state, self._last, self._follows, self._turning = state, solution, follows, None
+        return bends
+
+    def solve(self, patch: np.ndarray) -> Solution:
+        """Return the solution at a frame of the patch; the last one where there is none."""
+        from limber.mechanics.sensitivities import grasp_slopes
+        from limber.mechanics.statics.result import StaticSettings
+        from limber.mechanics.statics.solve import follow_poses
+        from limber.mechanics.strain import peak_load
+
+        assert self._grasp is not None
+        pose = np.r_[patch[:3, 3], rotation_vector(patch)]
+        result = follow_poses(self._held, self._grasp, pose[None], start=self._state,
+                              guess=self._guessed(patch),
+                              settings=StaticSettings(tolerance=_TOLERANCE))[0]
+        if not result.converged and self._last is not None:
+            self._last = replace(self._last, seconds=result.seconds, converged=False)
+            return self._last
+        self._state = result.displacement
+        slopes = grasp_slopes(self._held, self._grasp, self._state)
+        self._turning = None
+        if self._last is not None and self._follows is not None:
+            way = patch[:3, 3] - self._last.frame[:3, 3]
+            if np.linalg.norm(way) > SAME_PLACE:
+                self._turning = way, slopes.displacement - self._follows
+        self._follows = slopes.displacement
+        points = (np.zeros((0, 6)) if self._operator is None
+                  else self._operator @ slopes.displacement.reshape(-1, 6))
+        self._last = Solution(
+            patch, np.r_[result.reaction_force, result.reaction_torque], slopes.wrench,
+            self.seen(), points, peak_load(self._held, self._state)[0], result.seconds,
+            result.converged)
+        return self._last
+
+    def _guessed(self, patch: np.ndarray) -> np.ndarray | None:
+        """Where the nodes nearly are at a frame of the patch, [node_count, 3].
+
+        By the tangent of the solution before and how that changed.
+        """
+        if self._last is None or self._follows is None:
+            return None
+        change, follows = self._last.change_to(patch), self._follows
+        if self._turning is not None:
+            way, turning = self._turning
+            part = float(np.clip(change[:3] @ way / (way @ way), -_MOST_WAYS, _MOST_WAYS))
+            follows = follows + 0.5 * part * turning
+        return self._state + follows @ change
+
+
+def solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
+    solver = BranchSolver(setting)
+    # Below the arm's own loop; above other programs, for which the branch's force would be late.
+    claim_real_time(_SOLVER_PRIORITY)
+    spare_what_is_loaded()
+    try:
+        pipe.send(("ready", {"points": solver.seen()}))
+        while True:
+            kind, content = pipe.recv()
+            if kind == "grasp":
+                pipe.send(("grasped", solver.grasp(np.array(content))))
+            elif kind == "look":
+                pipe.send(("seen", solver.look(*content)))
+            elif kind == "try":
+                pipe.send(("tried", solver.tried()))
+            else:
+                began = time.monotonic()
+                pipe.send(("solved", solver.solve(content)))
+                time.sleep(_REST * (time.monotonic() - began))
+    except (EOFError, OSError):
+        # The robot is gone, and nobody else asks.
+        return
