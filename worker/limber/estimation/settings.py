@@ -23,54 +23,63 @@ class EstimateSettings(Settings):
     }
     common = ("pull", "fractions")
 
-    pull: tuple[str, ...] = Field((), description="Names of the pulls to use; without it all.")
+    pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
-        "gauss-newton", description="nelder-mead is the paper's.")
+        "gauss-newton", description="Optimiser; nelder-mead is the paper's.")
     forward: Literal["full", "reduced"] = Field(
-        "full", description="reduced: a reduced model of slow pose-driven pulls, corrected by the "
-        "full one; its basis is kept in the branch folder, and another estimate is quick.")
+        "full", description="reduced: a reduced model of slow pose-driven pulls, corrected by "
+        "the full model. Its basis is kept in the branch folder, so further estimates take "
+        "seconds.")
     drive: Literal["pose", "force"] | None = Field(
-        None, description="pose: the gripper's pose moves the branch and its force is compared; "
-        "force: the force pulls (the paper's). Without it as each pull says.")
+        None, description="pose: the gripper's pose moves the branch, and its force is compared. "
+        "force: the measured force pulls, as in the paper. Default: as each pull states.")
     motion: Literal["quasi_static", "dynamic"] | None = Field(
-        None, description="dynamic simulates inertia and damping; without it as each pull says.")
+        None, description="dynamic: simulate inertia and damping. Default: as each pull states.")
     fractions: tuple[float, ...] = Field(
-        (0.2, 0.4, 0.6, 0.8), description="Places of the control points on the main path.")
+        (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
+            "main path.")
     young: float | None = Field(
-        None, gt=0, description="Young's modulus to start from [Pa]; without it, from the force.")
+        None, gt=0, description="Young's modulus to start from [Pa]. Default: from the measured "
+            "force.")
     poisson: float | None = Field(
-        None, ge=0, lt=0.495, description="Poisson's ratio, fixed unless --fit-poisson.")
+        None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --fit-poisson is "
+            "given.")
     density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
-        True, description="The branch bears its own weight, and was scanned so.")
+        True, description="The branch carries its own weight, as when it was scanned.")
     field: Literal["open", "inverse_distance"] = Field(
-        "open", description="How Young's modulus runs between the control points. open: not "
-        "known; the pull and its interval decide. inverse_distance: exactly as the paper's.")
+        "open", description="Young's modulus between the control points. open: unknown, which "
+        "widens the intervals. inverse_distance: interpolated exactly as in the paper.")
     poisson_sigma: float = Field(
-        0.05, ge=0, description="Standard deviation of Poisson's ratio, where it is not fitted.")
+        0.05, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
     density_sigma: float = Field(
-        0.1, ge=0, description="Relative standard deviation of the density, where it acts.")
+        0.1, ge=0, description="Relative standard deviation of the density, if weight or inertia "
+            "acts.")
     fit_poisson: bool = Field(False, description="Estimate Poisson's ratio too.")
     fit_density: bool = Field(False, description="Estimate the density too.")
     fit_damping: bool = Field(False, description="Estimate Rayleigh damping too (dynamic only).")
     key_frames: int = Field(
-        12, ge=3, description="Frames that are simulated; a spline gives those between. Doubled "
-        "where that shows in the result.")
-    evaluations: int = Field(400, ge=1, description="Most forward simulations of all pulls.")
+        12, ge=3, description="Number of frames that are simulated; a spline interpolates the "
+        "others. It is doubled if that changes the result.")
+    evaluations: int = Field(400, ge=1, description="Largest number of forward simulations of "
+        "all pulls.")
     delta_m2: float | None = Field(
         None, gt=0, description="Nelder-Mead stops at this mean squared distance [m^2].")
-    robust: bool = Field(True, description="Outliers count less (Gauss-Newton).")
+    robust: bool = Field(True, description="Reduce the weight of outliers (Gauss-Newton).")
     hold_out: bool = Field(
-        True, description="With several pulls: fit without each in turn, and score it.")
+        True, description="With several pulls, fit without each one in turn and score the "
+            "prediction of it.")
     mesh_check: bool = Field(
-        True, description="At the end, see on a finer mesh how much this one is too stiff; it "
-        "enters the interval.")
+        True, description="Measure on a finer mesh how much too stiff this mesh is, and include "
+        "it in the intervals.")
     hung_sigma: float = Field(
-        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves that "
-        "hang on the branch beside its mesh: as far as two programs' volumes of one crown differ.")
+        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
+        "outside the mesh. The default is the difference between two programs' volumes of one "
+        "crown.")
     shapes: int = Field(
-        16, ge=0, description="At the end, pull so many branches that the scan allows as well; "
-        "how they differ enters the interval. 0: the radii's deviation alone, the axis as exact.")
+        16, ge=0, description="Number of other branch shapes, equally consistent with the scan, "
+        "that are pulled to include the shape's uncertainty in the intervals. 0: only that of "
+        "the radii.")
 
 
 class SwingSettings(Settings):
@@ -83,15 +92,16 @@ class SwingSettings(Settings):
     }
     common = ("pull",)
 
-    pull: str | None = Field(None, description="Name of the swing; without it the only one.")
-    periods: float = Field(6.0, ge=2, le=30, description="So many periods after the release.")
+    pull: str | None = Field(None, description="Name of the swing. Default: the only one.")
+    periods: float = Field(6.0, ge=2, le=30, description="Number of periods after the release "
+        "that are used.")
     poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
     density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
-        True, description="The branch bears its own weight, and was scanned so.")
+        True, description="The branch carries its own weight, as when it was scanned.")
     density_sigma: float = Field(
-        0.1, ge=0, description="Relative standard deviation of the density: inertia tells the "
-        "modulus, so it enters as it is.")
+        0.1, ge=0, description="Relative standard deviation of the density. A swing gives the "
+        "modulus by inertia, so this enters the modulus in full.")
 
 
 class VirtualPullSettings(Settings):
@@ -106,54 +116,58 @@ class VirtualPullSettings(Settings):
     common = ("seed",)
 
     young: tuple[float, ...] = Field(
-        (), description="True Young's modulus at the control points [Pa]; without it that of a "
+        (), description="True Young's modulus at the control points [Pa]. Default: that of a "
         "generated branch, or a gradient from 160 to 40 MPa.")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
     motion: Literal["quasi_static", "dynamic"] = Field(
         "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
-        "the branch; with --drive force it pulls and lets go.")
+        "the branch; with --drive force it pulls and releases it.")
     drive: Literal["pose", "force"] = Field(
-        "pose", description="What is said to move the branch; force: its force, as in the paper.")
+        "pose", description="What the recording states to move the branch: the gripper's pose, "
+            "or its force as in the paper.")
     weight: float | None = Field(
-        None, gt=0, description="Hang a growing weight of at last so many newtons on the grasp "
-        "instead of pulling sideways (slow, driven by force).")
+        None, gt=0, description="Instead of pulling sideways, hang a weight on the grasp that "
+        "grows to this value [N] (slow, driven by force).")
     damping: tuple[float, float] = Field(
         (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
     frames: int | None = Field(
-        None, ge=2, description="Number of recorded frames; without it 24, or 60 of a dynamic "
+        None, ge=2, description="Number of recorded frames. Default: 24, or 60 for a dynamic "
         "pull.")
     duration: float | None = Field(
-        None, gt=0, description="Length of the recording [s]; without it 6, or 1.5 of a dynamic "
+        None, gt=0, description="Duration of the recording [s]. Default: 6, or 1.5 for a dynamic "
         "pull.")
     grasp_fraction: float = Field(
-        0.92, gt=0, le=1, description="Where the branch is held. Past the last control point: "
-        "what lies beyond the grasp is not bent and cannot be estimated.")
+        0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
+        "must lie beyond the last control point: what is beyond the grasp is not bent and cannot "
+        "be estimated.")
     mode: Literal["clamped", "pinned"] = Field(
-        "pinned", description="pinned: held in a loop that lets the branch turn; clamped: turned "
-        "less than it would turn by itself, so that a torque acts.")
+        "pinned", description="pinned: held in a loop that lets the branch turn. clamped: turned "
+        "less than it would turn freely, so that a torque acts.")
     reach: float = Field(
-        0.35, gt=0, le=0.8, description="Sideways travel of the grasp over its arc length.")
-    turn: float = Field(2.0, description="How far the pull's direction turns on the way [rad].")
+        0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
+            "length.")
+    turn: float = Field(2.0, description="Angle by which the direction of the pull turns [rad].")
     phase: float | None = Field(
-        None, description="Direction in which it starts [rad]; without it drawn from the seed.")
+        None, description="Initial direction of the pull [rad]. Default: drawn from the seed.")
     position_noise: float = Field(1e-3, ge=0, description="Noise of observed points [m].")
     force_noise: float = Field(
-        0.02, ge=0, description="Noise of the force over its largest size.")
+        0.02, ge=0, description="Noise of the force as a fraction of its largest value.")
     torque_noise: float = Field(
-        0.02, ge=0, description="Noise of the torque over its largest size (clamped).")
+        0.02, ge=0, description="Noise of the torque as a fraction of its largest value (clamped).")
     gravity: bool = Field(
-        True, description="The branch bears its own weight, and was scanned so.")
+        True, description="The branch carries its own weight, as when it was scanned.")
     own_weight: bool = Field(
-        False, description="The shape is as drawn, without load: let gravity bend the branch out "
-        "of it, as for `limber import-pull --own-weight`.")
+        False, description="The shape is unloaded, as drawn: gravity bends the branch out of it, "
+        "as for `limber import-pull --own-weight`.")
     shape: Literal["likely", "fitted"] = Field(
-        "likely", description="What is pulled where only a scan is known. likely: a branch that "
-        "the scan allows as well as the reconstructed one, drawn from the seed; fitted: that one.")
+        "likely", description="The branch that is pulled if only a scan is known. likely: "
+        "another shape that is equally consistent with the scan, drawn from the seed. fitted: "
+        "the reconstructed shape.")
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")
-    seed: int = Field(0, ge=0, description="Seed of all that is random.")
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Fraction of points displaced by 5 cm.")
+    seed: int = Field(0, ge=0, description="Seed of everything random.")
 
     @property
     def frame_count(self) -> int:
@@ -178,10 +192,10 @@ class PredictSettings(Settings):
     common = ("weight", "load")
 
     pull: str | None = Field(
-        None, description="The pull whose points, grasp and gravity are taken; without it the "
-        "first one.")
-    weight: float | None = Field(None, ge=0, description="A hung weight [N].")
+        None, description="The pull whose points, grasp and gravity are used. Default: the first "
+        "one.")
+    weight: float | None = Field(None, ge=0, description="Weight that hangs on the grasp [N].")
     load: tuple[float, float, float] | None = Field(
-        None, description="A steady force in any direction, branch frame [N].")
+        None, description="Steady force in any direction, in the branch's frame [N].")
     gravity: bool = Field(
-        True, description="The branch bears its own weight, and was scanned so.")
+        True, description="The branch carries its own weight, as when it was scanned.")

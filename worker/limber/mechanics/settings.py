@@ -27,53 +27,59 @@ class SimulateSettings(Settings):
     common = ("name", "move", "grasp_force", "young")
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
-                      description="Name of the result: frames/NAME.pc2 and frames/NAME.json.")
+                      description="Name of the result files: frames/NAME.pc2 and frames/NAME.json.")
     kind: Literal["static", "dynamic"] = Field(
-        "dynamic", description="dynamic: motion in time; static: a path of equilibria.")
+        "dynamic", description="dynamic: motion in time. static: a sequence of equilibria.")
     move: tuple[float, float, float] | None = Field(
         None, description="Move the grasp by X Y Z [m].")
     turn: tuple[float, float, float] | None = Field(
         None, description="Turn the grasp by a rotation vector X Y Z [rad].")
     grasp_force: tuple[float, float, float] | None = Field(
-        None, description="Pull the grasp with a force X Y Z [N] instead of moving it.")
+        None, description="Pull the grasp by a force X Y Z [N] instead of moving it.")
     grasp_point: tuple[float, float, float] | None = Field(
-        None, description="Grasp at X Y Z [m] instead of where the mesh marks it.")
+        None, description="Position of the grasp X Y Z [m]. Default: the grasp that the mesh "
+            "marks.")
     grasp_radius: float = Field(
-        0.01, gt=0, description="Radius [m] of that grasp, and of the patches of --hold-at and "
-        "--load-at.")
+        0.01, gt=0, description="Radius of the grasp and of the patches of --hold-at and "
+        "--load-at [m].")
     grasp_mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="clamped: position and rotation held; pinned: position alone.")
+        "clamped", description="clamped: hold position and rotation. pinned: hold the position "
+            "only.")
     hold_at: tuple[Point, ...] = Field(
-        (), description="A second gripper or a tie holds the branch at X Y Z [m], as the grasp "
-        "mode says; may be given several times.", json_schema_extra={"metavar": "X Y Z"})
+        (), description="Position X Y Z [m] of another gripper or a tie, with the same grasp "
+        "mode. May be given several times.", json_schema_extra={"metavar": "X Y Z"})
     load_at: tuple[PointLoad, ...] = Field(
-        (), description="At X Y Z [m] a force FX FY FZ [N] grows with the pull; may be given "
-        "several times.", json_schema_extra={"metavar": "X Y Z FX FY FZ"})
+        (), description="A force FX FY FZ [N] at X Y Z [m] that grows with the pull. May be "
+        "given several times.", json_schema_extra={"metavar": "X Y Z FX FY FZ"})
     mass_at: tuple[PlacedMass, ...] = Field(
-        (), description="At X Y Z [m] hang KG (a fruit, a flower), from the start; may be given "
-        "several times.", json_schema_extra={"metavar": "X Y Z KG"})
-    duration: float = Field(1.0, gt=0, description="Time of the pull [s].")
-    hold: float = Field(0.5, ge=0, description="Time at the end of the pull [s] (dynamic).")
+        (), description="A mass KG [kg] (a fruit, a flower) that hangs at X Y Z [m] from the "
+        "start. May be given several times.", json_schema_extra={"metavar": "X Y Z KG"})
+    duration: float = Field(1.0, gt=0, description="Duration of the pull [s].")
+    hold: float = Field(0.5, ge=0, description="Duration of the hold at the end of the pull [s] "
+        "(dynamic).")
     frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames a second.")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
     scheme: Literal["energy_momentum", "newmark"] = Field(
-        "energy_momentum", description="energy_momentum: gains no energy however far the branch "
-        "swings; newmark: the paper's (dynamic).")
+        "energy_momentum", description="Time integration (dynamic). energy_momentum: keeps the "
+        "energy at any amplitude. newmark: the paper's.")
     newmark_beta: float = Field(
         0.25, gt=0, le=0.5, description="Newmark's beta (--scheme newmark).")
     newmark_gamma: float = Field(
-        0.5, ge=0.5, le=1, description="Newmark's gamma (--scheme newmark); over 0.5 damps fast "
-        "vibration.")
+        0.5, ge=0.5, le=1, description="Newmark's gamma (--scheme newmark); values above 0.5 "
+        "damp fast vibration.")
     lumped_mass: bool = Field(
-        False, description="Mass at the nodes alone instead of the consistent mass matrix.")
+        False, description="Lump the mass at the nodes instead of using the consistent mass "
+            "matrix.")
     young: float | None = Field(
-        None, gt=0, description="Young's modulus everywhere [Pa] instead of the mesh's.")
+        None, gt=0, description="Young's modulus of the whole branch [Pa]. Default: the mesh's.")
     gravity: bool = Field(
-        True, description="The branch bears its own weight, and was scanned so.")
+        True, description="The branch carries its own weight, as when it was scanned.")
     rest_shape: bool = Field(
-        True, description="Take the scan as already sagging under gravity; else gravity bends it.")
+        True, description="The scanned shape already sags under gravity. Otherwise gravity bends "
+            "it further.")
     material: Annotated[str, OneOf(material_names)] = Field(
         "st_venant_kirchhoff", description="Material law.")
-    damping_mass: float = Field(0.5, ge=0, description="Damping on velocity [1/s].")
-    damping_stiffness: float = Field(0.002, ge=0, description="Damping on strain rate [s].")
-    vtu: bool = Field(False, description="Also write a VTU series that ParaView opens.")
+    damping_mass: float = Field(0.5, ge=0, description="Mass-proportional Rayleigh damping [1/s].")
+    damping_stiffness: float = Field(0.002, ge=0, description="Stiffness-proportional Rayleigh "
+        "damping [s].")
+    vtu: bool = Field(False, description="Also write a VTU series for ParaView.")

@@ -16,20 +16,21 @@ class EnergySettings(Settings):
         "solver": ("forward",),
     }
     samples: int = Field(225, ge=30, description=(
-        "Grasp positions to solve: two thirds lie evenly, the others where neighbours do not "
-        "agree."))
+        "Number of grasp positions to solve. Two thirds are spread evenly; the others are placed "
+        "where neighbouring solutions disagree."))
     field_error: float | None = Field(None, gt=0, description=(
-        "Percent that the energy may be off at samples left out of the fit (root mean square over "
-        "theirs): more poses are solved where it is off most, up to four times --samples."))
+        "Largest error of the energy [%] at samples left out of the fit (root mean square). "
+        "Poses are added where the error is largest, up to four times --samples."))
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
-        "Largest distance from rest, as a share of the branch's length up to the grasp."))
+        "Largest distance from the rest position, as a fraction of the branch's length up to the "
+        "grasp."))
     gravity: bool = Field(True, description=(
-        "The branch bears its own weight, and was scanned so. Otherwise it has no weight."))
-    seed: int = Field(0, ge=0, description="Of the sampled positions.")
+        "The branch carries its own weight, as when it was scanned. Otherwise it has no weight."))
+    seed: int = Field(0, ge=0, description="Seed of the sampled positions.")
     forward: Literal["full", "reduced"] = Field("full", description=(
-        "reduced: the model that `limber session --mode pinned` learns, kept for both and learnt "
-        "first where there is none; each of its states is corrected once by the full model, which "
-        "solves those in doubt."))
+        "full: solve every pose on the full model. reduced: use the model that `limber session "
+        "--mode pinned` learns, and learn it first if there is none. The full model corrects "
+        "each state once and solves doubtful ones."))
 
 
 class PlanSettings(Settings):
@@ -48,78 +49,80 @@ class PlanSettings(Settings):
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
-        "chosen and named."))
+        "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "
+        "is chosen and stated."))
     tip_goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the branch's tip (its flower), or --target, shall be, in the branch's frame [m]."))
+        "Goal position of the branch's tip, or of --target, in the branch's frame [m]."))
     target: str | None = Field(None, description=(
-        "Named target (`limber target`) that --tip-goal, --target-box, --in-view and "
-        "--second-arm speak of; without it the tip."))
+        "Named target (`limber target`) for --tip-goal, --target-box, --in-view and "
+        "--second-arm. Default: the tip."))
     target_box: tuple[float, float, float, float, float, float] | None = Field(None, description=(
-        "Box that the target shall be in: lower corner, upper corner, in the branch's frame [m]."))
+        "Box that the target must reach: lower corner, upper corner, in the branch's frame [m]."))
     in_view: bool = Field(False, description=(
-        "The target shall be in the view of the cell's camera: in its picture, in its range, and "
+        "The target must be visible to the cell's camera: in its picture, within its range, and "
         "not hidden by the branch."))
     second_arm: bool = Field(False, description=(
-        "The target shall be where the cell's second arm can take it."))
+        "The target must be within reach of the cell's second arm."))
     goal_seed: int | None = Field(None, ge=0, description=(
-        "A grasp pose drawn at random from the paper's hemisphere, above the base and as far as "
-        "the branch is long, among those known, allowed and far from rest."))
+        "Seed of a random goal in the paper's hemisphere: above the base, no farther than the "
+        "branch is long, among sampled poses that are allowed and far from rest."))
     goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
-        "Where the grasp starts [m]; default the rest pose."))
+        "Start position of the grasp [m]. Default: the rest pose."))
     start_seed: int | None = Field(None, ge=0, description=(
-        "Start from a random deformed configuration instead, as in the paper's trials."))
+        "Seed of a random deformed start configuration, as in the paper's trials."))
     deformation_weight: float = Field(1.0, ge=0, description=(
         "Weight of deformation, the paper's alpha_def."))
     distance_weight: float = Field(1.5, gt=0, description=(
         "Weight of distance, the paper's alpha_dis."))
     max_detour: float | None = Field(None, ge=0, le=1000, description=(
-        "The gentlest path that is at most so many percent longer than the shortest one; sets the "
-        "weight of distance."))
+        "Largest extra length over the shortest path [%]. The weight of distance is set so that "
+        "the gentlest such path is found."))
     max_energy: float | None = Field(None, gt=0, description=(
-        "Deformation energy that no pose may exceed [J]."))
+        "Largest deformation energy of any pose [J]."))
     max_force: float | None = Field(None, gt=0, description=(
-        "Force of the gripper that no pose may exceed [N]."))
+        "Largest force of the gripper at any pose [N]."))
     max_axial_force: float | None = Field(None, gt=0, description=(
-        "Part of that force along the branch, pulling or pushing, that no pose may exceed [N]."))
+        "Largest component of that force along the branch, pulling or pushing [N]."))
     max_torque: float | None = Field(None, gt=0, description=(
-        "Torque of the gripper that no pose may exceed [Nm]. A gripper that turns as the branch "
-        "does needs nearly none."))
+        "Largest torque of the gripper at any pose [Nm]. A gripper that turns with the branch "
+        "needs almost none."))
     max_strain: float | None = Field(None, gt=0, lt=1, description=(
-        "Largest principal strain anywhere in the branch that no pose may exceed (0.01 is 1 %)."))
+        "Largest principal strain anywhere in the branch at any pose (0.01 is 1 %)."))
     wood: Literal["ash", "cherry", "maple", "oak", "walnut"] | None = Field(None, description=(
-        "Limit the strain to half of what green wood of this kind breaks at (0.3 %; Wood Handbook "
-        "FPL-GTR-190); young shoots bear more: --max-strain."))
+        "Limit the strain to half of that at which green wood of this species breaks (0.3 %; "
+        "Wood Handbook FPL-GTR-190). Young shoots bear more; give --max-strain for them."))
     max_stress: float | None = Field(None, gt=0, description=(
-        "Largest principal stress anywhere in the branch that no pose may exceed [Pa]; held for "
-        "the stiff end of the estimate's intervals."))
+        "Largest principal stress anywhere in the branch at any pose [Pa], for the stiff end of "
+        "the estimate's intervals."))
     workspace_low: tuple[float, float, float] | None = Field(None, description=(
-        "Lower corner of the box that the grasp stays in, in the branch's frame [m]."))
+        "Lower corner of the box that the grasp must stay in, in the branch's frame [m]."))
     workspace_high: tuple[float, float, float] | None = Field(None, description=(
         "Upper corner of that box [m]."))
     confidence: float | None = Field(None, ge=0.5, lt=1, description=(
-        "Probability with which the limits are kept, Young's modulus being as uncertain as the "
-        "estimate says; without it they are kept for the estimate."))
-    speed: float = Field(0.02, gt=0, le=0.25, description="Of the gripper, at most [m/s].")
+        "Probability that the limits hold, given the uncertainty of the estimated Young's "
+        "modulus. Default: they hold for the estimate itself."))
+    speed: float = Field(0.02, gt=0, le=0.25, description="Largest speed of the gripper [m/s].")
     acceleration: float = Field(0.1, gt=0, le=2.0, description=(
-        "Of the gripper, at most [m/s^2]; the motion stands still at both ends of the path."))
+        "Largest acceleration of the gripper [m/s^2]. The motion is at rest at both ends of the "
+        "path."))
     inertia: bool = Field(True, description=(
-        "Where there are limits, the motion keeps them also in time, with the branch's inertia; "
-        "it is slowed down until it does. Otherwise they are kept at every pose, standing still."))
+        "Check the limits also in motion, with the branch's inertia, and slow the motion down "
+        "until they hold. Otherwise they hold at every pose at rest."))
     slowings: int = Field(4, ge=0, le=10, description=(
-        "How often at most to slow the motion down for that."))
+        "Largest number of times that the motion is slowed down."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
-        "eikonal: the cheapest way on a grid, refined, mostly within 1 % of the best possible "
-        "path; d-rrt-star: the paper's D-RRT*. Either comes with a proven bound."))
-    iterations: int = Field(3000, ge=100, le=200_000, description="Samples of RRT* and D-RRT*.")
+        "eikonal: the least-cost path on a grid, refined; mostly within 1 % of the best possible "
+        "path. d-rrt-star: the paper's D-RRT*. Both state a proven lower bound."))
+    iterations: int = Field(3000, ge=100, le=200_000, description="Number of samples of RRT* and "
+        "D-RRT*.")
     engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
-        "For RRT* and D-RRT*: OMPL's or our own; auto: OMPL where it is installed."))
+        "Implementation of RRT* and D-RRT*: OMPL's or our own. auto: OMPL if it is installed."))
     field_error: float = Field(3.0, gt=0, description=(
-        "Percent by which the field's energy may be off the full model's along the plan (root mean "
-        "square); where it is more, the states found are added to the field and it is planned "
-        "anew."))
+        "Largest error of the field's energy along the plan, compared with the full model [%] "
+        "(root mean square). If it is larger, the states found are added to the field and "
+        "planning is repeated."))
     replans: int = Field(3, ge=0, le=10, description=(
-        "How often at most to plan anew, where the full model breaks a limit, the field is off, or "
-        "its error leaves in doubt that no path keeps the limits."))
-    seed: int = Field(0, ge=0, description="Of both planners.")
+        "Largest number of repeated plans: if the full model breaks a limit, if the field's "
+        "error is too large, or if that error leaves open whether a path exists."))
+    seed: int = Field(0, ge=0, description="Seed of both planners.")

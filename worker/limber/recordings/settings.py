@@ -25,71 +25,73 @@ class ImportSettings(Settings):
     }
     common = ("unit", "grasp_point", "cell")
 
-    kind: Kind = Field("auto", description="What SOURCE is; auto goes by its name and content.")
-    robot: str | None = Field(None, description="CSV of the gripper: time, pose and wrench.")
+    kind: Kind = Field("auto", description="Kind of SOURCE. auto: by its name and content.")
+    robot: str | None = Field(None, description="CSV of the gripper with time, pose and wrench.")
     unit: Literal["m", "cm", "mm"] | None = Field(
-        None, description="Unit of positions in SOURCE; without it that of the columns' names, "
+        None, description="Unit of positions in SOURCE. Default: the unit in the columns' names, "
         "else metres.")
     force_unit: Literal["N", "gf", "mN", "lbf", "kgf", "kN"] | None = Field(
-        None, description="Unit of forces; without it that of the columns' names, else newtons.")
+        None, description="Unit of forces. Default: the unit in the columns' names, else newtons.")
     rate_hz: float | None = Field(
-        None, gt=0, description="Frames a second, where SOURCE has no time stamps.")
+        None, gt=0, description="Frames a second, if SOURCE has no time stamps.")
     nominal: str | None = Field(
-        None, description="CSV label,x_m,y_m,z_m: the markers' places on the branch at rest; the "
-        "recording's first frames are fitted to it rigidly.")
+        None, description="CSV with label,x_m,y_m,z_m: positions of the markers on the branch at "
+        "rest. The recording's first frames are fitted to them rigidly.")
     coordinates: Literal["branch", "scan"] = Field(
-        "branch", description="Frame of --nominal, --grasp-point and --load: the branch folder's, "
-        "or that of the file it was made from.")
+        "branch", description="Coordinates of --nominal, --grasp-point and --load: the branch "
+        "folder's, or those of the scan's file.")
     grasp_point: tuple[float, float, float] | None = Field(
-        None, description="Where the gripper holds or the load hangs, at rest [m]; else the "
-        "robot's first pose.")
+        None, description="Position of the grasp or the load at rest [m]. Default: the robot's "
+        "first pose.")
     grasp_radius: float = Field(
-        0.01, gt=0, description="Radius of the grasp patch; half the length of the piece that a "
-        "clamping gripper holds [m].")
+        0.01, gt=0, description="Radius of the grasp patch, or half the length of the piece that "
+        "a clamping gripper holds [m].")
     grasp_mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="clamped: the gripper also turns the branch.")
+        "clamped", description="clamped: the gripper holds position and rotation. pinned: it "
+            "holds the position only.")
     weight: float | None = Field(
-        None, ge=0, description="No robot, but a weight of so many newtons that hangs at "
-        "--grasp-point: SOURCE shows the branch without it first, at rest under it last. 0 with "
-        "--own-weight: held up first, it sags under its own weight.")
+        None, ge=0, description="Weight [N] that hangs at --grasp-point instead of a robot's "
+        "pull. SOURCE begins without it and ends at rest under it. 0 with --own-weight: the "
+        "branch is held up first, then sags under its own weight.")
     load: tuple[float, float, float] | None = Field(
-        None, description="The same for a steady force in any direction [N].")
+        None, description="As --weight, for a steady force in any direction [N].")
     own_weight: bool = Field(
-        False, description="The branch's own weight is not in its shape at rest (it was held up, "
-        "or scanned lying): it acts as well.")
+        False, description="The scanned shape does not include the sag under the branch's own "
+        "weight (it was held up, or scanned lying), so the weight acts as well.")
     drive: Literal["pose", "force"] = Field(
-        "pose", description="What drives the simulation; the other is compared with it.")
+        "pose", description="What drives the simulation; the other is compared with the recording.")
     motion: Literal["quasi_static", "dynamic", "swing"] = Field(
-        "quasi_static", description="dynamic where inertia matters; swing: let go without a robot "
+        "quasi_static", description="dynamic: inertia matters. swing: released without a robot "
         "(with --weight or --load), for `limber swing`.")
     swing_start: Literal["held", "loaded"] = Field(
-        "held", description="A swing starts held in the shape at rest, until weight and load act; "
-        "or loaded: bent by the load until that is gone.")
+        "held", description="Start of a swing. held: in the rest shape, until weight and load "
+        "act. loaded: bent by the load until it is removed.")
     time_offset: float | None = Field(
-        None, description="Added to SOURCE's time stamps [s]; without it, it is estimated.")
+        None, description="Added to SOURCE's time stamps [s]. Default: estimated.")
     position_sigma: float | None = Field(
-        None, gt=0, description="Noise of positions [m]; without it 1 mm, under a steady load "
+        None, gt=0, description="Noise of positions [m]. Default: 1 mm, or under a steady load "
         "what the recording shows.")
     force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
     torque_sigma: float | None = Field(
-        None, gt=0, description="Noise of torques about the pose's position [N m]; a clamped "
-        "gripper's torque is used only where this is known.")
+        None, gt=0, description="Noise of torques about the pose's position [N m]. A clamped "
+        "gripper's torque is used only if this is given.")
     cell: str | None = Field(
-        None, description="Cell file of the robot: its base in the branch's frame, and where its "
-        "joints take the gripper.")
+        None, description="The robot's cell file: its base in the branch's frame, and its "
+        "kinematics.")
     frame_pose: tuple[float, float, float, float, float, float] | None = Field(
-        None, description="Pose of the frame that gripper poses are given in, in the branch's: "
-        "[m] and rotation vector [rad]; else the cell's base.")
-    wrench_topic: str | None = Field(None, description="Topic of the wrench, where there are two.")
+        None, description="Pose, in the branch's frame, of the frame that gripper poses are "
+        "given in: [m] and rotation vector [rad]. Default: the cell's base.")
+    wrench_topic: str | None = Field(None, description="Topic of the wrench, if there are several.")
     pose_topic: str | None = Field(
-        None, description="Topic of the gripper's pose, or its frame in TF, where there are two.")
+        None, description="Topic of the gripper's pose, or its TF frame, if there are several.")
     points_topic: str | None = Field(
-        None, description="Topic of markers, clouds or depth images; none: nothing was seen.")
+        None, description="Topic of markers, clouds or depth images. none: nothing was observed.")
     bag_clock: Literal["header", "log"] = Field(
-        "header", description="Time stamps of a bag: those of the messages, or when each came.")
+        "header", description="Time stamps of a bag: those in the messages' headers, or the "
+            "times of logging.")
     yolo_weights: str | None = Field(
         None, description="Weights file of a YOLO segmentation model of your own, for masks of "
         "an RGB-D folder's colour images (needs ultralytics).")
     yolo_prompt: str | None = Field(
-        None, description="What it shall look for, for open-vocabulary models.")
-    yolo_class: str | None = Field(None, description="Which of its classes is the branch.")
+        None, description="Prompt for open-vocabulary models.")
+    yolo_class: str | None = Field(None, description="Name of the class that is the branch.")

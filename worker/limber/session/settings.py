@@ -12,18 +12,23 @@ class SessionSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="What the marked grasp holds: the pose, or the position alone.")
-    grasp: bool = Field(True, description="Start with the marked grasp held; else nothing is.")
-    gravity: bool = Field(True, description="The branch bears its weight, and was scanned so.")
+        "clamped", description="What the marked grasp holds: position and rotation, or the "
+            "position only.")
+    grasp: bool = Field(True, description="Start with the marked grasp held. Otherwise nothing "
+        "is held.")
+    gravity: bool = Field(True, description="The branch carries its own weight, as when it was "
+        "scanned.")
     reduced: bool = Field(
-        True, description="Learn a reduced model of what is held; else the full one answers.")
-    grasps: int = Field(160, ge=2, description="Full solutions to learn from.")
+        True, description="Learn a reduced model of the held branch. Otherwise the full model "
+            "answers.")
+    grasps: int = Field(160, ge=2, description="Number of full solutions to learn from.")
     size: int = Field(80, ge=13, description="Reduced coordinates.")
     fields: int = Field(130, ge=10, description="Reduced strain fields.")
     young_spread: float = Field(
-        1.0, ge=1, description="Factor within which Young's modulus will change; 1: it stays.")
+        1.0, ge=1, description="Factor within which Young's modulus will change. 1: it is "
+            "constant.")
     cache: bool = Field(True, description="Use and keep learnt models.")
     cache_folder: Path | None = Field(
         None, description="Folder for learnt models instead of the user's cache.")
     positions: Path | None = Field(
-        None, description="File for the frames instead of a temporary one.")
+        None, description="File for the frames. Default: a temporary file.")

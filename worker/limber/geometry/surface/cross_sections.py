@@ -6,7 +6,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import resample
 
 SPACING = 1.5
-"""Distance of cross-sections in local radii."""
+"Distance between cross-sections in local radii."
 
 _SIDES, _MOST_SIDES = 12, 48
 _FACET = 0.025  # how far a carrier's facets may be off its circle, in radii of its thinnest twig

@@ -56,7 +56,7 @@ class SuggestPullSettings(Settings):
         "Largest principal strain that a pull may put the branch to (0.01 is 1 %)."))
     max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
     gravity: bool = Field(True, description=(
-        "The branch bears its own weight, and was scanned so."))
+        "The branch carries its own weight, as when it was scanned."))
 
 
 def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: str | None = None,

@@ -35,7 +35,7 @@ class GenerateSettings(BranchSpec):
     groups: ClassVar[Groups] = {"shape": ("seed",)}
     common = ("seed",)
 
-    seed: int = Field(0, description="Seed of all that is random.")
+    seed: int = Field(0, description="Seed of everything random.")
 
 
 def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
