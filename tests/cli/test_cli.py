@@ -147,8 +147,8 @@ def test_a_forgotten_output_is_named_after_the_input(capfd):
     """`limber reconstruct ten.xyz` proposes -o ten.branch."""
     assert main.call(["reconstruct", "scans/ten.xyz"]) == 2
     assert capfd.readouterr().err == (
-        "error: Missing option -o (--output). The branch folder to make; with a folder of scans, "
-        "where to make them. Add, for example: -o ten.branch\n")
+        "error: Missing option -o (--output). The branch folder to make. With a folder of "
+        "scans: where to make the branch folders. Add, for example: -o ten.branch\n")
 
 
 HEAVY = {"numpy", "pydantic", "scipy", "numba", "rich", "trimesh", "matplotlib"}

@@ -140,10 +140,10 @@ def exposed(slope, value=0.8):
 
 
 @pytest.mark.parametrize(("value", "now", "after", "worth", "words"), [
-    (0.5, 0.2, 0.1, False, "none holds it back"),
+    (0.5, 0.2, 0.1, False, "none of them restricts it"),
     (0.8, 0.25, 0.05, True, "does not keep force"),
     (0.95, 0.25, 0.2, True, "not expected to after one"),
-    (0.8, 0.13, 0.04, True, "more of that could be used"),
+    (0.8, 0.13, 0.04, True, "more of that limit could be used"),
     (0.8, 0.13, 0.12, False, "only"),
 ])
 def test_a_pull_is_worth_it_where_it_changes_what_a_plan_may_do(value, now, after, worth, words):

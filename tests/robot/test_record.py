@@ -245,7 +245,7 @@ def test_way_points_begin_at_the_gripper(tmp_path):
     assert frames[:, :3, 3] == pytest.approx(np.array(
         [[0.1, 0, 0.4], [0.12, 0, 0.4], [0.12, 0.02, 0.39]]))
     assert frames[:, :3, :3] == pytest.approx(np.tile(frames[0, :3, :3], (3, 1, 1)))
-    with pytest.raises(InputError, match=r"10\.0 mm from the gripper"):
+    with pytest.raises(InputError, match=r"10\.0 mm away from the gripper"):
         way_through(path, gripper + np.r_[-9e-3, np.zeros(5)])
 
 

@@ -59,7 +59,7 @@ def test_a_load_is_needed_and_lies_on_the_branch(tip):
     """No load, one without mass, one somewhere else: told what is wrong."""
     for settings, words in ((LoadSettings(), "No load"),
                             (LoadSettings(fruit=((*tip, 0.0),)), "without mass"),
-                            (LoadSettings(fruit=((9.0, 0.0, 0.0, 1.0),)), "off the branch")):
+                            (LoadSettings(fruit=((9.0, 0.0, 0.0, 1.0),)), "away from the branch")):
         with pytest.raises(InputError, match=words):
             load(EXAMPLE, settings)
 

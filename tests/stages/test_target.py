@@ -65,7 +65,7 @@ def test_one_that_is_there_is_left_as_it_is(folder):
 
 
 @pytest.mark.parametrize(("name", "settings", "words"), [
-    ("flower", {"at": (0.2, 0.0, 0.2)}, "off the branch"),
+    ("flower", {"at": (0.2, 0.0, 0.2)}, "away from the branch"),
     ("flower", {"at": (0.0, 0.0, 200.0)}, "unit"),
     ("flower", {"at": (float("nan"), 0.0, 0.1)}, "finite"),
     ("../flower", {"at": (0.0, 0.0, 0.1)}, "cannot name"),

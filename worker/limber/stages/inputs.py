@@ -48,8 +48,8 @@ class ParallelOptions(RunOptions):
     groups: ClassVar[Groups] = {"running": ("workers",)}
 
     workers: int | None = Field(None, ge=1, description=(
-        "At most so many processes side by side; by default one a core (LIMBER_CORES). The result "
-        "is the same."))
+        "Largest number of parallel processes. Default: one per core (LIMBER_CORES). The result "
+        "does not depend on it."))
 
 
 class NoOptions(Settings):

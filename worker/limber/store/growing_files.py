@@ -57,7 +57,7 @@ class Stream:
         except OSError as error:
             self._lock.release()
             raise BranchFolderError(f"{self.path} cannot be written ({error.strerror}).",
-                                    "It is to grow there.", "Choose another place.") from error
+                                    "It is to grow there.", "Choose another location.") from error
         self._waiting: list[bytes] = []
         self._guard = threading.Lock()
         self._closing = threading.Event()

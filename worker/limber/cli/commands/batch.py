@@ -63,7 +63,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
 
     if cluster is not None and scheduler is not None:
         raise InputError("Both --cluster and --scheduler are given.",
-                         "The one starts a cluster, the other uses one.", "Leave one out.")
+                         "The one starts a cluster, the other uses one.", "Omit one of them.")
     jobs = read_jobs(job_file)
     if emit is not None:
         from limber.batch.jobs.scheduler_scripts import write_script

@@ -206,7 +206,7 @@ def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
                          "A line has name,x_m,y_m,z_m.", "Correct the file.") from error
     if not np.isfinite(numbers).all():
         raise InputError(f"{path} has a number that is not finite.",
-                         "A place has three finite numbers.", "Correct the file.")
+                         "A position has three finite numbers.", "Correct the file.")
     if numbers.ndim != 2 or numbers.shape[1] not in (3, 9):
         raise InputError(f"{path} has {numbers.shape[-1]} numbers a line.",
                          "Three, or nine with the robot's pose, were expected.",

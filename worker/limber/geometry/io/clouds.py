@@ -51,7 +51,7 @@ def read_points(path: Path) -> Cloud:
     if reader is None:
         known = " ".join(sorted(READERS))
         raise InputError(f"{path.name} has a suffix that is not known.",
-                         f"Known are: {known}.", "Export the cloud as one of these.")
+                         f"Known suffixes: {known}.", "Export the cloud as one of these.")
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty.", "A point cloud was expected.", "Export it again.")
     try:

@@ -41,7 +41,7 @@ class Drive:
             if not self.grasps or grasp_forces is not None:
                 raise InputError("Poses without a grasp, or together with grasp forces.",
                                  "A grasp follows poses or exerts a force, not both.",
-                                 "Leave one out.")
+                                 "Omit one of them.")
             self.path = PosePath(self.grasps, model.mesh.nodes, self.times, poses)
         self._weight = model.weight_force
         self._nodal_forces = self._checked_nodal_forces(nodal_forces)

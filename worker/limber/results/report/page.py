@@ -164,7 +164,7 @@ def _estimate(branch: Branch) -> Section:
             estimate["truth"]["assumed"] = True
     for title, rows in [
             ("What makes it unsure: standard deviations", deviation_rows(estimate)),
-            ("Pulls foretold by a fit that did not see them: RMS errors",
+            ("Pulls predicted by a fit without them: RMS errors",
              held_out_rows(estimate))]:
         if rows:
             section.tables.append((title, rows))

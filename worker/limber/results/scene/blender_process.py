@@ -20,7 +20,7 @@ def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
 
     progress(0.0, "starting Blender")
     result = run_json_process("scene", [*blender_command(), "--", *map(str, arguments)], progress,
-                              fix="`limber doctor` says which Blender was used.")
+                              fix="`limber doctor` states which Blender was used.")
     return {key: result[key] for key in ("object_count", "frame_count", "blender")}
 
 

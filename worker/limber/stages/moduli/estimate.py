@@ -39,18 +39,17 @@ class EstimateOptions(RunOptions):
     common = ("bag",)
 
     bag: Path | None = Field(
-        None, description="Import this recording first (MCAP, rosbag2, RTDE log) as the pull of "
-        "its name, and estimate from it; `limber import-pull` where more has to be said.")
+        None, description="Import this recording first (MCAP, rosbag2, RTDE log) as a pull with "
+        "the file's name, and estimate from it. `limber import-pull` has more options.")
     cell: Path | None = Field(
-        None, description="With --bag: cell file of the robot, which says where its base stands "
-        "and how well gripper and force sensor are known.")
+        None, description="With --bag: the robot's cell file, which states its base and how well "
+        "gripper and force sensor are known.")
     resume: bool = Field(False, json_schema_extra={"switch": True}, description=(
-        "Start at the best that a stopped run found; otherwise what it left behind does not "
-        "count."))
+        "Start from the best result of a stopped run. Otherwise that result is ignored."))
     follow: bool = Field(
         False, description="Estimate frame by frame while a pull is recorded, or replay one.",
         json_schema_extra={"switch": True})
-    pace: float = Field(1.0, ge=0, description="Speed of a replay; 0: as fast as it goes.")
+    pace: float = Field(1.0, ge=0, description="Speed of a replay; 0: as fast as possible.")
 
 
 def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
@@ -226,7 +225,7 @@ def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: 
             foretell(pull, subject, found, settings)
         except LimberError as error:
             progress.warn(
-                f"{name}, which the estimate did not use, could not be scored: {error}")
+                f"The pull {name}, which the estimate did not use, could not be scored: {error}")
 
 
 def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptions,
@@ -235,8 +234,8 @@ def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptio
     if options.bag is not None:
         settings = _with_bag(inputs.branch_folder, options.bag, options.cell, settings, progress)
     elif options.cell is not None:
-        raise InputError("--cell is given without --bag.", "A pull that is in the folder says for "
-                         "itself how well its robot is known.", "Leave --cell out.")
+        raise InputError("--cell was given without --bag.", "A pull in the branch folder already "
+                         "states how well its robot is known.", "Omit --cell.")
     if options.follow:
         return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
     return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,
@@ -262,9 +261,9 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 
     tables = [("Young's modulus", modulus_rows(result, None))]
     if causes := cause_rows(result):
-        tables.append(("What makes it unsure, largest first", causes))
+        tables.append(("Sources of uncertainty, largest first", causes))
     if held_out := held_out_rows(result):
-        tables.append(("Pulls foretold by a fit that did not see them: RMS errors", held_out))
+        tables.append(("Pulls predicted by a fit without them: RMS errors", held_out))
     return tables
 
 

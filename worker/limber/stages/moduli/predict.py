@@ -51,7 +51,7 @@ def _entry(branch: Branch, name: str | None) -> PullEntry:
     if not names or (name is not None and name not in names):
         raise InputError(f"{branch.folder} has no pull {name or ''}.",
                          f"It has {', '.join(names)}." if names else "It has none.",
-                         "Bring one in with `limber import-pull`.")
+                         "Import one with `limber import-pull`.")
     return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
 
 

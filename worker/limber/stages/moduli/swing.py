@@ -46,7 +46,7 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
                    "pulls": pulls_digest(branch, [pull.name])}
         if not force and branch.is_current("swing", settings, digests=digests):
             return branch.manifest.stages["swing"].result
-        about = present(pull.entry.swing, "record of how the branch was let go")
+        about = present(pull.entry.swing, "record of the branch's release")
         seen = present(pull.observations, "observation of the swing")
         rest = np.array(pull.entry.rest_points_m)
         warnings: list[str] = []
@@ -61,9 +61,9 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
             progress=progress.keeping(warnings).part(0.0, 0.95))
         if not found.converged:
             raise WorkError("The fit of the swing did not converge.",
-                            f"What is left over is {100 * found.relative_residual:.0f} % of the "
+                            f"The residual is {100 * found.relative_residual:.0f} % of the "
                             "largest displacement.",
-                            "Check load, mass and density; or fit fewer --periods.")
+                            "Check load, mass and density, or fit fewer --periods.")
         young = found.factor * model.young
         result = _summary(found, young, pull, warnings)
         with branch.stage("swing", settings, digests=digests) as stage:
@@ -90,12 +90,13 @@ def _pull(branch: Branch, wanted: str | None) -> Pull:
         raise InputError(
             f"{branch.folder} has no swing {wanted or ''}.",
             f"It has {', '.join(swings)}." if swings else "It has none.",
-            "Name one with --pull; bring one in with `limber import-pull --motion swing --weight`.")
+            "Name one with --pull, or import one with `limber import-pull --motion swing "
+            "--weight`.")
     pull = read_pull(branch.path(f"pulls/{wanted}"))
     if pull.entry.swing is None or pull.observations is None or pull.entry.rest_points_m is None:
         raise InputError(f"{wanted}: pull.toml lacks [swing] or rest_points_m, or no markers.",
-                         "How it was let go and where its markers are at rest must be known.",
-                         "Bring it in with `limber import-pull --motion swing`.")
+                         "The release and the markers' rest positions must be known.",
+                         "Import it with `limber import-pull --motion swing`.")
     return pull
 
 

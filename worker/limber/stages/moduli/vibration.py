@@ -48,15 +48,15 @@ class VibrationSettings(Settings):
                                 "known": ("density_sigma", "radius_sigma")}
     common = ("sensor",)
 
-    start: float | None = Field(None, description="When the branch is left to itself, on the "
-                                "record's clock [s]; by default where it moves most.")
+    start: float | None = Field(None, description="Time at which the branch is released, on the "
+                                "record's clock [s]. Default: where it moves most.")
     sensor: tuple[float, float, float, float] | None = Field(
-        None, description="Place [m] and mass [kg] of a sensor that swings with the branch.",
+        None, description="Position [m] and mass [kg] of a sensor that swings with the branch.",
         json_schema_extra={"metavar": "X Y Z KG"})
-    density_sigma: float = Field(0.1, ge=0, le=1, description="Standard deviation of the wood's "
-                                 "density, as a share of it.")
-    radius_sigma: float = Field(0.02, ge=0, le=1, description="Standard deviation of the scan's "
-                                "radii as a whole, as a share of them.")
+    density_sigma: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the "
+                                 "wood's density.")
+    radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
+                                "scan's radii as a whole.")
 
 
 def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
@@ -80,7 +80,7 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
     from limber.store.loading import load_branch, load_mesh
 
     if not Path(record).is_file():
-        raise InputError(f"There is no file {record}.", "A record of how the branch rings was "
+        raise InputError(f"There is no file {record}.", "A record of the branch's vibration was "
                          "expected.", "Check the path.")
     rung = read_record(Path(record))
     for text in rung.warnings:
@@ -130,7 +130,7 @@ def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> 
         factor *= float(np.exp(way / slope))
     else:
         raise WorkError(f"No modulus gives the branch a first frequency of {wanted:.3g} Hz.",
-                        "Its weight or what hangs on it does not fit the record.",
+                        "The branch's mass, or what hangs on it, does not match the record.",
                         "Check density, --sensor and the record's unit of time.")
     slope = 0.5 if last is None else slope
     near = found[found < _CLOSE * found[0]]
@@ -151,8 +151,9 @@ def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel
     x, y, z, mass = settings.sensor
     away = float(np.linalg.norm(model.mesh.nodes - np.array([x, y, z]), axis=1).min())
     if not (mass > 0 and away < 0.1):
-        raise InputError(f"A sensor of {mass:g} kg, {1e3 * away:.0f} mm off the branch.",
-                         "It has a mass and sits on the branch.", "Check --sensor X Y Z KG.")
+        raise InputError(f"A sensor of {mass:g} kg lies {1e3 * away:.0f} mm off the branch.",
+                         "A sensor needs a mass and a position on the "
+                         "branch.", "Check --sensor X Y Z KG.")
     return model.with_point_masses([*model.point_masses, PointMass((x, y, z), mass)])
 
 

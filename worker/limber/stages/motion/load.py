@@ -38,38 +38,39 @@ class LoadSettings(Settings):
     common = ("wind", "snow", "fruit", "cut", "name")
 
     wind: tuple[float, float, float] | None = Field(
-        None, description="Velocity of the wind, branch frame [m/s].",
+        None, description="Wind velocity in the branch's frame [m/s].",
         json_schema_extra={"metavar": "X Y Z"})
     drag: float = Field(1.1, gt=0, le=5, description="Drag coefficient of a round branch across "
-                        "the wind; leaves are not in it.")
+                        "the wind, without leaves.")
     gust: float | None = Field(
-        None, gt=0, le=1, description="Gusts: standard deviation of the wind's speed over its "
-        "mean, 0.1 over water to 0.4 in a crown. What follows is then that of the peak, by "
-        "spectrum and peak factor of EN 1991-1-4, annex B.")
+        None, gt=0, le=1, description="Turbulence intensity of gusts: standard deviation of the "
+        "wind speed over its mean, from 0.1 over water to 0.4 in a crown. Results are then those "
+        "of the peak, by spectrum and peak factor of EN 1991-1-4, annex B.")
     gust_length: float = Field(
-        27.0, gt=0, le=1000, description="Length of the gusts [m]; that of EN 1991-1-4 2 m above "
-        "open land. Among trees it is about their height.")
-    gust_time: float = Field(600.0, ge=10, le=1e5, description="Time in which that peak is "
+        27.0, gt=0, le=1000, description="Length scale of the gusts [m]. The default is that of "
+        "EN 1991-1-4 at 2 m above open land. Among trees it is about their height.")
+    gust_time: float = Field(600.0, ge=10, le=1e5, description="Time within which the peak is "
                              "expected [s].")
     gust_record: Path | None = Field(
-        None, description="Gusts as recorded: a CSV file with time_s and speed_m_s along --wind, "
-        "whose length counts no more.")
-    snow: float = Field(0.0, ge=0, le=1000, description="Snow on the branch's shadow as seen "
+        None, description="Recorded gusts: a CSV file with time_s and speed_m_s along the "
+        "direction of --wind.")
+    snow: float = Field(0.0, ge=0, le=1000, description="Snow load per area of the branch seen "
                         "from above [kg/m^2].")
     fruit: tuple[_Fruit, ...] = Field(
-        (), description="A fruit: place on the branch [m] and mass [kg]; may be given again.",
+        (), description="A fruit: position on the branch [m] and mass [kg]. May be given several "
+                        "times.",
         json_schema_extra={"metavar": "X Y Z KG"})
     cut: tuple[_Place, ...] = Field(
-        (), description="Cut the branch off here [m]; may be given again.",
+        (), description="Position of a pruning cut [m]. May be given several times.",
         json_schema_extra={"metavar": "X Y Z"})
     strain_limit: float = Field(
         0.01, gt=0, lt=1, description="Strain at which the wood is taken to fail.")
     limit_load: bool = Field(
-        False, description="Also find how many times these loads the branch bears.")
-    most: float = Field(50.0, gt=1, le=1e4, description="Largest number of times that is tried.")
+        False, description="Also find the limit load, as a multiple of these loads.")
+    most: float = Field(50.0, gt=1, le=1e4, description="Largest multiple that is tried.")
     name: str | None = Field(
-        None, pattern=r"^[\w-]+$", max_length=60, description="Keep it in the branch folder under "
-        "this name: report and scene then show the branch as it comes to rest.")
+        None, pattern=r"^[\w-]+$", max_length=60, description="Keep the result in the branch "
+        "folder under this name, for report and scene.")
 
 
 def load(folder: Path, settings: LoadSettings, *, force: bool = False,
@@ -101,7 +102,8 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     gusts = _gusts(settings)
     wind = blown(settings.wind or (0.0, 0.0, 0.0), gusts)
     if not (settings.wind or settings.snow or settings.fruit or settings.cut):
-        raise InputError("No load is given.", "Its own weight has bent the scanned branch already.",
+        raise InputError("No load is given.", "The scanned shape already carries the branch's own "
+                                              "weight.",
                          "Give --wind, --snow, --fruit or --cut.")
     if any(not one[3] > 0 for one in settings.fruit):
         raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
@@ -173,8 +175,9 @@ def _gusts(settings: LoadSettings) -> Gusts | None:
     from limber.mechanics.loads.gust_loads import Turbulence, WindRecord
 
     if settings.gust is not None and settings.gust_record is not None:
-        raise InputError("Both --gust and --gust-record are given.", "The record has the gusts.",
-                         "Leave one out.")
+        raise InputError("Both --gust and --gust-record were given.", "The record already contains "
+                                                                     "the gusts.",
+                         "Omit one of them.")
     if settings.gust_record is not None:
         return WindRecord.read(settings.gust_record)
     return None if settings.gust is None else Turbulence(
@@ -185,8 +188,8 @@ def _require_near(nodes: np.ndarray, places: list[_Place]) -> None:
     for place in places:
         distance = float(np.linalg.norm(nodes - np.array(place), axis=1).min())
         if not distance < 0.1:
-            raise InputError(f"A fruit at {place} m is {distance:.3g} m off the branch.",
-                             "It hangs on the branch.", "Check frame and unit.")
+            raise InputError(f"A fruit at {place} m is {distance:.3g} m away from the branch.",
+                             "A fruit must hang on the branch.", "Check frame and unit.")
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

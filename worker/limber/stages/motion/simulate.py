@@ -35,13 +35,12 @@ class SimulateInputs(BranchInputs):
     groups: ClassVar[Groups] = {"motion": ("along", "pull")}
 
     along: Path | None = Field(
-        None, description="The grasp moves as the poses of a table do, from where it is: a "
-        "recording's robot.csv, or a plan's plans/NAME.csv, which takes --duration.",
+        None, description="Table of poses that the grasp follows, relative to its position: a "
+        "recording's robot.csv, or a plan's plans/NAME.csv over --duration.",
         json_schema_extra={"metavar": "FILE"})
     pull: str | None = Field(
-        None, description="Replay this recording of the branch: grasped where and held as it was, "
-        "moved as the gripper was; grasp, kind and name of the result are the recording's. What "
-        "was measured can then be seen over it, frame by frame.",
+        None, description="Replay this recording: the grasp, the motion and the result's name are "
+        "those of the recording. The measured motion can then be compared frame by frame.",
         json_schema_extra={"metavar": "NAME", "panel": False})
 
 
@@ -94,9 +93,9 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     progress(1.0, "done")
     if not motion.converged:
         raise ConvergenceError(
-            f"The branch could not follow: {motion.message}",
-            f"{result['frame_count']} frames up to the last good state are in"
-            f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
+            f"The branch could not follow the motion: {motion.message}",
+            f"{result['frame_count']} frames up to the last valid state are in "
+            f"frames/{settings.name}.pc2. The grasp force there is {result['grasp_force_n']} N.",
             "Pull less far, or check units and Young's modulus.")
     return result
 
@@ -180,7 +179,8 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
     from limber.store.loading import known_pulls
 
     if inputs.along is not None:
-        raise InputError("Both --along and --pull were given.", "Each is a way of the gripper.",
+        raise InputError("Both --along and --pull were given.", "Each states a path of the "
+                                                                "gripper.",
                          "Give one of them.")
     if inputs.pull not in known_pulls(branch):
         raise InputError(f"There is no pull {inputs.pull!r}.",
@@ -188,7 +188,7 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
                          "Import or record it first.")
     pull = read_pull(branch.path(f"pulls/{inputs.pull}"))
     if pull.entry.motion == "swing":
-        raise InputError(f"{inputs.pull} is a free swing.", "No gripper leads the branch there.",
+        raise InputError(f"{inputs.pull} is a free swing.", "A free swing has no gripper.",
                          "`limber swing` fits it.")
     grasp, way = pull.entry.grasp, PoseTable(pull.times, pull.poses)
     is_static = pull.entry.motion == "quasi_static"

@@ -49,14 +49,14 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             off = 100.0 * field.errors["energy_error"]
             if off > settings.field_error:
                 progress.warn(
-                    f"The energy field is off by {off:.2g} %, over the {settings.field_error:g} % "
-                    f"of --field-error, with {len(field.samples.poses)} poses: ask for more "
-                    "--samples, or a smaller --deflection.")
+                    f"The error of the energy field is {off:.2g} % with "
+                    f"{len(field.samples.poses)} poses, more than the {settings.field_error:g} % "
+                    "of --field-error. Increase --samples, or reduce --deflection.")
         samples, reasons = sampled.samples, sampled.reasons
         rejected = len(samples.rejected_poses)
         if rejected > 0.2 * settings.samples:
-            progress.warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); "
-                          "paths keep away from them.")
+            progress.warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}). "
+                          "Paths avoid them.")
         field.write(stage.path("energy.npz"), {
             "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
             "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,

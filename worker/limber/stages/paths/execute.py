@@ -56,11 +56,11 @@ class ExecuteSettings(Settings):
     groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation", "gravity")}
 
     speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
-    hold: float = Field(2.0, ge=0, le=3600, description="Time at the path's end [s].")
+    hold: float = Field(2.0, ge=0, le=3600, description="Time to wait at the path's end [s].")
     gripper_rotation: tuple[float, float, float] | None = Field(
-        None, description="Rotation vector of the gripper at the grasp, branch frame [rad]; "
-        "without it the way across the branch that keeps farthest from singularities.")
-    gravity: bool = Field(True, description="Predict forces of the branch with its weight.")
+        None, description="Rotation vector of the gripper at the grasp, in the branch's frame "
+        "[rad]. Default: the direction across the branch that stays farthest from singularities.")
+    gravity: bool = Field(True, description="Include the branch's weight in the predicted forces.")
 
 
 class ExecuteOptions(Settings):
@@ -69,13 +69,14 @@ class ExecuteOptions(Settings):
     groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop")}
     common = ("arm", "confirm")
 
-    arm: bool = Field(False, description="Move the robot. Without it: a dry run.",
+    arm: bool = Field(False, description="Move the robot. Default: a dry run.",
                       json_schema_extra={"switch": True, "panel": False})
     confirm: str | None = Field(
-        None, description="The plan's name, typed: the robot moves. Without it the name is asked "
-        "for at the terminal.", json_schema_extra=NOT_KEPT)
+        None, description="The plan's name, to confirm that the robot may move. Default: ask at "
+        "the terminal.", json_schema_extra=NOT_KEPT)
     after_stop: AfterStop = Field(
-        "ask", description="What to do after a stop; ask: at the terminal, else hold.",
+        "ask", description="What to do after a stop. ask: ask at the terminal, or hold without "
+                           "one.",
         json_schema_extra=NOT_KEPT)
 
 
@@ -159,9 +160,9 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
         return settings, cell
     speed, acceleration = checked["speed_m_s"], checked["acceleration_m_s2"]
     if settings.speed > speed:
-        progress.warn(f"The plan keeps its limits with the branch's inertia up to "
-                      f"{1e3 * speed:.1f} mm/s, and is followed no faster; plan with a higher "
-                      "--speed if it shall be.")
+        progress.warn(f"The plan keeps its limits in motion up to {1e3 * speed:.1f} mm/s, so it "
+                      "is followed at that speed at most. Plan with a higher --speed to go "
+                      "faster.")
     limits = cell.limits.model_copy(update={
         # The plan's law spends that share of it along the way, the robot's all.
         "acceleration_m_s2": min(cell.limits.acceleration_m_s2, np.sqrt(0.5) * acceleration)})
@@ -185,8 +186,8 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
 
     doubt = estimated_doubt(branch, model)
     if doubt is None:
-        progress.warn("How uncertain Young's modulus is, is not known (no estimate): the interval "
-                      "of the predicted force leaves it out.")
+        progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
+                      "The interval of the predicted force does not include it.")
     positions = _closely(positions)
     clamped = Grasp.gripping(model.mesh, model.grasp.centre, GRASP_RADIUS_M)
     firm = model.model.gripped(clamped)
@@ -201,8 +202,9 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
             result = follow_poses(firm, clamped, pose[None], start=held)[0]
             reason = refusal(result)
         if reason is not None:
-            raise WorkError(f"Pose {number + 1} of {len(positions)} has no believable solution "
-                            f"({reason}).", "Its force is not known, so it is not taken there.",
+            raise WorkError(f"Pose {number + 1} of {len(positions)} has no reliable solution "
+                            f"({reason}).", "Its force is unknown, so the robot does not go "
+                                            "there.",
                             "Plan a gentler path.")
         held = result.displacement
         poses.append(pose)
@@ -265,7 +267,7 @@ def _planned(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
         rows = csv.DictReader(read_text(path, "the table of a motion").splitlines())
         planned = planned[[row.get("phase") != "return" for row in rows]]
     if len(planned) < 2:
-        raise InputError(f"{path} has {len(planned)} points.", "That is no path.", "Plan again.")
+        raise InputError(f"{path} has {len(planned)} points.", "This is not a path.", "Plan again.")
     # The grasped piece at rest is where it is and not turned.
     start = np.r_[rest, np.zeros(3)]
     way = float(np.linalg.norm(planned[0, :3] - rest))
@@ -279,7 +281,7 @@ def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
     if peak >= cell.limits.soft_force_n:
         raise InputError(
             f"The path needs {peak:.3g} N, the soft limit is {cell.limits.soft_force_n:.3g} N.",
-            "The guard would pause on the way.",
+            "The guard would pause the motion.",
             "Plan with a lower --max-force, or raise limits.soft_force_n in the cell file.")
     box = cell.workspace
     if box is not None:
@@ -287,7 +289,8 @@ def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
         if outside.any():
             place = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
             raise InputError(f"The path leaves the workspace at ({place}) m.",
-                             "The guard would stop there.", "Plan inside it, or correct the cell.")
+                             "The guard would stop there.", "Plan inside it, or correct the cell "
+                                                            "file.")
 
 
 def _summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
@@ -386,9 +389,9 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
             stage.result.update(result)
     if not reached:
         raise SafetyStop(f"The robot was stopped: {event['reason']}.",
-                         f"{event['after_stop']['outcome']} Its log is in executions/{name}.",
-                         "Look at the branch and the robot before anything moves; plan again from "
-                         "where it is.", result=result)
+                         f"{event['after_stop']['outcome']} The log is in executions/{name}.",
+                         "Check the branch and the robot before anything moves, then plan again "
+                         "from the current position.", result=result)
     return result
 
 

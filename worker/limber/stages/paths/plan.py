@@ -54,8 +54,8 @@ class PlanInputs(BranchInputs):
     common = ("cell", "name")
 
     cell: Path | None = Field(None, description=(
-        "The robot's cell file: its workspace, force limit and obstacles hold, and its arm must "
-        "reach all of the way."))
+        "The robot's cell file. Its workspace, force limit and obstacles apply, and its arm must "
+        "reach the whole path."))
     name: str = Field("path", description="Name of the plan's files.")
 
 
@@ -86,8 +86,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
             ("-baseline", "-bound", "-motion", "-setpoints", "-trees")):
         raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names; -baseline, -bound, -motion, -setpoints "
-                         "and -trees are its own files.",
+                         "It becomes part of file names, and -baseline, -bound, -motion, "
+                         "-setpoints and -trees are reserved.",
                          "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field_path = branch.require("energy.npz", "energy")
@@ -97,8 +97,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     field = EnergyField.read(field_path)
     if not is_sampled_on(energy_stage.reads, field.rest, grasp_model):
         raise BranchFolderError(
-            "The energy field is of another mesh, material, weight or of other targets.",
-            "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
+            "The energy field belongs to another mesh, material, weight or set of targets.",
+            "The branch was meshed or estimated again, or its targets changed, after `limber "
+            "energy` ran.",
             "Run `limber energy` again.")
     digests = energy_inputs(grasp_model)
     grasp_model = grasp_model.damped(known_damping(branch))
@@ -149,11 +150,11 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     result = branch.manifest.stages[key].result
     if result["stopped"]:
         gap = result["certificate"]["gap_percent"]
-        near = "how far above the best possible is not known" if gap is None else (
+        near = "gap to the best possible unknown" if gap is None else (
             f"at most {gap:.2g} % above the best possible")
         raise Cancelled("The search was stopped.",
-                        f"Its best path so far ({near}), checked on the full model, is plan "
-                        f"{name}.", "Run it again to have the bound closed.")
+                        f"The best path so far ({near}) was checked on the full model and stored "
+                        f"as plan {name}.", "Run it again to close the bound.")
     progress(1.0, "planned")
     return result
 
@@ -190,7 +191,7 @@ class _InCell:
             if hit:
                 raise NoPathError(
                     f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
-                    "Nothing can be brought there.",
+                    "The branch cannot be moved there.",
                     "Choose another goal, or correct the obstacle in the cell file.")
 
 
@@ -206,8 +207,8 @@ def _stiffer(branch: Branch) -> float:
     highest = np.array(result["young_interval_pa"], float)[:, 1]
     share = highest / np.array(result["young_pa"], float)
     if not np.isfinite(share).all():
-        raise InputError("--max-stress is given, and the estimate says not how stiff the branch "
-                         "may be at most.", "A stiffer branch bears more stress at the same pose.",
+        raise InputError("--max-stress was given, but the estimate has no upper limit for the "
+                         "stiffness.", "A stiffer branch has more stress at the same pose.",
                          "Record another pull, or limit --max-strain instead.")
     return float(np.max(share, initial=1.0))
 

@@ -66,8 +66,8 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
         size = float(np.ptp(surface.vertices, axis=0).max())
         if size > _LARGE:
             raise InputError(f"The obstacle {path} is {size:.0f} m long.",
-                             "No branch's cell is that large: its unit is another one.",
-                             'Say unit = "mm" or "cm" in the cell file.')
+                             "No cell is that large, so the file has another unit.",
+                             "State unit = \"mm\" or \"cm\" in the cell file.")
         found.append(Solid(name, surface))
     return tuple(found)
 
@@ -96,9 +96,10 @@ def require_taken(entry: SecondArmEntry, place: np.ndarray) -> None:
         matrices(np.array(entry.grasp_pose)))
     if np.isnan(inverse(arm, flange)).any(axis=-1).all():
         where = ", ".join(f"{x:.3f}" for x in place)
-        raise NoPathError(f"The second arm ({arm.name}) cannot take the target at ({where}) m.",
-                          f"None of {_TURNS} directions has inverse kinematics there.",
-                          "Put the arm nearer or farther, or give a --target-box.")
+        raise NoPathError(f"The second arm ({arm.name}) cannot reach the target at ({where}) m.",
+                          f"The inverse kinematics has no solution for any of {_TURNS} "
+                          "directions.",
+                          "Move the arm, or give a --target-box.")
 
 
 def _view_of(cell: Cell) -> View | None:
@@ -181,10 +182,10 @@ def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
     return NoPathError(
         f"{what} would be inside {name}, by up to {1e3 * depth:.1f} mm, at "
         f"({', '.join(f'{x:.3f}' for x in where)}) m.",
-        "So it is where the arm keeps farthest from singularities, and every other way of "
-        "holding the branch that was tried is blocked as well.",
-        "Choose another way for the branch, another place for the robot's base, or correct the "
-        "obstacle in the cell file.")
+        "This is the gripper direction farthest from singularities. Every other direction that "
+        "was tried is blocked as well.",
+        "Choose another path or another position of the robot's base, or correct the obstacle in "
+        "the cell file.")
 
 
 def _apart(places: np.ndarray) -> np.ndarray:

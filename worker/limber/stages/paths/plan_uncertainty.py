@@ -20,14 +20,14 @@ def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> Youn
         InputError: there is no limit, no estimate, or one without intervals.
     """
     if not limits.asked():
-        raise InputError("--confidence is given without a limit.",
-                         "It is the probability with which limits are kept.",
+        raise InputError("--confidence was given without a limit.",
+                         "It is the probability that the limits hold.",
                          "Give --max-force, --max-strain or another limit as well.")
     doubt = estimated_doubt(branch, grasp_model)
     if doubt is None:
-        raise InputError("--confidence is given, and nothing is estimated.",
-                         "How uncertain Young's modulus is comes from `limber estimate`.",
-                         "Import a pull and estimate, or leave --confidence away.")
+        raise InputError("--confidence was given, but there is no estimate.",
+                         "The uncertainty of Young's modulus comes from `limber estimate`.",
+                         "Import a pull and estimate, or omit --confidence.")
     return doubt
 
 
@@ -46,7 +46,7 @@ def estimated_doubt(branch: Branch, grasp_model: GraspModel) -> YoungDoubt | Non
     interval = np.array(found["young_interval_pa"], float)
     if not (np.isfinite(interval).all() and (interval > 0.0).all()):
         raise InputError("The estimate has no interval for some control points.",
-                         "How uncertain Young's modulus is there is not known.",
+                         "The uncertainty of Young's modulus is unknown there.",
                          "Record another pull and estimate again.")
     points = np.array(found["control_points_m"], float)
     covariance = np.array(found["covariance"], float)[np.ix_(found["groups"], found["groups"])]

@@ -44,7 +44,7 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
         counts = write_mcap(beside, entry.parent, pull)
         beside.replace(output)
     except OSError as error:
-        raise InputError(f"{output} cannot be written ({error}).", "", "Choose another place."
+        raise InputError(f"{output} cannot be written ({error}).", "", "Choose another location."
                          ) from error
     finally:
         beside.unlink(missing_ok=True)

@@ -34,9 +34,9 @@ class ImportInputs(BranchInputs):
                             "RTDE log.")
     name: str = required("Name of the pull.", "pull-1")
     swing: bool = Field(
-        False, description="The branch is let go, without a robot. Markers with --weight or --load "
-        "become a pull for `limber swing`; other records (accelerometer, strain gauge, a video's "
-        "track, markers of a plucked branch) go through `limber vibration` at once.",
+        False, description="The branch is released without a robot. Markers with --weight or "
+        "--load become a pull for `limber swing`. Other records (accelerometer, strain gauge, "
+        "video track, markers of a plucked branch) are evaluated by `limber vibration`.",
         json_schema_extra={"switch": True})
 
 
@@ -94,8 +94,8 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
         # ROS sends joints in any order, UR's with names like left_shoulder_pan_joint.
         order = [[k for k, name in enumerate(names) if part in name] for part in _JOINTS]
         if any(len(found) != 1 for found in order):
-            raise InputError(f"Joints are called {', '.join(names)}.",
-                             f"A UR arm's are {', '.join(_JOINTS)}.",
+            raise InputError(f"The joints are named {', '.join(names)}.",
+                             f"A UR arm's joints are {', '.join(_JOINTS)}.",
                              "Record poses or TF, or rename the joints.")
         return pose_vectors(forward(cell.arm, angles[:, [found[0] for found in order]]) @ tool)
 

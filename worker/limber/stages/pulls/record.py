@@ -53,20 +53,22 @@ class RecordSettings(Settings):
     common = ("direction", "distance")
 
     direction: tuple[float, float, float] = Field(
-        (1.0, 0.0, 0.0), description="Where to pull, branch frame; its length does not count.")
-    distance: float = Field(0.05, gt=0, le=0.5, description="How far [m].")
+        (1.0, 0.0, 0.0), description="Direction of the pull in the branch's frame; its length is "
+                                     "ignored.")
+    distance: float = Field(0.05, gt=0, le=0.5, description="Distance of the pull [m].")
     shape: Literal["arc", "straight"] = Field(
-        "arc", description="arc: as the branch's model goes when it is pulled along --direction, "
-        "the gripper turning with it; straight: a line, the gripper not turned.")
+        "arc", description="Shape of the pull. arc: the arc that the branch follows when it is "
+        "pulled along --direction, with the gripper turning along. straight: a line without "
+        "turning.")
     waypoints: str | None = Field(
-        None, description="CSV of the gripper's way instead: x_m,y_m,z_m, and rx_rad,ry_rad,rz_rad "
-        "where it turns; branch frame, from where the gripper is.")
+        None, description="CSV of way-points instead: x_m,y_m,z_m, and rx_rad,ry_rad,rz_rad if "
+        "the gripper turns, in the branch's frame. The first one is the gripper's position.")
     suggested: bool = Field(
-        False, description="The pull that `limber suggest-pull` found best: its direction and "
-        "distance; the gripper has to be at its place.", json_schema_extra={"switch": True})
+        False, description="Use direction and distance of the best pull of `limber suggest-pull`. "
+        "The gripper must be at its grasp.", json_schema_extra={"switch": True})
     speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
-    cycles: int = Field(1, ge=1, le=20, description="Times out and back.")
-    pause: float = Field(0.5, ge=0, le=10, description="Standing still at each end [s].")
+    cycles: int = Field(1, ge=1, le=20, description="Number of times out and back.")
+    pause: float = Field(0.5, ge=0, le=10, description="Time at rest at each end [s].")
 
 
 class RecordOptions(Settings):
@@ -76,16 +78,17 @@ class RecordOptions(Settings):
     common = ("confirm",)
 
     confirm: str | None = Field(
-        None, description="The recording's name, typed: the robot moves. Without it the name is "
-        "asked for at the terminal.", json_schema_extra=NOT_KEPT)
+        None, description="The recording's name, to confirm that the robot may move. Default: ask "
+        "at the terminal.", json_schema_extra=NOT_KEPT)
     markers: int | None = Field(
-        None, ge=1, le=65535, description="Port on the robot's address at which a tracker sends "
-        "the points that it sees as JSON lines (the virtual robot's is 63400).")
+        None, ge=1, le=65535, description="Port at the robot's address where a tracker sends "
+        "observed points as JSON lines (the virtual robot's is 63400).")
     after_stop: AfterStop = Field(
-        "ask", description="What to do after a stop; ask: at the terminal, else hold.",
+        "ask", description="What to do after a stop. ask: ask at the terminal, or hold without "
+                           "one.",
         json_schema_extra=NOT_KEPT)
-    recover: bool = Field(False, description="Move nothing: take over what a killed recording "
-                          "of this name has left.", json_schema_extra={"switch": True})
+    recover: bool = Field(False, description="Move nothing, and recover an interrupted recording "
+                          "of this name.", json_schema_extra={"switch": True})
 
 
 def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
@@ -111,18 +114,18 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} cannot name a recording.",
-                         "It becomes a folder's name.", "Use letters, digits, dash and dot.")
+                         "The name becomes a folder's name.", "Use letters, digits, dash and dot.")
     branch, cell = Branch.open(folder), read_cell(cell_file)
     if warning := check_branch(cell, branch.uuid, folder):
         progress.warn(warning)
     if options.recover:
-        return _finish(branch, name, settings, {"ended": "recovered after a kill"})
+        return _finish(branch, name, settings, {"ended": "recovered after an interruption"})
     if branch.has(f"pulls/{name}/pull.toml"):
-        raise InputError(f"{folder} has a recording {name} already.",
-                         "A recording is never written over.", "Give another --name.")
+        raise InputError(f"{folder} already has a recording {name}.",
+                         "A recording is never overwritten.", "Give another --name.")
     if f"pulls/{name}/robot.csv" in branch.streams():
-        raise InputError(f"A recording {name} was cut off.", "It would be lost.",
-                         "Take it over with --recover, or give another --name.")
+        raise InputError(f"A recording {name} was interrupted.", "It would be lost.",
+                         "Recover it with --recover, or give another --name.")
     require_payload(cell)
     blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
     require_confirmation(name, options.confirm)
@@ -133,7 +136,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
                          f"{ended['after_stop']['outcome']} {result['sample_count']} samples are "
                          f"in pulls/{name}.",
-                         "Look at the branch and the robot before anything moves.", result=result)
+                         "Check the branch and the robot before anything moves.", result=result)
     return result
 
 
@@ -245,11 +248,11 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
         direction, distance = suggested_pull(branch, point)
     length = np.linalg.norm(direction)
     if length < 1e-9 and settings.waypoints is None:
-        raise InputError("--direction 0 0 0.", "It points nowhere.", "Give a direction.")
+        raise InputError("--direction is 0 0 0.", "It has no direction.", "Give a direction.")
     if settings.speed > cell.limits.speed_m_s:
-        raise InputError(f"--speed {settings.speed:g} is over the cell's "
+        raise InputError(f"--speed {settings.speed:g} exceeds the cell's "
                          f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
-                         "Ask for less, or raise limits.speed_m_s in the cell file.")
+                         "Reduce --speed, or raise limits.speed_m_s in the cell file.")
     gripper, joints = sample[1:7], sample[19:25]
     here = matrices(gripper)
     if settings.waypoints is not None:
@@ -278,8 +281,8 @@ def _grasp_point(branch: Branch, gripper: np.ndarray) -> np.ndarray:
         if off < distance:
             nearest, distance = start + part * way, off
     if distance > 0.03:
-        raise InputError(f"The gripper is {1000 * distance:.0f} mm from the branch's axis.",
-                         "It would close on nothing, or the calibration is off.",
+        raise InputError(f"The gripper is {1000 * distance:.0f} mm away from the branch's axis.",
+                         "It would close on nothing, or the calibration is wrong.",
                          "Move it onto the branch, or calibrate again.")
     return nearest
 
@@ -318,8 +321,8 @@ def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str
     prefix = f"pulls/{name}/"
     left = [file for file in branch.streams() if file.startswith(prefix)]
     if f"{prefix}robot.csv" not in left or f"{prefix}pull.toml" not in left:
-        raise InputError(f"There is no cut-off recording {name}.",
-                         f"Left over are: {', '.join(branch.streams()) or 'none'}.",
+        raise InputError(f"There is no interrupted recording {name}.",
+                         f"Interrupted recordings: {', '.join(branch.streams()) or 'none'}.",
                          "Give the name of one of those.")
     with branch.stage(f"record:{name}", settings) as stage:
         for file in left:

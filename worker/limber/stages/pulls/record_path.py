@@ -97,8 +97,8 @@ def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float
     if away > _SAME_PLACE_M:
         raise InputError(
             f"The gripper is {1000 * away:.0f} mm from where the suggested pull holds the branch, "
-            f"({', '.join(f'{x:.3f}' for x in place)}) m.", "Held elsewhere the same way tells "
-            "something else, and strains the branch otherwise.", "Move the gripper there.")
+            f"({', '.join(f'{x:.3f}' for x in place)}) m.", "The same motion at another grasp "
+            "gives other information and other strains.", "Move the gripper there.")
     # The end lies on the arc, nearer to the root, which is the origin: the pull is across.
     way, out = np.array(found.end_m) - place, place / max(float(np.linalg.norm(place)), 1e-9)
     return way - (way @ out) * out, found.travel_m
@@ -113,18 +113,19 @@ def way_through(path: Path, gripper: np.ndarray) -> np.ndarray:
         InputError: it cannot be read, has one place, or starts too far from ``gripper`` [6].
     """
     table = read_columns(path, POSE_COLUMNS[:3], "a table of way-points (x_m, y_m, z_m, and "
-                         "rx_rad, ry_rad, rz_rad where the gripper turns)")
+                         "rx_rad, ry_rad, rz_rad if the gripper turns)")
     poses = np.tile(gripper, (len(table["x_m"]), 1))
     for column, name in enumerate(POSE_COLUMNS):
         if name in table:
             poses[:, column] = table[name]
     if len(poses) < 2:
-        raise InputError(f"{path} has one way-point.", "That is no way.", "Give two or more.")
+        raise InputError(f"{path} has only one way-point.", "A path needs two.", "Give two or more "
+                                                                          "way-points.")
     away = float(np.linalg.norm(poses[0, :3] - gripper[:3]))
     if away > _NEAR_M:
-        raise InputError(f"The first way-point is {1000 * away:.1f} mm from the gripper.",
-                         f"At most {1000 * _NEAR_M:.0f} mm are bridged.",
-                         "Begin where the gripper is, in the branch's frame.")
+        raise InputError(f"The first way-point is {1000 * away:.1f} mm away from the gripper.",
+                         f"At most {1000 * _NEAR_M:.0f} mm are allowed.",
+                         "Start at the gripper's position, in the branch's frame.")
     return matrices(np.vstack([gripper, poses[1:]]))
 
 
@@ -147,10 +148,11 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
                        singularity_margin=cell.limits.singularity,
                        joint_margin=cell.limits.joint_margin_rad)
     if start is not None and (told := different_joints(start, taken.joints[0])):
-        raise SafetyStop(f"The arm cannot go this way as it stands: {'; '.join(told)}.",
-                         "In its own configuration it would come to a limit or a singularity.",
+        raise SafetyStop("The arm cannot follow this path from its configuration: "
+                         f"{'; '.join(told)}.",
+                         "In this configuration it would reach a joint limit or a singularity.",
                          f"Move the joints to {in_degrees(taken.joints[0])} degrees, or choose "
-                         "another way.")
+                         "another path.")
     met = None if blocked is None else blocked(flange, taken.joints)
     if met is not None:
         raise met

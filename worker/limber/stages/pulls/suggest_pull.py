@@ -42,7 +42,7 @@ class SuggestPullInputs(BranchInputs):
     common = ("plan",)
 
     plan: str | None = Field(None, description=(
-        "Name of a plan; it is said whether another pull is worth it for this one."))
+        "Name of a plan. The result states whether another pull is worthwhile for it."))
 
 
 class SuggestPullSettings(Settings):
@@ -51,9 +51,9 @@ class SuggestPullSettings(Settings):
     groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force", "gravity")}
 
     fractions: tuple[float, ...] = Field((0.5, 0.67, 0.8, 0.92), min_length=1, description=(
-        "Places on the main path where the branch may be held."))
+        "Candidate grasps as fractions of the main path."))
     max_strain: float = Field(0.01, gt=0, lt=1, description=(
-        "Largest principal strain that a pull may put the branch to (0.01 is 1 %)."))
+        "Largest principal strain during a pull (0.01 is 1 %)."))
     max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
     gravity: bool = Field(True, description=(
         "The branch carries its own weight, as when it was scanned."))
@@ -79,8 +79,8 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
 
     if any(not 0.0 < fraction <= 1.0 for fraction in settings.fractions):
         raise InputError(f"--fractions {settings.fractions}.",
-                         "Places on the main path are shares of its length.",
-                         "Give numbers over 0 and up to 1.")
+                         "Grasps are fractions of the main path's length.",
+                         "Give numbers greater than 0 and at most 1.")
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
     reads = [file for file in ("mesh.vtu", "skeleton.swc", "estimate.json") if branch.has(file)]
@@ -167,14 +167,14 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
     limits = limits_in_file(plan.summary.get("limits") or {})
     confidence = branch.manifest.stages[f"plan:{name}"].settings.get("confidence") or _CONFIDENCE
     if not limits.asked() or plan.motion is None:
-        return {"worth": False, "why": "The plan has no limit: its path would be checked against "
-                "none however well the modulus is known."}
+        return {"worth": False, "why": "The plan has no limits, so a better known modulus changes "
+                "nothing about it."}
     gravity = bool(branch.manifest.stages["energy"].settings["gravity"])
     grasp_model = load_grasp_model(branch, gravity=gravity, progress=progress)
     doubt = estimated_doubt(branch, grasp_model)
     if doubt is None:
-        return {"worth": True, "why": "Nothing is estimated: whether the plan keeps its limits is "
-                "not known."}
+        return {"worth": True, "why": "There is no estimate, so it is unknown whether the plan "
+                "keeps its limits."}
     phases = np.array(plan.motion.phases)
     there = plan.motion.poses[:, :3]
     path = resolve_path(grasp_model, there[phases == "path"],
@@ -199,22 +199,22 @@ def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
         still = [name for name in over if after.excess[name] > 1.0]
         named = ", ".join(over).replace("_", " ")
         if len(still) < len(over):
-            return True, (f"The plan does not keep {named} {sure}; knowing the modulus as well as "
-                          "after this pull it is expected to.")
+            return True, (f"The plan does not keep {named} {sure}. After this pull it is expected "
+                          "to.")
         return True, (f"The plan does not keep {named} {sure}, and is not expected to after one "
-                      "more pull either: plan again with --confidence besides.")
+                      "more pull either. Also plan again with --confidence.")
     gained = {name: now.factors[name] / after.factors[name] for name in now.factors
               if now.excess[name] > _USED}
     if not gained:
-        return False, (f"The plan keeps its limits {sure} and none holds it back: knowing the "
-                       "modulus better changes nothing of it.")
+        return False, (f"The plan keeps its limits {sure}, and none of them restricts it. A "
+                       "better known modulus changes nothing.")
     name, ratio = max(gained.items(), key=lambda item: item[1])
     words = name.replace("_", " ")
     if ratio > _MATTERS:
-        return True, (f"The plan keeps its limits {sure}, and {words} holds it back: after this "
-                      f"pull {100 * (ratio - 1):.0f} % more of that could be used.")
-    return False, (f"The plan keeps its limits {sure}; of {words}, which holds it back, this pull "
-                   f"would make only {100 * (ratio - 1):.1f} % more usable.")
+        return True, (f"The plan keeps its limits {sure}, and {words} restricts it. After this "
+                      f"pull {100 * (ratio - 1):.0f} % more of that limit could be used.")
+    return False, (f"The plan keeps its limits {sure}, and {words} restricts it. This pull would "
+                   f"make only {100 * (ratio - 1):.1f} % more of that limit usable.")
 
 
 def run(inputs: SuggestPullInputs, settings: SuggestPullSettings, options: ParallelOptions,
@@ -225,8 +225,8 @@ def run(inputs: SuggestPullInputs, settings: SuggestPullSettings, options: Paral
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    rows = [["held at", "to [m]", "travel", "strain", "force", "tells", "for each % of strain",
-             "E then known to"]]
+    rows = [["held at", "to [m]", "travel", "strain", "force", "tells", "per % of strain",
+             "E then known within"]]
     for pull in [result["best"], *result["others"]][:8]:
         end = " ".join(f"{x:.3f}" for x in pull["end_m"])
         rows.append([
@@ -234,10 +234,10 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
             f"{100 * pull['peak_strain']:.2g} %", f"{pull['peak_force_n']:.3g} N",
             f"{pull['bits']:.1f} bit", f"{pull['bits_per_percent_strain']:.1f} bit",
             " ".join(f"{100 * share:.0f} %" for share in pull["young_deviation"])])
-    tables = [("Pulls, the best first", rows)]
+    tables = [("Suggested pulls, best first", rows)]
     if plan := result.get("plan"):
         worth = "yes" if plan["worth"] else "no"
-        tables.append((f"Worth it for the plan {plan['name']}?", [[worth], [plan["why"]]]))
+        tables.append((f"Worthwhile for the plan {plan['name']}?", [[worth], [plan["why"]]]))
     return tables
 
 

@@ -44,7 +44,7 @@ class ExportInputs(BranchInputs):
 
     groups: ClassVar[Groups] = {"output": ("output",)}
 
-    output: Path = Field(description="File to write; its suffix says what.",
+    output: Path = Field(description="File to write. Its suffix states the format.",
                          json_schema_extra={"short": "-o", "example": "{stem}.urdf"})
 
 
@@ -54,11 +54,12 @@ class ExportSettings(Settings):
     groups: ClassVar[Groups] = {"output": ("links", "gravity", "load", "columns")}
 
     links: int = Field(30, ge=2, le=500, description="Links along the main path (.xml, .urdf).")
-    gravity: bool = Field(True, description="The branch has weight, which the springs carry.")
+    gravity: bool = Field(True, description="Include the branch's weight, which the springs "
+                                            "carry.")
     load: tuple[float, float, float] | None = Field(
         None, description="Force on the tip in the static step of an .inp file [N].")
     columns: Literal["rtwig", "simpleforest"] = Field(
-        "rtwig", description="Whose names the columns of a .csv file have.")
+        "rtwig", description="Column names of a .csv file.")
 
 
 def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Progress = SILENT,
@@ -88,8 +89,8 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
         text, told = _cylinders(branch, output, settings)
     else:
         known = " ".join((*_RODS, *_SCENES, *_ELEMENTS, *_CYLINDERS))
-        raise InputError(f"{output} has a suffix that is not known.", f"Known are: {known}.",
-                         "Name the file so.")
+        raise InputError(f"{output} has an unknown suffix.", f"Known suffixes: {known}.",
+                         "Use one of them.")
     _written(output, text)
     return {"output": output, "format": suffix, **told}
 
@@ -130,7 +131,8 @@ def _elements(branch: Branch, settings: ExportSettings, progress: Progress,
     model = load_branch(branch, gravity=False, progress=progress).model
     tip = _tip(model, load_skeleton(branch))
     if model.point_masses:
-        progress.warn("What hangs on the branch (twigs, leaves, targets) is not in an .inp file.")
+        progress.warn("An .inp file does not contain what hangs on the branch (twigs, leaves, "
+                      "targets).")
     load = None if settings.load is None else np.array(settings.load)
     text = inp_text(model, branch.name, tip, load)
     return text, {"tet_count": model.mesh.tet_count, "node_count": model.mesh.node_count,
@@ -147,7 +149,8 @@ def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dic
     require_extra("usd", ("pxr",), "USD")
     model = load_branch(branch, gravity=False, progress=progress).model
     if model.point_masses:
-        progress.warn("What hangs on the branch (twigs, leaves, targets) is not in a USD file.")
+        progress.warn("A USD file does not contain what hangs on the branch (twigs, leaves, "
+                      "targets).")
     tip = _tip(model, load_skeleton(branch))
     made = as_deformable(model, tip)
     with tempfile.TemporaryDirectory() as place:
@@ -205,7 +208,7 @@ def _written(output: Path, text: str | bytes | None) -> None:
 
 def _cannot_write(output: Path, error: OSError) -> InputError:
     return InputError(f"{output} cannot be written ({error.strerror}).", "The export goes there.",
-                      "Choose another place.")
+                      "Choose another location.")
 
 
 def run(inputs: ExportInputs, settings: ExportSettings, _options: NoOptions,

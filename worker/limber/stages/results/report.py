@@ -21,10 +21,10 @@ class ReportInputs(BranchInputs):
     common = ("caliper",)
 
     picture: Path | None = Field(
-        None, description="A PNG to open the page with, such as the render of `limber scene`.")
+        None, description="A PNG for the top of the page, such as a render of `limber scene`.")
     caliper: Path | None = Field(
-        None, description="Diameters that you measured, to hold beside the scan's: a CSV with the "
-        "columns along_m (from the root along the main path) and diameter_mm.")
+        None, description="Measured diameters to compare with the scan's: a CSV with the columns "
+        "along_m (from the root along the main path) and diameter_mm.")
 
 
 def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Path | None = None,

@@ -29,10 +29,10 @@ class SceneInputs(BranchInputs):
     render: Path | None = Field(
         None, description="Also render a picture (PNG) of the end of the path.")
     turntable: Path | None = Field(
-        None, description="Also render it from all sides, as a moving picture (.webp, .gif or "
-        ".png): seconds a side.")
+        None, description="Also render an animation of all sides (.webp, .gif or .png). It takes "
+        "seconds per view.")
     data: Path | None = Field(
-        None, description="Write only what a scene shows, as arrays (.npz): what the add-on opens.")
+        None, description="Write only the scene's data as arrays (.npz), which the add-on opens.")
 
 
 class SceneSettings(Settings):
@@ -42,19 +42,19 @@ class SceneSettings(Settings):
         "picture": ("width", "sides", "color", "plan", "motion", "strength")}
 
     width: int = Field(1120, ge=160, le=8192, description=(
-        "Of the picture [pixels]; its height is three quarters of it."))
-    sides: int = Field(48, ge=2, le=720, description="Of the turntable.")
+        "Width of the picture [pixels]; the height is three quarters of it."))
+    sides: int = Field(48, ge=2, le=720, description="Number of frames of the turntable.")
     color: Literal["young", "strain_energy", "strain", "stress", "stress_over_strength", "det_f",
                    "residual"] = Field(
-        "young", description="What the branch's colours mean; all but young and residual (measured "
-        "to simulated): the worst of all frames.")
-    plan: str | None = Field(None, description="Which path to show; without it the newest.")
+        "young", description="Quantity that the colours show. All but young and residual "
+        "(measured to simulated) show the worst of all frames.")
+    plan: str | None = Field(None, description="Path to show. Default: the newest.")
     motion: str | None = Field(
-        None, description="Which frames to play; without it the path's, else the newest.")
+        None, description="Frames to play. Default: the path's, else the newest.")
     strength: float | None = Field(
         None, gt=0, description=(
-            "Stress that breaks the wood (modulus of rupture) [Pa], over which stress is shown; "
-            "without it 0.6 % of Young's modulus, as green wood has it (0.5 to 0.7 %)."))
+            "Strength of the wood (modulus of rupture) [Pa], to which stress is compared. "
+            "Default: 0.6 % of Young's modulus, as of green wood (0.5 to 0.7 %)."))
 
 
 def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | None = None,
@@ -87,8 +87,8 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
     from limber.store.loading import load_targets
 
     if (output is None) == (data_path is None):
-        raise InputError("Neither or both of --output and --data were given.",
-                         "One says what to make.", "Give -o scene.blend.")
+        raise InputError("Exactly one of --output and --data must be given.",
+                         "It states what to write.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
     branch = Branch.read(branch_folder)
     data = scene_data(branch, plan, motion, load_targets(branch), strength)
@@ -101,7 +101,7 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         data.write(_writable(target))
         return {"data": target, "vertex_count": len(data.arrays["vertices"])}
     if turntable is not None and turntable.suffix.lower() not in _MOVING:
-        raise InputError(f"{turntable.name} is no moving picture.", "",
+        raise InputError(f"{turntable.name} has no suffix of an animation.", "",
                          f"Name it {' or '.join(_MOVING)}.")
     with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
         prepared = Path(temporary) / "scene.npz"
@@ -119,8 +119,8 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         if turntable is not None:
             _write_moving(turntable, sorted(frames.glob("*.png")))
     if not output.is_file():
-        raise WorkError(f"Blender ended well but wrote no {output}.", "",
-                        "`limber doctor` says which Blender was used.")
+        raise WorkError(f"Blender ended without an error but did not write {output}.", "",
+                        "`limber doctor` states which Blender was used.")
     return result | {"scene": output, "picture": picture, "turntable": turntable}
 
 
@@ -129,8 +129,8 @@ def _write_moving(path: Path, pictures: list[Path]) -> None:
     from PIL import Image
 
     if not pictures:
-        raise WorkError("Blender ended well but rendered no side of the branch.", "",
-                        "`limber doctor` says which Blender was used.")
+        raise WorkError("Blender ended without an error but rendered nothing.", "",
+                        "`limber doctor` states which Blender was used.")
     shown = [Image.open(picture).convert("RGB") for picture in pictures]
     beside = path.with_name(f".{path.name}.part")
     try:
@@ -149,7 +149,7 @@ def _writable(path: Path) -> Path:
             return path.resolve()
     except OSError as error:
         raise InputError(f"{path.parent} cannot be written to ({error.strerror}).",
-                         "The result goes there.", "Choose another place.") from error
+                         "The result goes there.", "Choose another location.") from error
 
 
 def run(inputs: SceneInputs, settings: SceneSettings, _options: NoOptions,

@@ -53,15 +53,15 @@ class SkeletonInputs(BranchInputs):
     common = ("edits",)
 
     edits: Path | None = Field(
-        None, description="Edits (JSON) that take the place of those that the branch has; an "
-        "empty list undoes all.")
+        None, description="Edits (JSON) that replace those of the branch. An empty list removes "
+        "all.")
     frame: Literal["scan", "branch"] = Field(
-        "scan", description="Whose coordinates the edits are in: those of the scan's file, or the "
-        "branch's [m].")
-    append: bool = Field(False, description="The edits come after those that the branch has.")
+        "scan", description="Coordinates of the edits: those of the scan's file, or the branch's "
+        "frame [m].")
+    append: bool = Field(False, description="Append the edits to those of the branch.")
     output: Path | None = Field(
-        None, description="Also write the skeleton, edits applied, in the scan's coordinates: "
-        ".swc, or .csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
+        None, description="Also write the edited skeleton in the scan's coordinates: .swc, or "
+        ".csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
 
 
 def review_skeleton(folder: Path, *, edits_path: Path | None = None,
@@ -94,8 +94,8 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
     branch = Branch.read(folder)
     skeleton, alignment, mesh = _latest(branch)
     if mesh == "out of date":
-        progress.warn("This is the skeleton of the last reconstruct, which did not come to a mesh; "
-                      "the mesh is of an earlier one.")
+        progress.warn("This skeleton is that of the last reconstruct, which made no mesh. The "
+                      "mesh is that of an earlier one.")
     if output is not None:
         _write(skeleton.in_file(alignment), output, branch.manifest.source.get("unit", "m"))
     applied = _applied(branch)
@@ -177,8 +177,8 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     made, early = known.get("reconstruct"), known.get("skeleton")
     if made is None or early is None or not _belong(early, made):
         raise InputError(
-            f"{branch.folder} has no mesh of the skeleton that would be edited.",
-            "Its last reconstruct failed, or is of an older Limber; the scan is needed again.",
+            f"{branch.folder} has no mesh of this skeleton.",
+            "The last reconstruct failed, or an older Limber ran it. The scan is needed again.",
             "Run `limber reconstruct CLOUD -o NAME.branch --edits FILE`.")
     settings = _settings(made)
     alignment = branch.manifest.alignment
@@ -205,8 +205,9 @@ def _write(skeleton: Skeleton, path: Path, unit: str) -> None:
     from limber.geometry.io.skeletons import write_cylinders
 
     if path.suffix.lower() not in (".swc", ".csv"):
-        raise InputError(f"{path} is neither .swc nor .csv.", "A skeleton is written as one.",
-                         "Name the file so.")
+        raise InputError(f"{path} is neither .swc nor .csv.", "A skeleton is written as one of "
+                                                              "them.",
+                         "Use one of them.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix.lower() == ".swc":
@@ -215,7 +216,7 @@ def _write(skeleton: Skeleton, path: Path, unit: str) -> None:
             write_cylinders(skeleton, path)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}).",
-                         "The skeleton goes there.", "Choose another place.") from error
+                         "The skeleton goes there.", "Choose another location.") from error
 
 
 def _told(doubt: Doubt, alignment: Alignment) -> dict[str, Any]:

@@ -24,9 +24,9 @@ class MeshInputs(Settings):
     groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
 
     surface: Path = argument(
-        "STL, PLY, OBJ or OFF; a CSV of sections along an axis from the end that is held: x, y, "
-        "z, width, height, and perhaps mass_kg, what hangs there; or a cylinder model: .mat of "
-        "TreeQSM or SmartQSM, CSV of rTwig or SimpleForest, MTG, SWC.")
+        "A closed surface (STL, PLY, OBJ or OFF); a CSV of sections from the fixed end, with x, "
+        "y, z, width, height and optionally mass_kg of what hangs there; or a cylinder model "
+        "(.mat of TreeQSM or SmartQSM, CSV of rTwig or SimpleForest, MTG, SWC).")
     output: Path = Field(description="The branch folder to make.",
                          json_schema_extra={"short": "-o", "example": "{stem}.branch"})
 

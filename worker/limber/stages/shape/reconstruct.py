@@ -44,21 +44,23 @@ class ReconstructInputs(Settings):
                                "output": ("output",)}
     common = ("camera",)
 
-    cloud: Path = argument("A point cloud file, or a folder of them: then each becomes a branch "
-                           "folder in the output folder, and a bad one does not stop the others.")
+    cloud: Path = argument("A point cloud, or a folder of them. Each file of a folder becomes a "
+                           "branch folder in the output folder, and a bad one does not stop the "
+                           "others.")
     output: Path = Field(
-        description="The branch folder to make; with a folder of scans, where to make them.",
+        description="The branch folder to make. With a folder of scans: where to make the branch "
+                    "folders.",
         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
     skeleton: Path | None = Field(
         None, description="Your own skeleton in the cloud's coordinates: SWC, cylinder CSV (ours, "
         "rTwig's, SimpleForest's), .mat of TreeQSM or SmartQSM, or MTG.")
     edits: Path | None = Field(
-        None, description="Edits of the skeleton (JSON, see `limber skeleton`); they stay in the "
-        "branch folder and are applied again by each reconstruct without --skeleton.")
+        None, description="Edits of the skeleton (JSON, see `limber skeleton`). They stay in the "
+        "branch folder, and each reconstruct without --skeleton applies them again.")
     camera: Path | None = Field(
-        None, description="camera.toml: then CLOUD is a depth image.")
+        None, description="camera.toml of the depth camera; CLOUD is then a depth image.")
     mask: Path | None = Field(
-        None, description="With --camera: an image that is over 0 on the branch.")
+        None, description="With --camera: a mask image, greater than 0 on the branch.")
 
 
 def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
@@ -116,7 +118,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     warnings: list[str] = []
     if edits_path is None and not edits and branch.has(EDITS):
         progress.keeping(warnings).warn(
-            "The edits of edits.json are not applied: the given skeleton is used as it is.")
+            "The edits in edits.json were not applied, because a skeleton was given.")
     searched = {name: value for name, value in digests.items() if name != "edits"}
     known = None if force else load_search(branch, settings, searched)
     is_kept = known is not None
@@ -136,8 +138,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         except LimberError as error:
             if is_kept and not isinstance(error, Cancelled):
                 progress.warn(
-                    f"The skeleton as it was found is in {branch.folder / FOUND_SKELETON}.swc, "
-                    "in the scan's coordinates: mend it and give it back (--skeleton), or edit it "
+                    f"The skeleton as found is in {branch.folder / FOUND_SKELETON}.swc, in the "
+                    "scan's coordinates. Correct it and return it (--skeleton), or edit it "
                     "(--edits).")
             raise
         stage.manifest.alignment = made.alignment
@@ -304,7 +306,8 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
         one = [name for name in ("skeleton", "edits", "camera", "mask") if getattr(inputs, name)]
         if one:
             raise InputError(f"{inputs.cloud} is a folder, and --{one[0]} was given.",
-                             "That belongs to one scan.", "Reconstruct that scan by itself.")
+                             "That option applies to a single "
+                             "scan.", "Reconstruct that scan by itself.")
         return reconstruct_folder(inputs.cloud, inputs.output, settings, force=options.force,
                                   progress=progress)
     return reconstruct(inputs.cloud, inputs.output, settings, skeleton_path=inputs.skeleton,

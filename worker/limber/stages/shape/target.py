@@ -37,14 +37,14 @@ class TargetSettings(Settings):
     common = ("at",)
 
     at: tuple[float, float, float] | None = Field(
-        None, description="Where it is on the branch as it hangs, branch frame [m].",
+        None, description="Position on the branch at rest, in the branch's frame [m].",
         json_schema_extra={"metavar": "X Y Z"})
     mass: float = Field(
-        0.0, ge=0, le=100, description="What it weighs beside the scanned branch [kg]; it hung "
-        "there when the branch was scanned.")
+        0.0, ge=0, le=100, description="Additional mass [kg] that hung there when the branch was "
+        "scanned.")
     farthest: float = Field(
-        0.03, gt=0, description="Farthest that it may be off the branch [m].")
-    remove: bool = Field(False, description="Forget this target.")
+        0.03, gt=0, description="Largest allowed distance from the branch [m].")
+    remove: bool = Field(False, description="Remove this target.")
 
 
 def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, force: bool = False,
@@ -95,14 +95,16 @@ def _check_wishes(name: str, settings: TargetSettings) -> None:
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
         raise InputError(f"{name!r} cannot name a target.",
-                         "Names go into files and tables of other programs.",
+                         "Names appear in files and tables of other programs.",
                          "Use letters, digits, dash and underscore, 64 at most.")
     if settings.remove == (settings.at is not None):
         given = "Both --at and --remove" if settings.remove else "Neither --at nor --remove"
-        raise InputError(f"{given} for target {name}.", "It is set at a place, or removed.",
+        raise InputError(f"{given} for target {name}.", "A target is either set at a position or "
+                                                        "removed.",
                          "Give --at X Y Z, or --remove.")
     if settings.at is not None and not np.isfinite(settings.at).all():
-        raise InputError(f"Target {name} at {settings.at}.", "A place has three finite numbers.",
+        raise InputError(f"Target {name} at {settings.at}.", "A position has three finite "
+                                                             "numbers.",
                          "Give --at X Y Z in metres.")
 
 
@@ -118,9 +120,9 @@ def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: Targ
     if not distance <= settings.farthest:
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
         raise InputError(
-            f"Target {name} is {distance:.3g} m off the branch.",
-            f"The branch reaches from ({_numbers(low)}) to ({_numbers(high)}) m; its nearest place "
-            f"is ({_numbers(foot)}) m, and {settings.farthest:g} m are allowed.",
+            f"Target {name} is {distance:.3g} m away from the branch.",
+            f"The branch extends from ({_numbers(low)}) to ({_numbers(high)}) m. Its nearest "
+            f"point is ({_numbers(foot)}) m, and {settings.farthest:g} m are allowed.",
             "Check the frame and the unit (metres, branch frame), or widen --farthest.")
     return {"target": NamedTarget(name, at, settings.mass), "position_m": place,
             "mass_kg": settings.mass, "branch_point_m": foot, "distance_m": distance}
