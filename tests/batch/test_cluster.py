@@ -95,7 +95,7 @@ def test_a_task_is_the_same_after_its_command_line():
     (["--scheduler", "tcp://10.0.0.1:8786"], "not encrypted"),
     (["--scheduler", "tcp://example.org:8786"], "not encrypted"),
     (["--scheduler", "10.0.0.1"], "no address"),
-    (["--scheduler", "tls://127.0.0.1:1", "--cluster", "local"], "Leave one out"),
+    (["--scheduler", "tls://127.0.0.1:1", "--cluster", "local"], "Omit one of them"),
     (["--cluster", "slurm"], "How many jobs"),
     (["--cluster", "slurm", "--workers", "2"], "no sbatch"),
 ])

@@ -33,7 +33,7 @@ class Link:
 
     def gripper(self, close):
         if self._gone:
-            raise WorkError("The robot's driver is gone.")
+            raise WorkError("The robot's driver has ended.")
         self.opened, self._force = not close, 0.5
 
 
@@ -42,22 +42,27 @@ def cell_with(gripper: str) -> Cell:
                 tool={"gripper": gripper, "grip_seconds": 0.01})
 
 
-STOPPED = {"event": "stopped", "reason": "the force rises on the way back [N] (41, allowed 38)"}
+STOPPED = {"event": "stopped", "reason": "the force rises during the return [N] (41, allowed 38)"}
 
 
 @pytest.mark.parametrize("link, gripper, retreated, opened, told", [
-    (Link(), "digital_output", True, False, "went back the way it came; 0.0 N are"),
+    (Link(), "digital_output", True, False,
+     "returned along its path; the force on the branch is 0.0 N"),
     (Link(STOPPED, 39.0), "digital_output", False, True,
-     "could not go back: the force rises on the way back [N] (41, allowed 38); 39.0 N are on the "
-     "branch. The gripper was opened; 0.5 N"),
-    (Link(SafetyStop("There is no way back.")), "digital_output", False, True, "no way back"),
-    # It went back, and something still pulls.
-    (Link(left=12.0), "digital_output", True, True, "way it came; 12.0 N"),
-    (Link(STOPPED, 39.0), "by_hand", False, False, "is by_hand): free the branch by hand; 39.0 N"),
-    (Link(STOPPED, 39.0), "none", False, False, "free the branch by hand; 39.0 N"),
-    (Link(WorkError("The driver is gone."), gone=True), "digital_output", False, False,
-     "The gripper did not open (The robot's driver is gone): free the branch by hand; the force "
-     "on the branch is not known"),
+     "could not return: the force rises during the return [N] (41, allowed 38); the force on "
+     "the branch is 39.0 N. The gripper was opened; the force on the branch is 0.5 N"),
+    (Link(SafetyStop("There is no path to return along.")), "digital_output", False, True,
+     "no path to return along"),
+    # It returned, and something still pulls.
+    (Link(left=12.0), "digital_output", True, True,
+     "along its path; the force on the branch is 12.0 N"),
+    (Link(STOPPED, 39.0), "by_hand", False, False,
+     "is by_hand): free the branch by hand; the force on the branch is 39.0 N"),
+    (Link(STOPPED, 39.0), "none", False, False,
+     "free the branch by hand; the force on the branch is 39.0 N"),
+    (Link(WorkError("The driver has ended."), gone=True), "digital_output", False, False,
+     "The gripper did not open (The robot's driver has ended): free the branch by hand; the force "
+     "on the branch is unknown"),
 ])
 def test_the_outcome_of_a_retreat_is_told(link, gripper, retreated, opened, told):
     found = retreat_if_chosen(cell_with(gripper), link, "retreat", SILENT)
@@ -70,7 +75,8 @@ def test_an_arm_that_holds_tells_its_force(choice):
     """Nobody is at a terminal here."""
     found = retreat_if_chosen(cell_with("digital_output"), Link(), choice, SILENT)
     assert found == {"choice": "hold", "retreated": False, "gripper_opened": False, "force_n": 38.0,
-                     "outcome": "The arm holds where it stopped; 38.0 N are on the branch."}
+                     "outcome": "The arm holds where it stopped; the force on the branch is 38.0 "
+                                "N."}
 
 
 def test_what_a_stopped_command_found_is_in_its_json(capfd):

@@ -51,7 +51,7 @@ def test_a_touched_place_is_the_controllers_own(tool, tells_it):
 
 def test_a_pose_of_another_tool_is_refused():
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"grasp_pose": GRASP})
-    with pytest.raises(InputError, match=r"tool.grasp_pose at \(10, 0, 150\) mm"):
+    with pytest.raises(InputError, match=r"tool.grasp_pose is at \(10, 0, 150\) mm"):
         touched_place(cell, sample_with((0.0, 0.0, 0.2, 0, 0, 0), np.array(HOME)))
 
 
@@ -76,12 +76,12 @@ def test_points_touched_in_one_place_are_refused():
 @pytest.mark.parametrize("mirror", [np.diag([1, -1, 1]), np.eye(3)[[1, 0, 2]]])
 def test_mirrored_points_are_named_as_such(mirror):
     """A y axis with the wrong sign; two columns that were swapped."""
-    with pytest.raises(InputError, match="fit in a mirror alone"):
+    with pytest.raises(InputError, match="fit only when mirrored"):
         fit_base(touched_at(ON_BRANCH), ON_BRANCH @ mirror)
     # As flat as is accepted at all, they are off by more than is allowed.
     flat = np.vstack([ON_BRANCH[:3], [[0.02, 0.05, 0.0132]]])
     assert fit_base(touched_at(flat), flat).residual < 1e-9
-    with pytest.raises(InputError, match="fit in a mirror alone"):
+    with pytest.raises(InputError, match="fit only when mirrored"):
         fit_base(touched_at(flat), flat @ mirror)
 
 

@@ -130,7 +130,7 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(cb3):
         set_off(cb3, link, straight(cb3, (0.0, 0.2, 0.0)))
         cb3.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
         assert "force" in link.wait("stopped", seconds=5)["reason"]
-        assert any("wait for a step" in each for each in link.warnings)
+        assert any("wait for the next step" in each for each in link.warnings)
         cb3.ask("added_wrench", wrench=[0] * 6)
         assert link.retreat()["event"] == "reached"
         # The program that was uploaded anew is watched like the first.
@@ -169,7 +169,7 @@ def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(e_series):
         e_series.ask("stand", joints=list(np.add(e_series.state["joints"],
                                                      [0.2, 0, 0, 0, 0, 0])))
         time.sleep(0.1)
-        with pytest.raises(SafetyStop, match=r"mm and .* degrees from the way"):
+        with pytest.raises(SafetyStop, match=r"mm and .* degrees away from its path"):
             link.retreat()
 
 
@@ -187,7 +187,7 @@ def test_a_computer_that_stands_still_is_no_silent_robot(e_series, held_up, ends
         event = link.wait("reached", "stopped", seconds=10)
         assert event["event"] == ends, event
     if held_up == "both":
-        assert any("held the robot's program up" in each for each in link.warnings)
+        assert any("delayed the robot's program" in each for each in link.warnings)
     else:
         assert "no data from the robot" in event["reason"]
 

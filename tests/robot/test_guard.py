@@ -187,7 +187,7 @@ def test_a_force_unlike_the_predicted_one_stops_long_before_the_limit():
 @pytest.mark.parametrize("wanted, left, told", [
     (5, 0.5, "never held"),
     # Too much for a lost branch, too little for the prediction.
-    (8, 4.9, "fell at once")])
+    (8, 4.9, "dropped suddenly")])
 def test_slip_is_told_from_the_predicted_force(wanted, left, told):
     bench = Bench()
     bench.guard.begin()
@@ -198,7 +198,7 @@ def test_slip_is_told_from_the_predicted_force(wanted, left, told):
 
 
 @pytest.mark.parametrize("seconds, off, told", [
-    (0.01, (-2.1, 2.7), "fell at once"), (3.0, (-2.1, 2.7), "unlike"),
+    (0.01, (-2.1, 2.7), "dropped suddenly"), (3.0, (-2.1, 2.7), "unlike"),
     (3.0, (-3.4, 0), "is softer")])
 def test_what_falls_at_once_is_a_slip_also_where_it_turns_aside(seconds, off, told):
     """A branch that slides in the grip pulls askew, here by 52 degrees; as slowly as a path leads,
@@ -339,9 +339,9 @@ def test_a_retreat_goes_on_while_the_force_falls(start):
 
 
 @pytest.mark.parametrize("forces, told, before", [
-    (np.linspace(38, 60, 800), "the force rises on the way back", 200),
+    (np.linspace(38, 60, 800), "the force rises during the return", 200),
     (np.r_[np.linspace(38, 20, 400), np.linspace(20, 38, 400)], "the force rises", 500),
-    (np.full(800, 38.0), "the force does not fall on the way back", 600),
+    (np.full(800, 38.0), "the force does not fall during the return", 600),
     (np.r_[np.linspace(38, 2, 400), np.full(400, 12.0)], "the force rises", 410),
     (np.r_[np.full(50, 38.0), 60.0], "the force rises", 51),
     (np.r_[np.full(50, 38.0), np.nan], "no number", 51)])
@@ -379,5 +379,5 @@ def test_a_retreat_needs_a_force_that_is_known_and_an_arm_that_stands():
     with pytest.raises(SafetyStop, match="moving"):
         bench.guard.begin_retreat(np.zeros(6))
     bench.guard.event("test")
-    with pytest.raises(SafetyStop, match="not known"):
+    with pytest.raises(SafetyStop, match="unknown"):
         bench.guard.begin_retreat(np.r_[np.inf, np.zeros(5)])

@@ -174,10 +174,10 @@ def test_a_replay_is_for_the_virtual_robot_alone(tmp_path):
     assert isinstance(open_sensor(cell), ReplayedSensor)
     real = cell.model_copy(update={"robot": cell.robot.model_copy(
         update={"address": "192.168.0.10"})})
-    with pytest.raises(InputError, match="would not feel the branch"):
+    with pytest.raises(InputError, match="would not feel the real branch"):
         open_sensor(real)
     for wrong in ({"kind": "replay"}, {"kind": "ft300", "file": "ft.csv"}):
-        with pytest.raises(ValueError, match="goes with nothing else"):
+        with pytest.raises(ValueError, match="allowed only with it"):
             cell_with(**wrong)
 
 

@@ -164,7 +164,7 @@ def test_a_command_that_is_not_there_ends_the_program_and_says_so(registers):
     registers.write(41)
     registers.wait(0.02)
     assert registers.controller.runtime_state == RuntimeState.STOPPED
-    assert "not there in the virtual controller" in registers.controller.log[-1]
+    assert "virtual controller has no command" in registers.controller.log[-1]
 
 
 def test_the_gripper_weighs_what_the_payload_does_not_say():

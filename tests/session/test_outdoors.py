@@ -131,7 +131,7 @@ def test_what_loads_do_is_told(with_axes):
     held.set_young(2.0 * held.young)
     try:
         teller.ask(question, held)
-        with pytest.raises(InputError, match="One question"):
+        with pytest.raises(InputError, match="One request"):
             teller.ask(question, held)
         assert said.over.wait(120)
         said.over.clear()

@@ -50,8 +50,8 @@ def test_every_command_is_understood(command):
     (b"\xff\xfe\x00", "JSON"),
     (b"{}", "command"),
     (b'{"command": ["move"]}', "move"),
-    (b'{"command": "grasp"}', "one of"),
-    (b'{"command": "grasp", "vertex": 1, "point": [0, 0, 0]}', "one of"),
+    (b'{"command": "grasp"}', "either"),
+    (b'{"command": "grasp", "vertex": 1, "point": [0, 0, 0]}', "either"),
     (b'{"command": "young", "young_pa": [0]}', "greater than 0"),
     (b'{"command": "close", "more": 1}', "more"),
 ])

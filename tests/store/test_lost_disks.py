@@ -96,10 +96,10 @@ def test_a_folder_that_goes_while_a_stage_runs(tmp_path):
     folder, away = tmp_path / "a.branch", tmp_path / "away"
     write(Branch.create(folder), 1)
     branch = Branch.open(folder)
-    with pytest.raises(WorkError, match="not there any more"), branch.stage("b") as stage:
+    with pytest.raises(WorkError, match="no longer exists"), branch.stage("b") as stage:
         folder.rename(away)
         stage.path("b.txt")
-    with pytest.raises(WorkError, match="not there any more"), branch.stage("b"):
+    with pytest.raises(WorkError, match="no longer exists"), branch.stage("b"):
         raise AssertionError
     with pytest.raises(BranchFolderError, match="no folder"):
         Branch.open(folder)
@@ -108,7 +108,7 @@ def test_a_folder_that_goes_while_a_stage_runs(tmp_path):
     write(Branch.open(folder, verify=True), 2)
     # Gone after its last file was written, before it counts.
     branch = Branch.open(folder)
-    with pytest.raises(WorkError, match="not there any more"), branch.stage("a", {"n": 3}) as stage:
+    with pytest.raises(WorkError, match="no longer exists"), branch.stage("a", {"n": 3}) as stage:
         stage.path("x.txt").write_text("3")
         folder.rename(away)
     assert not folder.exists()

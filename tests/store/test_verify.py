@@ -48,7 +48,7 @@ def test_each_damaged_file_is_named(branch: Branch):
         (clouds / f"{number}.ply").unlink()
     code, said = verify(branch)
     assert (code, said["status"]) == (2, "failed")
-    for number, trouble in enumerate(["other content"] * 2 + ["2 bytes where 7"] * 2
+    for number, trouble in enumerate(["other content"] * 2 + ["2 bytes instead of 7"] * 2
                                      + ["missing"] * 2):
         assert f"pulls/a/clouds/{number}.ply ({trouble}" in said["error"]
     assert "6.ply" not in said["error"]

@@ -149,7 +149,7 @@ def test_the_overload_comes_while_the_branch_is_led_and_is_taken_away():
 
 def test_a_loop_writes_over_nothing(tmp_path):
     (tmp_path / "loop.branch").mkdir()
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         ClosedLoop(tmp_path).run()
 
 
@@ -169,9 +169,9 @@ def test_what_is_compared_fits_a_terminal():
               "holding_force_n": 4.2, "max_force_n": 8.4}
     tables = dict(comparison(result))
     assert tables["Young's modulus"][1][-1] == "yes"
-    assert ["pulls", "2"] in tables["Whether that is enough"]
-    assert ["way after it", "2.0 mm"] in tables["Safety"]
-    assert [row[0] for row in tables["The flower"]] == ["", "flower's goal", "where it came to"]
+    assert ["pulls", "2"] in tables["Sufficient?"]
+    assert ["distance after it", "2.0 mm"] in tables["Safety"]
+    assert [row[0] for row in tables["The flower"]] == ["", "flower's goal", "final position"]
 
 
 def test_a_stop_tells_how_long_the_virtual_robot_was_held_up(tmp_path, monkeypatch):
@@ -201,7 +201,7 @@ def test_a_stop_tells_how_long_the_virtual_robot_was_held_up(tmp_path, monkeypat
     monkeypatch.setattr(ClosedLoop, "_reconstructed", stopped)
     with pytest.raises(SafetyStop, match="no data"):
         ClosedLoop(tmp_path / "loop", progress=progress).run()
-    assert warned == ["stopped; until then the virtual robot itself was held up for 72 ms in all."]
+    assert warned == ["stopped; until then the virtual robot itself was delayed by 72 ms in total."]
 
 
 @pytest.mark.parametrize("reason", ["hard force limit [N]", None])

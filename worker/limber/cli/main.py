@@ -112,10 +112,11 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
         decorated = click.option(
             "--progress", "progress_style", type=click.Choice(["auto", "bar", "json", "none"]),
             default="auto", show_default=True,
-            help="bar on a terminal; json: one JSON object a line on standard output.")(body)
+            help="auto: a bar on a terminal. json: one JSON object per line on standard "
+                 "output.")(body)
         decorated = click.option(
             "--json", "as_json", is_flag=True,
-            help="Print the result as one JSON object, the last line.")(decorated)
+            help="Print the result as one JSON object in the last line.")(decorated)
         return click.command(name, cls=_grouped_command())(decorated)
     return wrap
 
@@ -127,7 +128,8 @@ def command_of(stage: "StageDescription", help_text: str) -> click.Command:
     @stage_command(stage.name)
     @click.option("--schema", cls=GroupedOption, expert=True, is_flag=True, is_eager=True,
                   expose_value=False, callback=functools.partial(_show_schema, stage.name),
-                  help="Print what the stage takes as a JSON schema, and exit.")
+                  help="Print the stage's inputs, settings and options as a JSON schema, and "
+                       "exit.")
     @stage_options(stage)
     def command(run: Run, values: dict[str, Any]) -> dict[str, Any]:
         result = stage.run(*stage.models(values), run.progress)

@@ -46,7 +46,7 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
             or getattr(error, "winerror", None) in _LOST_ON_WINDOWS):
         return WorkError(f"{name} does not answer ({told}).",
                          "The disk or the network folder that it is on was lost.",
-                         "Bring it back, and run this again: what was stored before is kept.")
+                         "Restore it, and run this again. Earlier results are kept.")
     if error.errno in _FORBIDDEN:
         return InputError(f"{name} cannot be used ({told}).",
                           "It is read-only, or belongs to somebody else.",

@@ -93,7 +93,7 @@ def read_sections(path: Path, unit: str) -> Sections:
                          "or a negative mass.", "No body has such a section.", "Correct the table.")
     if np.any(np.linalg.norm(np.diff(made.axis, axis=0), axis=1) == 0):
         raise InputError(f"{path} has the same place twice in a row.",
-                         "Between two sections the body has a length.", "Leave one of them out.")
+                         "Between two sections the body has a length.", "Omit one of them.")
     return made
 
 

@@ -29,7 +29,7 @@ def require_confirmation(name: str, typed: str | None) -> None:
         InputError: nothing was typed, or something else.
     """
     if typed is None and sys.stdin.isatty():
-        typed = input(f"The robot will move. Type {name} to go on: ").strip()
+        typed = input(f"The robot will move. Type {name} to continue: ").strip()
     if typed != name:
         raise InputError("Nobody confirmed that the robot may move.", "",
                          f"Give --confirm {name}, with the workspace free and a hand at the "
@@ -47,8 +47,8 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
         is left on the branch (None: not known); and ``outcome``, all of it in words.
     """
     if choice == "ask" and sys.stdin.isatty():
-        typed = input("The robot has stopped. Type retreat to go back the way it came; anything "
-                      "else holds: ")
+        typed = input("The robot has stopped. Type retreat to return along the same path; "
+                      "anything else holds: ")
         choice = "retreat" if typed.strip() == "retreat" else "hold"
     told: dict[str, Any] = {"choice": "hold", "retreated": False, "gripper_opened": False}
     if choice != "retreat":
@@ -57,8 +57,8 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
     event = _retreated(link)
     force = _force_left(link)
     told |= {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
-    went = ("The arm went back the way it came" if told["retreated"] else
-            f"The arm could not go back: {event['reason'].rstrip('.')}")
+    went = ("The arm returned along its path" if told["retreated"] else
+            f"The arm could not return: {event['reason'].rstrip('.')}")
     if told["retreated"] and force is not None and force <= cell.limits.soft_force_n:
         return told | {"outcome": f"{went}; {_left(force)}."}
     opened, how = _opened(cell, link, progress)
@@ -81,8 +81,8 @@ def _retreated(link: RobotLink) -> dict[str, Any]:
 def _opened(cell: Cell, link: RobotLink, progress: Progress) -> tuple[bool, str]:
     """Open the gripper; returns whether that was done, and what was done."""
     if cell.tool.gripper == "none" or (cell.tool.gripper == "by_hand" and not sys.stdin.isatty()):
-        return False, ("The gripper is not opened from here (tool.gripper is "
-                       f"{cell.tool.gripper}): free the branch by hand")
+        return False, (f"Limber does not open this gripper (tool.gripper is {cell.tool.gripper}): "
+                       "free the branch by hand")
     try:
         grip(cell, link, close=False, progress=progress)
     except LimberError as error:
@@ -102,8 +102,8 @@ def _force_left(link: RobotLink) -> float | None:
 
 
 def _left(force: float | None) -> str:
-    return "the force on the branch is not known" if force is None else (
-        f"{force:.1f} N are on the branch")
+    return "the force on the branch is unknown" if force is None else (
+        f"the force on the branch is {force:.1f} N")
 
 
 def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> None:
@@ -114,6 +114,6 @@ def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> Non
     elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
         input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
     elif cell.tool.gripper == "by_hand":
-        progress.warn(f"The gripper is {'closed' if close else 'opened'} by hand, and here nobody "
-                      "can be asked to: it was taken as done. Run it at a terminal, or state "
-                      "tool.gripper in the cell file.")
+        progress.warn(f"The gripper is {'closed' if close else 'opened'} by hand, but there is no "
+                      "terminal to ask at, so this was assumed to be done. Run the command in a "
+                      "terminal, or state tool.gripper in the cell file.")

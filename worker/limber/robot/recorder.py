@@ -136,8 +136,8 @@ class MarkerStream:
         try:
             self._socket = socket.create_connection((address, port), timeout)
         except OSError as error:
-            raise WorkError(f"No markers come from {address} port {port} ({error}).",
-                            "The pull would be recorded blind.",
+            raise WorkError(f"No markers arrive from {address} port {port} ({error}).",
+                            "The pull would be recorded without observations.",
                             "Start the tracker, or record without --markers.") from error
         self._data = b""
         self._count: int | None = None
@@ -184,16 +184,16 @@ class MarkerStream:
         if not frames:
             raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
         if self.left_out:
-            raise WorkError(f"The tracker sends {self._count} points, and another number in "
+            raise WorkError(f"The tracker sends {self._count} points, but another number in "
                             f"{self.left_out} of {len(frames) + self.left_out} frames.",
-                            "Which of them is which cannot be told.",
-                            "Let it send null for a point that it does not see.")
+                            "So the points cannot be told apart.",
+                            "Make it send null for a point that it does not see.")
         seen = np.array([points for _, points in frames])
         unseen = np.flatnonzero(np.isnan(seen).any(axis=2).all(axis=0))
         if len(unseen):
             raise WorkError(f"The tracker does not see point {', '.join(map(str, unseen))} (from "
-                            "0) while the branch rests.", "Where it rests would not be known.",
-                            "Turn the tracker or the branch, or take the point out.")
+                            "0) while the branch rests.", "Its rest position would be unknown.",
+                            "Turn the tracker or the branch, or remove the point.")
         means = np.nanmean(seen, axis=0)
         if np.isfinite(seen).all(axis=2).sum(axis=0).min() < _FRAMES_FOR_NOISE:
             return means, None

@@ -263,7 +263,7 @@ class FrameReader:
         if not layout.fits(size):
             self._map.close()
             raise InputError(f"{os.fspath(path)} of {size} bytes is cut short or damaged.",
-                             "Its header speaks of more than it holds.", "Start a new session.")
+                             "Its header announces more than it contains.", "Start a new session.")
         self.vertex_count, face_count = counts[:2]
         self.faces = np.frombuffer(self._map, "<i4", 3 * face_count, layout.faces_at
                                    ).reshape(-1, 3).copy()

@@ -105,5 +105,5 @@ def _take(line: bytes | None, inbox: Inbox, refuse: Callable[[int, str], None]) 
     if isinstance(command, Close):
         inbox.close()
     elif not inbox.put(command):
-        refuse(command.id, f"Too much waits: {_WAITING_LIMIT} commands. Send fewer, or wait for"
-                           " replies.")
+        refuse(command.id, f"{_WAITING_LIMIT} commands are waiting, which is the limit. Send "
+                           "fewer, or wait for replies.")

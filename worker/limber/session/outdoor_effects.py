@@ -48,8 +48,8 @@ class EffectsTeller:
                 are asked for without a wind.
         """
         if self._asked is not None and not self._asked.done():
-            raise InputError("The effects of loads are being worked out.",
-                             "One question is answered at a time.", "Wait for its reply.")
+            raise InputError("The effects of loads are being computed.",
+                             "One request is answered at a time.", "Wait for its reply.")
         loads, gusts = held.outdoors(), gusts_of(question)
         loads = replace(loads, wind=blown(loads.wind, gusts))
         # It stays for the next question: most of the first one's time is its beginning.

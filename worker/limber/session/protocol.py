@@ -48,7 +48,7 @@ class _OnBranch(BaseModel):
     @model_validator(mode="after")
     def _one_place(self) -> "_OnBranch":
         if (self.vertex is None) == (self.point is None):
-            raise ValueError("a place is one of `vertex` and `point`")
+            raise ValueError("a place is either `vertex` or `point`")
         return self
 
 
@@ -164,7 +164,7 @@ class Effects(_Command):
     @model_validator(mode="after")
     def _one_kind(self) -> "Effects":
         if self.gust is not None and self.gust_record is not None:
-            raise ValueError("gusts are those of `gust` or of `gust_record`, not both")
+            raise ValueError("give either `gust` or `gust_record`, not both")
         return self
 
 

@@ -105,8 +105,8 @@ class HeldBranch:
             InputError: too many grasps, nothing is there, or the base or another grasp is.
         """
         if len(self.grasps) >= GRASP_LIMIT:
-            raise InputError(f"There are {GRASP_LIMIT} grasps already.",
-                             "A frame has room for no more.", "Release one.")
+            raise InputError(f"There are already {GRASP_LIMIT} grasps.",
+                             "A frame has no room for more.", "Release one.")
         return self.hold(Grasp.at(self.model.mesh, self._place(vertex, point), radius, mode))
 
     def hold(self, grasp: Grasp) -> int:
@@ -197,7 +197,7 @@ class HeldBranch:
             InputError: a place is off the branch, or its axes are not known.
         """
         if self._skeleton is None:
-            raise InputError("The branch has no axes.", "Wind, snow and cuts go by them.",
+            raise InputError("The branch has no axes.", "Wind, snow and cuts need its axes.",
                              "Make it from a scan (limber reconstruct).")
         made = LoadedOutdoors(self.model, self._skeleton, loads)
         self._outdoors = loads
@@ -217,7 +217,8 @@ class HeldBranch:
                              "Send `outdoors` first.")
         if not self.gravity_on and self.model.hanging is not None:
             raise InputError("The branch's weight is switched off.",
-                             "What loads do is told of a branch that hangs.", "Switch it on.")
+                             "Effects of loads are computed for a branch under its "
+                             "weight.", "Switch it on.")
         return self._outdoors
 
     def vertices_gone(self) -> np.ndarray:

@@ -130,7 +130,7 @@ class Learning:
         elif "progress" in content:
             self._say(event="progress", **content)
         elif kind == "failed":
-            self._say(event="warning", message=f"no reduced model: {content['message']}")
+            self._say(event="warning", message=f"there is no reduced model: {content['message']}")
         else:
             self._say(**content)
 
@@ -138,7 +138,7 @@ class Learning:
         try:
             model = ReducedModel.read(Path(content.pop("path")))
         except LimberError as error:
-            self._say(event="warning", message=f"the reduced model is gone: {error}")
+            self._say(event="warning", message=f"the reduced model was lost: {error}")
             return
         self._busy = False
         self._tell(Learnt(self.key, model, content))

@@ -247,8 +247,9 @@ class Branch:
         renewed = [d.name for d in damages if now.get(d.name) != self.manifest.files[d.name]]
         if renewed:
             raise BranchFolderError(
-                f"Another run made {', '.join(renewed[:4])} of {self.folder} anew, or removed it, "
-                "while this one was reading.", "What has been read does not belong with it.",
+                f"Another run replaced or removed {', '.join(renewed[:4])} of {self.folder} while "
+                "this one was reading.", "The data that were read no longer belong "
+                                               "together.",
                 "Run this again.")
         raise damage_error(self.folder, damages)
 

@@ -49,15 +49,15 @@ def _is_gone(folder: Path) -> bool:
 
 
 def gone(folder: Path) -> WorkError:
-    return WorkError(f"{folder} is not there any more.",
-                     "It was moved or removed, or the disk or network folder that it is on was "
-                     "lost.", "Bring it back, and run this again: what was stored before is kept.")
+    return WorkError(f"{folder} no longer exists.",
+                     "It was moved or removed, or its disk or network folder was "
+                     "lost.", "Restore it, and run this again. Earlier results are kept.")
 
 
 def require_room(folder: Path, purpose: str) -> None:
     free = shutil.disk_usage(folder).free
     if free < LEAST_FREE_BYTES:
         raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left.",
-                        f"For {purpose} {LEAST_FREE_BYTES / 1e6:.0f} MB are wanted: it would end "
-                        "without its results.",
+                        f"{purpose} needs {LEAST_FREE_BYTES / 1e6:.0f} MB; otherwise its results "
+                        "would be lost.",
                         "Make room (`limber cache --clear` frees some), or move the folder.")

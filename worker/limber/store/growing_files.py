@@ -57,7 +57,8 @@ class Stream:
         except OSError as error:
             self._lock.release()
             raise BranchFolderError(f"{self.path} cannot be written ({error.strerror}).",
-                                    "It is to grow there.", "Choose another location.") from error
+                                    "The recording is written "
+                                    "there.", "Choose another location.") from error
         self._waiting: list[bytes] = []
         self._guard = threading.Lock()
         self._closing = threading.Event()
@@ -73,7 +74,8 @@ class Stream:
             WorkError: an earlier line could not be written, as on a full disk.
         """
         if "\n" in line or "\r" in line:
-            raise InputError("A line of a stream has a line end in it.", "It would be two lines.",
+            raise InputError("A line of a stream has a line end in it.", "It would become two "
+                                                                         "lines.",
                              "Append them one by one.")
         self._raise_error()
         with self._guard:
@@ -120,7 +122,7 @@ class Stream:
         if self._error is not None:
             told = machine_error(self._error, self.path)
             raise WorkError(f"{self.path} could not be written ({self._error.strerror}).",
-                            f"{told.why if told else ''} What was appended last is lost.".strip(),
+                            f"{told.why if told else ''} The last lines are lost.".strip(),
                             told.fix if told else "Make room on the disk.") from self._error
 
 

@@ -81,7 +81,7 @@ def roll_forward(folder: Path) -> None:
     except PermissionError as error:
         raise BranchFolderError(
             f"{error.filename2 or error.filename} cannot be replaced ({error.strerror}).",
-            "Another program has it open, or the folder is read-only; the new results wait in "
+            "Another program has it open, or the folder is read-only. The new results are in "
             f"{pending}.", "Close that program, or change the permissions, and run any command "
             "on the folder again.") from error
 

@@ -190,7 +190,7 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
     if (isinstance(mass, int | float) and isinstance(stiffness, int | float)
             and mass >= 0 and stiffness >= 0):
         return RayleighDamping(float(mass), float(stiffness))
-    progress.warn("No swing has told the damping; that of simulations is taken.")
+    progress.warn("No swing has been fitted, so the damping of simulations is used.")
     return DEFAULT_DAMPING
 
 
@@ -244,7 +244,7 @@ def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarra
             return value
         if name not in mesh.cell_data:
             raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
-                             "The material is not known.", "Reconstruct again.")
+                             "The material is unknown.", "Reconstruct again.")
         return mesh.cell_data[name]
 
     return BranchModel(
@@ -309,7 +309,7 @@ def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
             f"{branch.folder} has no pull {', '.join(missing)}." if missing
             else f"{branch.folder} has no pulls.",
             f"It has {', '.join(known)}." if known else "There is nothing to estimate from.",
-            "Bring one in with `limber import-pull`, or simulate one with `limber virtual-pull`.")
+            "Import one with `limber import-pull`, or simulate one with `limber virtual-pull`.")
     return list(settings.pull) or known
 
 

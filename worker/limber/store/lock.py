@@ -49,7 +49,7 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
     except Timeout as error:
         raise BranchBusyError(
             f"Another Limber is writing to {folder}: {_holder(folder)}.",
-            "Two at once would spoil each other's results; reading goes on meanwhile.",
+            "Two writers would corrupt each other's results. Reading is still possible.",
             "Wait for it to end, or stop it.") from error
     is_first = lock.lock_counter == 1
     try:
@@ -146,7 +146,7 @@ def _holder(folder: Path) -> str:
         except (OSError, ValueError, KeyError, TypeError):
             # It has just begun, or just ended.
             time.sleep(0.05)
-    return "one that has not said who it is"
+    return "an unknown process"
 
 
 def _user() -> str:

@@ -95,7 +95,7 @@ def read_manifest(folder: Path) -> Manifest:
     path = folder / MANIFEST
     if not path.is_file():
         raise BranchFolderError(
-            f"{folder} has no {MANIFEST}.", "So it is not a branch folder.",
+            f"{folder} has no {MANIFEST}.", "It is not a branch folder.",
             "Name a folder that `limber reconstruct` or `limber mesh` made.")
     try:
         content = read_json(path, "a manifest")
@@ -131,7 +131,7 @@ def checked_name(name: str) -> str:
     plain = relative_name(name)
     if plain.casefold() == MANIFEST or plain.startswith("."):
         raise InputError(f"{name!r} cannot be used as a file name in a branch folder.",
-                         f"{MANIFEST} and names with a dot first are the folder's own.",
+                         f"{MANIFEST} and names that begin with a dot are reserved.",
                          "Use another name.")
     return plain
 
@@ -146,7 +146,7 @@ def _require_inside(path: Path, manifest: Manifest) -> None:
             raise BranchFolderError(
                 f"{path} lists a file {name[:200]!r}. {error.why}",
                 "The manifest is damaged or was tampered with. Nothing was changed.",
-                "Get the folder again from where it came, or reconstruct into a new one.",
+                "Get the folder from its source again, or reconstruct into a new one.",
             ) from error
 
 

@@ -34,7 +34,7 @@ class Checker:
             return "missing"
         about = path.stat()
         if about.st_size != entry.bytes:
-            return f"{about.st_size} bytes where {entry.bytes} were written"
+            return f"{about.st_size} bytes instead of {entry.bytes}"
         state = (about.st_mtime_ns, about.st_size, entry.sha256)
         if self._verified.get(name) != state:
             if file_digest(path) != entry.sha256:

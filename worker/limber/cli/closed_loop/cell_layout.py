@@ -59,9 +59,9 @@ def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray)
                 if held is not None and (best is None or held[0].singularity > best[0]):
                     best = held[0].singularity, pose
     if best is None:
-        raise NoPathError(f"A {arm.name} reaches the branch from nowhere around it.",
-                          "It is too large, or grows where the arm cannot turn.",
-                          "Take a larger arm.")
+        raise NoPathError(f"A {arm.name} cannot reach the branch from any position around it.",
+                          "The branch is too large, or grows where the arm cannot turn.",
+                          "Use a larger arm.")
     return best[1]
 
 
@@ -74,7 +74,7 @@ def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray) -> tuple[np.ndar
     found = _held(cell.arm, np.array(cell.base.pose), matrices(np.array(cell.tool.grasp_pose)),
                   point, axis)
     if found is None:
-        raise NoPathError("The arm does not reach about the grasp.", "", "Move its base.")
+        raise NoPathError("The arm cannot reach around the grasp.", "", "Move its base.")
     return found[0].joints[0], found[1]
 
 

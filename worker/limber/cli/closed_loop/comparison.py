@@ -75,21 +75,21 @@ def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
               f"{100 * result['force_within_share']:.1f} % of the path"],
              ["difference, 95 % of the path below",
               f"{100 * result['force_error_of_peak']:.1f} % of the peak"],
-             ["the virtual branch's own force off by at most",
+             ["largest error of the virtual branch's own force",
               f"{result['extrapolation_error_n']:.2f} N"]]
     places = [["", "x [mm]", "y [mm]", "z [mm]"]]
     for title, key in (("flower's goal", "flower_goal_m"), ("as planned", "flower_planned_m"),
-                       ("where it came to", "flower_m")):
+                       ("final position", "flower_m")):
         if result[key] is not None:
             places.append([title, *(f"{1000 * value:.1f}" for value in result[key])])
     way, still = result["overload_way_m"], result["overload_standstill_s"]
     pulls = [["pulls", str(result["pull_count"])],
-             ["widest interval, its end over its beginning", f"{result['open_factor']:.1f}"],
+             ["widest interval, upper over lower end", f"{result['open_factor']:.1f}"],
              ["no further pull", result["no_further_pull"]],
              ["holds the flower in its goal", f"{result['holding_force_n']:.2f} N"],
-             ["allowed on the way", f"{result['max_force_n']:.2f} N"]]
+             ["allowed along the path", f"{result['max_force_n']:.2f} N"]]
     stop = [["a provoked overload", ""], ["stopped by", result["overload_reason"]],
-            ["way after it", "-" if way is None else f"{1000 * way:.1f} mm"],
+            ["distance after it", "-" if way is None else f"{1000 * way:.1f} mm"],
             ["until standstill", "-" if still is None else f"{1000 * still:.0f} ms"]]
-    return [("Young's modulus", modulus_rows(result, result)), ("Whether that is enough", pulls),
+    return [("Young's modulus", modulus_rows(result, result)), ("Sufficient?", pulls),
             ("Predicted against measured", force), ("The flower", places), ("Safety", stop)]

@@ -114,7 +114,8 @@ class ClosedLoop:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.branch.exists():
-            raise InputError(f"{self.branch} is there already.", "A loop begins with a new branch.",
+            raise InputError(f"{self.branch} already exists.", "The loop starts with a new "
+                                                                 "branch.",
                              "Choose another folder with -o.")
         truth = self._grown()
         cell = self._cell(truth)
@@ -133,8 +134,8 @@ class ClosedLoop:
                 # A real controller is never held up: what this one lost may be what stopped it.
                 if robot.process.poll() is None:
                     held_up = 1000 * robot.state["lost_seconds"]
-                    self.progress.warn("stopped; until then the virtual robot itself was held up "
-                                       f"for {held_up:.0f} ms in all.")
+                    self.progress.warn("stopped; until then the virtual robot itself was delayed "
+                                       f"by {held_up:.0f} ms in total.")
                 raise
         return plain({"seed": self.seed, "branch": self.branch, **compared(
             truth, moved, told, executed, watch, stopped,
@@ -196,7 +197,7 @@ class ClosedLoop:
         on_axis = np.array([truth.skeleton.point_at(part) for part in (0.3, 0.6, 0.85)])
         write_touched(self.folder / "touched.csv", np.array(cell.base.pose), moved, on_axis,
                       _TOUCH_SIGMA_M, rng)
-        self._part("calibrate", "base calibrated by touching", "robot", "calibrate",
+        self._part("calibrate", "base calibrated by touched points", "robot", "calibrate",
                    self.cell_file, self.branch, "--points", self.folder / "touched.csv")
         tip = truth.skeleton.nodes[truth.skeleton.main_path()[-1]] + moved
         self._part("target", "the flower at its tip is named", "target", self.branch, FLOWER,
@@ -215,8 +216,8 @@ class ClosedLoop:
                 return replace(told, reason=f"no interval is open beyond {OPEN_FACTOR:g}")
             reached = [part for part in _FRACTIONS if self._reaches(part)]
             if not reached:
-                return replace(told, reason="the arm reaches no place for another pull")
-            found = self._part("suggest", "whether another pull is worth it", "suggest-pull",
+                return replace(told, reason="the arm reaches no grasp for another pull")
+            found = self._part("suggest", "whether another pull is worthwhile", "suggest-pull",
                                self.branch, "--plan", PLAN, "--fractions",
                                ",".join(map(str, reached)), "--max-force",
                                read_cell(self.cell_file).limits.soft_force_n)
@@ -265,7 +266,7 @@ class ClosedLoop:
                 raise
             # What it advises then, once: where a branch may stand in two shapes, few poses tell
             # its force coarsely.
-            self.progress.warn(f"plan: {error} Planned again with {_MORE_SAMPLES} poses.")
+            self.progress.warn(f"plan: {error} Planning is repeated with {_MORE_SAMPLES} poses.")
             self._sampled(wish, "--samples", _MORE_SAMPLES)
             plan = self._ways(wish, goal)
         return Told(estimated, goal, wish, plan)
@@ -275,17 +276,17 @@ class ClosedLoop:
                    self.seed, "--deflection", wish.sampled_deflection, *more)
 
     def _ways(self, wish: Wish, goal: np.ndarray) -> dict[str, Any]:
-        return self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
+        return self._part("plan", "path of the flower to the light", "plan", self.branch, "--name",
                           PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
                           "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", wish.max_force,
                           "--speed", _PLAN_SPEED_M_S, "--seed", self.seed)
 
     def _executed(self, robot: VirtualRobot) -> tuple[dict[str, Any], Watch]:
-        dry = self._part("dry run", "the path checked for the arm", "execute", self.branch,
+        dry = self._part("dry run", "the path is checked for the arm", "execute", self.branch,
                          "--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S)
         robot.ask("stand", joints=dry["start_joints_rad"])
         with Watch(robot) as watch:
-            result = self._part("execute", "the path followed, armed", "execute", self.branch,
+            result = self._part("execute", "the path is followed, armed", "execute", self.branch,
                                 *self._armed(dry))
         return dry | result, watch
 
@@ -297,13 +298,15 @@ class ClosedLoop:
         stopped: SafetyStop | None = None
         with Watch(robot, overload=overload) as watch:
             try:
-                self._part("overload", "the path again, with an overload", "execute", self.branch,
+                self._part("overload", "the path is followed again, with an "
+                                       "overload", "execute", self.branch,
                            *self._armed(executed))
             except SafetyStop as stop:
                 stopped = stop
         if stopped is None:
             raise WorkError("The overload stopped nothing.", f"{overload[2]:.0f} N were added to "
-                            "the sensor while the branch was led.", "See the robot's log.")
+                            "the sensor reading while the branch was "
+                            "moved.", "See the robot's log.")
         told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
         if told["stop_reason"] is None:
             # Something else stopped it before it moved; what is told is of the way before.

@@ -11,18 +11,18 @@ from limber.cli.main import Run, stage_command
 
 @stage_command("batch")
 @click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
-@click.option("--dry-run", is_flag=True, help="Only check the file and say what would run.")
-@click.option("--retry-failed", is_flag=True, help="Run again also what has failed before.")
+@click.option("--dry-run", is_flag=True, help="Only check the file and list what would run.")
+@click.option("--retry-failed", is_flag=True, help="Also run stages again that failed before.")
 @click.option("--emit", type=click.Choice(["slurm", "snakemake"]), help=(
-    "Run nothing; write a Slurm array job, a task a branch, or a Snakefile, for a cluster."))
+    "Run nothing, but write a Slurm array job with one task per branch, or a Snakefile."))
 @click.option("--cluster", type=click.Choice(CLUSTERS), help=(
-    "Run on a Dask cluster: started here (local, loopback only), or asked of a queue with the "
+    "Run on a Dask cluster that is started here (local, loopback only) or by a queue, with the "
     "settings of dask-jobqueue (jobqueue.slurm and so on in Dask's configuration)."))
 @click.option("--scheduler", metavar="tls://HOST:PORT", help=(
     "Run on the Dask cluster of this scheduler; tcp:// only on loopback."))
 @click.option("--workers", type=click.IntRange(min=1), help=(
-    "At most so many branches side by side; by default as the file says, or one a core. "
-    "Of a queue: so many jobs."))
+    "Largest number of branches at a time. Default: as the file states, or one per core. With a "
+    "queue: number of jobs."))
 def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: str | None,
             cluster: str | None, scheduler: str | None, workers: int | None) -> dict[str, Any]:
     """Run stages on many branches, side by side.
@@ -62,8 +62,9 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     from limber.core.errors import InputError, WorkError
 
     if cluster is not None and scheduler is not None:
-        raise InputError("Both --cluster and --scheduler are given.",
-                         "The one starts a cluster, the other uses one.", "Omit one of them.")
+        raise InputError("Both --cluster and --scheduler were given.",
+                         "One starts a cluster, the other uses an existing "
+                         "one.", "Omit one of them.")
     jobs = read_jobs(job_file)
     if emit is not None:
         from limber.batch.jobs.scheduler_scripts import write_script
@@ -96,6 +97,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
         first = ": ".join(failed[0])
         raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed; {first}",
                         "The others are done.",
-                        f"See {path_of_page(jobs)}; mend it and run this with --retry-failed.")
+                        f"See {path_of_page(jobs)}, correct the cause, and run this with "
+                        "--retry-failed.")
     return {"branch_count": len(jobs.branches), **counts(jobs, records),
             "table": path_of_table(jobs), "page": path_of_page(jobs)}

@@ -16,8 +16,8 @@ from limber.cli.main import Run, stage_command
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("limber-bug.zip"),
               show_default=True, help="File to write.")
 @click.option("--data", is_flag=True, help=(
-    "Also the files: scan, mesh, recordings. Without it nothing of what was measured "
-    "leaves your computer but numbers of results and settings."))
+    "Also include the files: scan, mesh, recordings. Otherwise only settings and numbers of "
+    "results are included."))
 @click.option("--note", default="", help="What you did, and what happened instead.")
 def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict[str, Any]:
     """Pack what is installed, and what is known of a branch folder or of a scan, into a ZIP.
@@ -34,7 +34,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     source = Path(source)
     if not source.exists():
         raise InputError(f"There is no {source}.", "A branch folder or a scan was expected.",
-                         "Name what the bug is about.")
+                         "Name the branch folder or scan that the bug is about.")
     told: dict[str, Any] = {"note": note, "doctor": plain(report()), "damages": [], "opens": True}
     if source.is_dir():
         told |= _of_folder(source)

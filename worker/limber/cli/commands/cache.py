@@ -9,8 +9,8 @@ from limber.cli.main import Run, stage_command
 
 @stage_command("cache")
 @click.option("--limit", metavar="SIZE", help=(
-    "Remove what was used longest ago until all together take so much at most: 500 MB, 2 GB."))
-@click.option("--clear", is_flag=True, help="Remove all of it; it is made anew when it is needed.")
+    "Remove the least recently used entries until the total is at most this size: 500 MB, 2 GB."))
+@click.option("--clear", is_flag=True, help="Remove everything. It is computed again when needed.")
 def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
     """Show what is kept beside branch folders (meshes, reduced models, compiled code), or trim it.
 
@@ -26,10 +26,10 @@ def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
         try:
             most = 1e6 * float(in_unit(limit, "MB"))
         except (TypeError, ValueError) as error:
-            raise InputError(f"--limit {limit!r} is no size.", "", "Write 500 MB or 2 GB.",
+            raise InputError(f"--limit {limit!r} is not a size.", "", "Write 500 MB or 2 GB.",
                              ) from error
         if not 0 <= most < float("inf"):
-            raise InputError(f"--limit {limit!r} is no size.", "", "Write 500 MB or 2 GB.")
+            raise InputError(f"--limit {limit!r} is not a size.", "", "Write 500 MB or 2 GB.")
     if clear:
         freed = clear_folder(cache_folder())
     else:

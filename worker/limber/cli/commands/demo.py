@@ -68,8 +68,8 @@ class _Demo:
         if (seen, why, fix) == (error.seen, error.why, error.fix):
             return error
         return type(error)(seen or f"{name} failed.", why, " ".join(filter(None, [
-            fix, f"`limber {name}` has more options than the demo; run it by itself on the "
-                 f"results in {self.folder}."])))
+            fix, f"`limber {name}` has more options than the demo. Run it on the results in "
+                 f"{self.folder}."])))
 
 
 _option = functools.partial(click.option, cls=GroupedOption, group="demo")
@@ -80,21 +80,21 @@ _option = functools.partial(click.option, cls=GroupedOption, group="demo")
 @_option("-o", "--output", type=click.Path(path_type=Path),
          help="Folder of the results.  [default: out/NAME]")
 @_option("--crop", type=float, nargs=6, metavar="X Y Z X Y Z",
-         help="Lower and upper corner of the part to keep, in the cloud's coordinates.")
+         help="Lower and upper corner of the box to keep, in the cloud's coordinates.")
 @_option("--skeleton", type=click.Path(path_type=Path),
          help="Your own skeleton in the cloud's coordinates, as of `limber reconstruct`.")
 @_option("--edits", type=click.Path(path_type=Path),
          help="Edits of the skeleton, as of `limber skeleton`.")
 @_option("--goal", type=float, nargs=3, metavar="X Y Z",
-         help="Where the grasp shall be, in the branch's frame [m]; else a far pose.")
+         help="Goal position of the grasp, in the branch's frame [m]. Default: a distant pose.")
 @_option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
          show_default=True, metavar="A,B,C,D",
          help="Assumed Young's modulus [Pa] at the control points of your CLOUD's pull.")
 @_option("--seed", type=int, default=1, show_default=True,
-         help="Of the generated branch, the sensor noise and the planner.")
+         help="Seed of the generated branch, the sensor noise and the planner.")
 @_option("--force", is_flag=True, help="Reconstruct again even if nothing has changed.")
-@_option("--robot", is_flag=True, help="The whole loop instead, with a virtual robot that "
-         "scans, pulls and moves a generated branch, over loopback.")
+@_option("--robot", is_flag=True, help="Run the closed loop instead, with a virtual robot that "
+         "scans, pulls and moves a generated branch.")
 @settings_options(ReconstructSettings, "scan", without=("young",))
 def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed: int, robot: bool,
             **wishes: Any) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     if robot:
         return _closed_loop(run, cloud, output or Path("out") / "robot", seed)
     if cloud is not None and not cloud.is_file():
-        raise InputError(f"There is no file {cloud}.", "The demo wants the scan of one branch.",
+        raise InputError(f"There is no file {cloud}.", "The demo needs the scan of one branch.",
                          "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
     # Before minutes of work, not after them.
     require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
@@ -114,13 +114,13 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     started = time.perf_counter()
     run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
     if cloud is not None:
-        run.say("The pull is simulated with an assumed Young's modulus (--young): nothing is "
-                "measured of this branch's stiffness.")
+        run.say("The pull is simulated with an assumed Young's modulus (--young). The stiffness "
+                "of this branch was not measured.")
     branch, failure = _run_stages(demo, cloud, name, young=young, seed=seed, wishes=wishes)
     _show_tables(demo)
     summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}
-    run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\n"
-            f"picture {summary['picture']}\n{summary['demo_seconds']:.0f} s in all")
+    run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\npicture "
+            f"{summary['picture']}\n{summary['demo_seconds']:.0f} s in total")
     if failure is not None:
         raise failure
     return summary
@@ -128,9 +128,9 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
 
 def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[str, Any]:
     if cloud is not None:
-        raise InputError(f"--robot is given with the scan {cloud}.",
-                         "The virtual robot scans a branch that it holds: a generated one.",
-                         "Leave one of them out.")
+        raise InputError(f"--robot was given with the scan {cloud}.",
+                         "The virtual robot scans a generated branch.",
+                         "Omit one of them.")
     require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
     require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     from limber.cli.closed_loop.comparison import comparison
@@ -147,11 +147,11 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
     except Cancelled:
         raise
     except LimberError as error:
-        run.progress.warn(f"There is no picture of it: {error}")
+        run.progress.warn(f"There is no picture: {error}")
     with_picture = ["--picture", str(picture)] if picture.exists() else []
     report = run_stage(["report", result["branch"], *with_picture])["report"]
     seconds = round(time.perf_counter() - started, 1)
-    run.say(f"\nreport  {report}\nscene   {scene}\npicture {picture}\n{seconds:.0f} s in all")
+    run.say(f"\nreport  {report}\nscene   {scene}\npicture {picture}\n{seconds:.0f} s in total")
     return result | {"report": report, "demo_seconds": seconds}
 
 
@@ -185,7 +185,7 @@ def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, young: str, seed:
         raise
     except LimberError as error:
         failure = error
-        demo.run.progress.warn(f"{error} Scene and report show what there is.")
+        demo.run.progress.warn(f"{error} Scene and report show the results so far.")
     picture = demo.folder / "scene.png"
     demo.stage("a Blender scene and its picture", "scene", branch,
                "-o", demo.folder / "scene.blend", "--render", picture)

@@ -17,17 +17,17 @@ PARTS = [
     ("numpy", "numpy", None),
     ("scipy", "scipy", None),
     ("numba", "numba", None),
-    ("cvxopt", "cvxopt", "fast factorisation; SuperLU takes over, about 4 times slower"),
-    ("robust_laplacian", "robust_laplacian", "the robust Laplacian; our own takes over"),
-    ("pytetwild", "pytetwild", "fTetWild meshes; the sweep mesher takes over"),
+    ("cvxopt", "cvxopt", "fast factorisation; without it SuperLU is used, about 4 times slower"),
+    ("robust_laplacian", "robust_laplacian", "the robust Laplacian; without it our own is used"),
+    ("pytetwild", "pytetwild", "fTetWild meshes; without it the sweep mesher is used"),
     ("manifold3d", "manifold3d", "smooth unions at forks"),
-    ("ompl", "ompl", "OMPL's RRT*; our own planner takes over (no wheel for Windows)"),
+    ("ompl", "ompl", "OMPL's RRT*; without it our own planner is used (no wheel for Windows)"),
     ("rtde_control", "ur-rtde", "motion of a UR robot (pip install 'limber[robot]')"),
     ("laspy", "laspy", "LAS and LAZ scans"),
     ("pypcd4", "pypcd4", "PCD scans"),
     ("ezc3d", "ezc3d", "C3D motion capture"),
     ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
-    ("fsspec", "fsspec", "addresses in job files, s3:// and such (pip install 'limber[remote]')"),
+    ("fsspec", "fsspec", "addresses such as s3:// in job files (pip install 'limber[remote]')"),
     ("h5py", "h5py", "MAT files of version 7.3 (pip install 'limber[matlab]')"),
     ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags (pip install 'limber[bags]')"),
     ("mcap", "mcap", "`limber export-pull` (pip install 'limber[bags]')"),
@@ -82,4 +82,5 @@ def _version(distribution: str) -> str:
 
 def _blender() -> str:
     path = os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
-    return path or "none found (LIMBER_BLENDER or the PATH); scripts/provision_blender brings one"
+    return path or ("none found (LIMBER_BLENDER or the PATH); scripts/provision_blender installs "
+                    "one")

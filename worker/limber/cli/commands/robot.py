@@ -34,18 +34,18 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
     facts.pop("event", None)
     samples = np.concatenate(batches) if batches else np.zeros((0, 31))
     if cell.robot.version and cell.robot.version != facts["version"]:
-        run.progress.warn(f"The cell was calibrated with version {cell.robot.version}, the "
-                          f"controller is {facts['version']}.")
+        run.progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "
+                          f"the controller now has {facts['version']}.")
     if not facts["real_time"]:
-        run.progress.warn("No real-time priority: other programs can hold the loop up, which ends "
-                          "in a stop.")
+        run.progress.warn("The loop has no real-time priority. Other programs can delay it, which "
+                          "stops the robot.")
     if not facts["kept_in_memory"]:
-        run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`): what it has "
-                          "not used for a while may come from the disk, which ends in a stop.")
+        run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`). Memory that "
+                          "was swapped out can delay it, which stops the robot.")
     if not facts["kept_awake"]:
-        run.progress.warn("The computer's processors may sleep while they idle (on Linux, who may "
-                          "write to /dev/cpu_dma_latency keeps them awake): a virtual machine's "
-                          "wake late, which ends in a stop.")
+        run.progress.warn("The computer's processors may sleep while idle (on Linux, write access "
+                          "to /dev/cpu_dma_latency prevents this). Those of a virtual machine "
+                          "wake late, which stops the robot.")
     pose = np.array(facts["pose"])
     from limber.core.numerics.rigid import matrices
     from limber.robot.ur.kinematics import forward
@@ -65,21 +65,22 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
 @click.argument("cell_file", type=click.Path(path_type=Path))
 @click.argument("branch_folder", type=click.Path(path_type=Path))
 @click.option("--points", "points_file", type=click.Path(path_type=Path),
-              help="CSV of points on the branch to touch: name,x_m,y_m,z_m (branch frame). With "
-              "six more columns, robot_x_m .. robot_rz_rad, the robot is not asked.")
+              help="CSV of points on the branch to touch: name,x_m,y_m,z_m in the branch's frame. "
+              "With six more columns, robot_x_m to robot_rz_rad, the robot's pose is read from "
+              "the file.")
 @click.option("--views", "views_file", type=click.Path(path_type=Path),
-              help="Instead: CSV of a board or marker seen by the camera that scanned the branch, "
-              "a line a pose of the arm: robot_x_m .. robot_rz_rad of the gripper's middle, and "
-              "seen_x_m, seen_y_m, seen_z_m [m] in the camera's frame, with seen_rx_rad, "
-              "seen_ry_rad, seen_rz_rad of a board.")
+              help="CSV of a board or marker seen by the camera that scanned the branch, one line "
+              "for each pose of the arm: robot_x_m to robot_rz_rad of the gripper's middle, "
+              "seen_x_m, seen_y_m, seen_z_m in the camera's frame, and seen_rx_rad, seen_ry_rad, "
+              "seen_rz_rad for a board.")
 @click.option("--camera-on", type=click.Choice(["stand", "gripper"]), default="stand",
-              show_default=True, help="With --views: what carries the camera; the other one "
+              show_default=True, help="With --views: what carries the camera. The other one "
               "carries the board.")
 @click.option("--scan-pose", type=float, nargs=6, metavar="X Y Z RX RY RZ",
-              help="With --camera-on gripper: where the gripper was, base frame [m, rad], when "
-              "the camera scanned the branch. Without it the scan is in the board's frame.")
+              help="With --camera-on gripper: pose of the gripper in the base frame [m, rad] when "
+              "the camera scanned the branch. Default: the scan is in the board's frame.")
 @click.option("--largest-residual", default=0.01, show_default=True,
-              help="A point or view that is farther off is refused [m].")
+              help="Largest residual of a point or view [m]; a larger one is refused.")
 def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path | None,
               views_file: Path | None, camera_on: str, scan_pose: tuple[float, ...] | None,
               largest_residual: float) -> dict[str, Any]:
@@ -97,16 +98,16 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
 
     cell, branch = read_cell(cell_file), Branch.read(branch_folder)
     if (points_file is None) == (views_file is None):
-        raise InputError("Neither --points nor --views is given, or both.",
+        raise InputError("Exactly one of --points and --views must be given.",
                          "The base is found from touched points or from a camera's views.",
                          "Give one of them.")
     if views_file is None:
         assert points_file is not None
         return _by_touching(run, cell_file, cell, branch, points_file, largest_residual)
     if scan_pose is not None and camera_on == "stand":
-        raise InputError("--scan-pose is given, and the camera stands.",
-                         "Where a standing camera is, no pose of the arm says.",
-                         "Leave it out, or give --camera-on gripper.")
+        raise InputError("--scan-pose was given, but the camera is fixed.",
+                         "The position of a fixed camera does not follow from a pose of the arm.",
+                         "Omit it, or give --camera-on gripper.")
     return _by_seeing(run, cell_file, cell, branch, views_file, camera_on, scan_pose,
                       largest_residual)
 
@@ -162,8 +163,8 @@ def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file:
     version = cell.robot.version
     if touched is None:
         if not sys.stdin.isatty():
-            raise InputError("Nobody can say when a point is touched: standard input is no "
-                             "terminal.", "", "Run it in a terminal, or give the robot's poses "
+            raise InputError("Touching points needs a terminal, and standard input is "
+                             "none.", "", "Run it in a terminal, or give the robot's poses "
                              "in the points file.")
         touched, version = _touch(run, cell, names)
     fit = fit_base(touched, on_branch, largest_residual=largest_residual, names=names)
@@ -205,7 +206,7 @@ def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
         raise InputError(f"{path} cannot be read as points ({error}).",
                          "A line has name,x_m,y_m,z_m.", "Correct the file.") from error
     if not np.isfinite(numbers).all():
-        raise InputError(f"{path} has a number that is not finite.",
+        raise InputError(f"{path} contains a number that is not finite.",
                          "A position has three finite numbers.", "Correct the file.")
     if numbers.ndim != 2 or numbers.shape[1] not in (3, 9):
         raise InputError(f"{path} has {numbers.shape[-1]} numbers a line.",
@@ -245,13 +246,16 @@ def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
 
 
 @stage_command("scan")
-@click.option("--address", default="127.0.0.1", show_default=True, help="Of the virtual robot.")
+@click.option("--address", default="127.0.0.1", show_default=True, help="Address of the virtual "
+                                                                        "robot.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True,
               help="PLY file to write.")
 @click.option("--middle", type=float, nargs=3, required=True, metavar="X Y Z",
-              help="What the cameras look at, branch frame [m].")
-@click.option("--distance", default=0.6, show_default=True, help="Of the cameras [m].")
-@click.option("--views", default=8, show_default=True, help="Number of places around it.")
+              help="Point that the cameras look at, in the branch's frame [m].")
+@click.option("--distance", default=0.6, show_default=True, help="Distance of the cameras from it "
+                                                                 "[m].")
+@click.option("--views", default=8, show_default=True, help="Number of camera positions around "
+                                                            "it.")
 def scan(run: Run, address: str, output: Path, middle: tuple[float, float, float],
          distance: float, views: int) -> dict[str, Any]:
     """Scan the branch of `limber virtual-robot` with its depth camera, from all around.

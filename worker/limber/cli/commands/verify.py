@@ -12,7 +12,8 @@ from limber.store import Branch, damage_error, unlisted
 @stage_command("verify")
 @click.argument("branch_folder", type=click.Path(path_type=Path))
 @click.option("--finish", is_flag=True, help=(
-    "First put in place what an interrupted command left (.commit). Else nothing is changed."))
+    "First put the results of an interrupted command (.commit) in place. Otherwise nothing is "
+    "changed."))
 def command(run: Run, branch_folder: Path, finish: bool) -> dict[str, Any]:
     """Compare every file of a branch folder with its checksum; exit code 2 if one is damaged.
 
@@ -23,7 +24,7 @@ def command(run: Run, branch_folder: Path, finish: bool) -> dict[str, Any]:
               else Branch.read(branch_folder, unfinished=True))
     if branch.is_unfinished:
         run.progress.warn(
-            "An interrupted command left results that are not in place yet; they are compared as "
+            "An interrupted command left results that are not in place yet. They are compared as "
             "they will be. --finish, or the next command that writes to the folder, puts them in "
             "place.")
     run.progress(0.0, "comparing with checksums")

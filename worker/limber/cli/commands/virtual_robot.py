@@ -13,14 +13,14 @@ from limber.cli.main import Run, stage_command
 @stage_command("virtual-robot")
 @click.argument("branch_folder", required=False, type=click.Path(path_type=Path))
 @click.option("--cell", "cell_file", type=click.Path(path_type=Path),
-              help="Cell file: model, address, where the branch stands. Needed with a branch.")
+              help="Cell file with model, address and base. Required with a branch.")
 @click.option("--model", default="ur5e", show_default=True,
               help="ur3, ur5, ur10 (125 Hz), ur3e, ur5e, ur10e, ur16e (500 Hz).")
 @click.option("--address", default="127.0.0.1", show_default=True, help="Loopback address.")
 @click.option("--young", help="True Young's moduli of the branch [Pa], A,B,C,D.")
-@click.option("--joints", type=float, nargs=6, help="Where the arm stands [rad].")
+@click.option("--joints", type=float, nargs=6, help="Initial joint angles [rad].")
 @click.option("--seed", default=0, show_default=True, help="Seed of the sensors' noise.")
-@click.option("--seconds", type=float, help="End after so many seconds; else Ctrl-C.")
+@click.option("--seconds", type=float, help="End after this time [s]. Default: run until Ctrl-C.")
 def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model: str,
             address: str, young: str | None, joints: tuple[float, ...], seed: int,
             seconds: float | None) -> dict[str, Any]:
@@ -64,7 +64,9 @@ def _setting(branch_folder: Path, cell: Any, young: str | None, folder: Path) ->
     from limber.store import Branch
 
     if cell is None:
-        raise InputError("A branch without a cell file.", "It says where the branch stands.",
+        raise InputError("A branch was given without a cell "
+                         "file.", "The cell file states where the branch "
+                                                          "is.",
                          "Give --cell cell.toml.")
     branch = Branch.read(branch_folder)
     moduli = tuple(float(part) for part in young.split(",")) if young else ()

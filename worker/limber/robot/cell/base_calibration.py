@@ -65,32 +65,36 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
         InputError: too few, no numbers, too close to each other, in a line or in a plane.
     """
     if len(points) < _FEWEST:
-        raise InputError(f"{len(points)} points {which}.", "Four or more that lie in no plane are "
-                         "needed: fewer fit a mirrored frame as well.", "Touch more points.")
+        raise InputError(f"{len(points)} points {which}.", "Four or more points that are not "
+                         "coplanar are needed, because fewer also fit a mirrored "
+                         "frame.", "Touch more points.")
     if not np.isfinite(points).all():
         worst = names[int((~np.isfinite(points)).any(axis=1).argmax())]
-        raise InputError(f"Point {worst} {which} is no number.", "", "Touch it again.")
+        raise InputError(f"Point {worst} {which} is not a number.", "", "Touch it again.")
     away = np.linalg.norm(points[:, None] - points[None], axis=2)
     away[np.tril_indices(len(points))] = np.inf
     first, second = np.unravel_index(away.argmin(), away.shape)
     if away[first, second] < largest_residual:
         raise InputError(
             f"Points {names[first]} and {names[second]} are {1000 * away[first, second]:.1f} mm "
-            f"apart {which}.", f"At least {1000 * largest_residual:.0f} mm are needed: closer ones "
-            "pass for each other.", "Leave one of them out, and touch another place.")
+            f"apart {which}.", f"At least {1000 * largest_residual:.0f} mm are needed, because "
+            "closer points can be confused.", "Omit one of them, and touch another point.")
     spread = spreads(points)
     if spread[1] < _LEAST_SPREAD:
         raise InputError(
-            f"The points {which} spread by {1000 * spread[1]:.1f} mm across their line (root mean "
-            f"square); {1000 * _LEAST_SPREAD:.0f} mm are needed.", "The frame could turn about it.",
-            "Touch points that lie beside it, such as twigs and the pot's rim.")
+            f"The points {which} are nearly collinear: they spread by {1000 * spread[1]:.1f} mm "
+            f"across their line (root mean square), and {1000 * _LEAST_SPREAD:.0f} mm are "
+            "needed.", "The frame could rotate about "
+                                                                   "that line.",
+            "Touch points beside it, such as twigs and the rim of the pot.")
     needed = least_depth(largest_residual)
     if spread[2] < needed:
         raise InputError(
             f"The points {which} lie in a plane: they spread by {1000 * spread[2]:.1f} mm out of "
-            f"it (root mean square); {1000 * needed:.0f} mm are needed.",
-            "A mirrored frame would fit as well.",
-            "Touch points above and below it, such as the pot's rim and the branch's tip.")
+            f"it (root mean square), and {1000 * needed:.0f} mm are needed.",
+            "A mirrored frame would fit equally well.",
+            "Touch points above and below it, such as the rim of the pot and the tip of the "
+            "branch.")
 
 
 def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
@@ -112,9 +116,9 @@ def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
                 and length(turn_between(tool, seen)) <= _TOOL_RAD):
             return _carried(sample.pose, tool, grasp)
     raise InputError(
-        f"The tool that is set in the controller is at about {_millimetres(seen)} in the flange's "
-        f"frame, the cell's tool.grasp_pose at {_millimetres(grasp)}.",
-        "The controller's pose is of another point than the gripper's middle.",
+        f"The tool centre point in the controller is at about {_millimetres(seen)} in the "
+        f"flange's frame, but the cell's tool.grasp_pose is at {_millimetres(grasp)}.",
+        "So the controller's pose is not that of the gripper's middle.",
         "Set the tool centre point to tool.grasp_pose on the pendant, or correct the cell file.")
 
 
@@ -145,7 +149,7 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
     touched, on_branch = np.asarray(touched, float), np.asarray(on_branch, float)
     if touched.shape != on_branch.shape or touched.ndim != 2 or touched.shape[1] != 3:
         raise InputError(f"{len(touched)} touched points for {len(on_branch)} on the branch.",
-                         "Each has its counterpart.", "Correct the list.")
+                         "Each point needs its counterpart.", "Correct the list.")
     names = [str(number + 1) for number in range(len(touched))] if names is None else names
     require_frame(on_branch, names, "on the branch", largest_residual)
     require_frame(touched, names, "as they were touched", largest_residual)
@@ -171,10 +175,12 @@ def _off(residuals: np.ndarray, mirrored: np.ndarray, names: Sequence[str],
     off = ", ".join(f"{name} {1000 * value:.1f}"
                     for name, value in zip(names, residuals, strict=True))
     if mirrored.max() <= largest_residual:
-        return InputError(f"The points fit in a mirror alone; as they are, they are off by [mm]: "
-                          f"{off}.", "One of the frames is left-handed.",
+        return InputError("The points fit only when mirrored. Without mirroring, their residuals "
+                          f"are [mm]: {off}.", "So one of the frames is left-handed.",
                           "Correct the signs or the order of its axes.")
     worst = int(residuals.argmax())
-    return InputError(f"Point {names[worst]} is off by {1000 * residuals[worst]:.1f} mm; all of "
-                      f"them [mm]: {off}.", "It was taken for another one, or the units differ.",
-                      "Touch it again, or leave it out.")
+    return InputError(f"Point {names[worst]} has a residual of {1000 * residuals[worst]:.1f} mm; "
+                      "all residuals [mm]: "
+                      f"{off}.", "It was confused with another point, or the units "
+                                            "differ.",
+                      "Touch it again, or omit it.")

@@ -50,8 +50,9 @@ class RobotEntry(_Entry):
     version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
                                 description="Controller version that was seen when calibrating.")
     pose_sigma_m: float = Field(
-        5e-5, ge=0, le=0.01, description="How exactly the arm goes a way of some centimetres.")
-    pose_sigma_rad: float = Field(3e-4, ge=0, le=0.1, description="And a turn.")
+        5e-5, ge=0, le=0.01, description="Repeatability of the arm over some centimetres [m].")
+    pose_sigma_rad: float = Field(3e-4, ge=0, le=0.1, description="Repeatability of the arm's "
+                                                                  "rotation [rad].")
     joint_limits_rad: tuple[tuple[float, float], ...] | None = Field(
         None, min_length=6, max_length=6,
         description="Narrower limits of the joints, as set in the controller's safety.")
@@ -65,7 +66,7 @@ class BaseEntry(_Entry):
     pose: Pose = Field(description="Position [m] and rotation vector [rad].")
     position_sigma_m: float = Field(0.005, ge=0, le=0.5)
     rotation_sigma_rad: float = Field(0.01, ge=0, le=0.5)
-    residual_m: float | None = Field(None, ge=0, description="What calibration left over.")
+    residual_m: float | None = Field(None, ge=0, description="Residual of the calibration [m].")
 
     _near = field_validator("pose")(_in_metres)
 
@@ -83,14 +84,16 @@ class ToolEntry(_Entry):
 
     grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's.")
     mass_kg: float | None = Field(
-        None, ge=0, le=20, description="Payload, 0 for a bare flange; unstated, nothing moves.")
-    centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="In the frame of the flange.")
+        None, ge=0, le=20, description="Payload [kg]; 0 for a bare flange. Without it nothing "
+                                       "moves.")
+    centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="Position in the flange's frame "
+                                                                  "[m].")
     parts: tuple[CapsuleEntry, ...] = ()
     compliance_m_per_n: float = Field(
-        5e-5, ge=0, le=1e-2, description="What arm, fingers and bark give way by.")
+        5e-5, ge=0, le=1e-2, description="Compliance of arm, fingers and bark [m/N].")
     gripper: Literal["none", "digital_output", "by_hand"] = "by_hand"
     grip_seconds: float = Field(
-        1.0, gt=0, le=30, description="Given to the gripper to close or open.")
+        1.0, gt=0, le=30, description="Time for the gripper to close or open [s].")
     close_output: int = Field(0, ge=0, le=7, description="Digital output that closes it.")
 
     _near = field_validator("grasp_pose", "centre_of_mass_m")(_in_metres)
@@ -99,7 +102,7 @@ class ToolEntry(_Entry):
 class ApproachEntry(_Entry):
     """How the gripper comes to the branch and leaves it."""
 
-    direction: Vector = Field((0.0, 0.0, 1.0), description="In the frame of the grasp.")
+    direction: Vector = Field((0.0, 0.0, 1.0), description="Direction in the grasp's frame.")
     distance_m: float = Field(0.08, gt=0, le=1)
 
     @field_validator("direction")
@@ -115,7 +118,7 @@ class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
     kind: Literal["controller", "ft300", "replay", "none"] = Field(
-        "controller", description="replay: what a file holds, for the virtual robot alone.")
+        "controller", description="replay: readings from a file, only for the virtual robot.")
     file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
                              "sensor's frame.")
     pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's.")
@@ -128,7 +131,7 @@ class SensorEntry(_Entry):
     @model_validator(mode="after")
     def _has_its_file(self) -> "SensorEntry":
         if (self.kind == "replay") != (self.file is not None):
-            raise ValueError("file is the CSV of kind = \"replay\", and goes with nothing else")
+            raise ValueError("file is the CSV of kind = \"replay\", and is allowed only with it")
         return self
 
 
@@ -142,15 +145,16 @@ class LimitsEntry(_Entry):
     hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
     hard_torque_nm: float = Field(3.0, gt=0)
     unexpected_force_n: float = Field(
-        3.0, gt=0, description="Distance of the measured force from the predicted one that stops.")
+        3.0, gt=0, description="Difference between measured and predicted force that stops the "
+                               "motion [N].")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
 
     @model_validator(mode="after")
     def _order(self) -> "LimitsEntry":
         if self.soft_force_n >= self.hard_force_n:
-            raise ValueError("soft_force_n must be less than hard_force_n: it is the one that "
-                             "pauses before the other stops")
+            raise ValueError("soft_force_n must be less than hard_force_n, because it pauses the "
+                             "motion before hard_force_n stops it")
         return self
 
 
@@ -158,7 +162,7 @@ class CameraEntry(_Entry):
     """A depth camera: a pinhole that looks along its z axis, y down."""
 
     pose: Pose
-    mount: Literal["branch", "flange"] = Field("branch", description="Frame that pose is in.")
+    mount: Literal["branch", "flange"] = Field("branch", description="Frame of the pose.")
     width: int = Field(640, gt=0)
     height: int = Field(480, gt=0)
     focal_px: tuple[float, float] = (600.0, 600.0)
@@ -200,7 +204,7 @@ class BoxEntry(_Entry):
     kind: Literal["box"] = "box"
     name: str = ""
     size_m: Vector = Field(description="Edge lengths.")
-    pose: Pose = Field(description="Of its middle, branch frame.")
+    pose: Pose = Field(description="Pose of its centre in the branch's frame.")
 
     @field_validator("size_m")
     @classmethod
@@ -228,7 +232,7 @@ class Cell(_Entry):
     format_version: Literal[1] = 1
     branch: str | None = Field(None, description="Identity of the branch (branch.json) that "
                                "base.pose was calibrated for.")
-    calibrated: str | None = Field(None, description="When, ISO 8601.")
+    calibrated: str | None = Field(None, description="Date of the calibration, ISO 8601.")
     robot: RobotEntry
     base: BaseEntry
     tool: ToolEntry = ToolEntry()
@@ -293,7 +297,7 @@ def read_cell(path: str | Path) -> Cell:
         return Cell.model_validate(content)
     except ValidationError as error:
         told = "; ".join(_told(path, item) for item in error.errors())
-        raise InputError(told, "The robot would be taken to stand or reach where it does not.",
+        raise InputError(told, "The robot's position or reach would be wrong.",
                          "Correct the entries; lengths are in metres, angles in radians.",
                          ) from error
 

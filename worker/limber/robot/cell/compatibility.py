@@ -18,8 +18,9 @@ def require_payload(cell: Cell) -> None:
     """
     if cell.tool.mass_kg is None:
         raise InputError("The cell file states no tool.mass_kg: the payload is not set.",
-                         "The controller would take the gripper's weight for a force on it, and "
-                         "so would the guard.", "Weigh the gripper; 0 for a bare flange.")
+                         "The controller and the guard would interpret the gripper's weight as a "
+                         "force on it.", "Weigh the gripper and state its mass; 0 for a "
+                                                "bare flange.")
 
 
 def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
@@ -32,16 +33,16 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
         InputError: it was made for another robot, another branch or another place of the base.
     """
     if not made_for:
-        return ("The plan was made in no robot's cell (`limber plan --cell`): obstacles and the "
-                "gripper's shape were not looked at.")
+        return ("The plan was made without a cell (`limber plan --cell`), so obstacles and the "
+                "gripper's shape were not checked.")
     if made_for.get("model") != cell.arm.name:
         raise InputError(f"The plan was made for a {made_for.get('model')}, the cell has a "
-                         f"{cell.arm.name}.", "Another arm reaches elsewhere and turns otherwise.",
+                         f"{cell.arm.name}.", "Another arm has another reach.",
                          "Plan again with this cell.")
     if made_for.get("branch") not in (None, cell.branch):
         raise InputError(f"The plan was made in a cell of branch {made_for['branch']}, this one is "
-                         f"of {cell.branch}.", "The robot would reach to where another branch "
-                         "stands.", "Plan again with this cell.")
+                         f"of {cell.branch}.", "The robot would reach to the position of another "
+                         "branch.", "Plan again with this cell.")
     base = made_for.get("base_pose")
     if base is not None:
         off = np.abs(np.array(base, float) - np.array(cell.base.pose))
@@ -49,7 +50,7 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
             raise InputError(
                 f"The plan was made with the robot's base {1e3 * off[:3].max():.1f} mm and "
                 f"{np.degrees(off[3:].max()):.2f} degrees from where the cell has it now.",
-                "The cell was calibrated again since: reach and obstacles lie otherwise.",
+                "The cell was calibrated again after that, so reach and obstacles have changed.",
                 "Plan again with this cell.")
     return None
 
@@ -61,10 +62,10 @@ def check_branch(cell: Cell, uuid: str | None, folder: object) -> str | None:
         InputError: the cell was calibrated for another branch.
     """
     if cell.branch is None:
-        return ("The cell file names no branch: that its base.pose was calibrated for this one is "
-                "taken on trust. `limber robot calibrate` writes it.")
+        return ("The cell file names no branch, so it is assumed that base.pose was calibrated "
+                "for this one. `limber robot calibrate` writes the name.")
     if cell.branch != uuid:
         raise InputError(f"The cell was calibrated for branch {cell.branch}, {folder} is {uuid}.",
-                         "The robot would reach to where another branch stands.",
+                         "The robot would reach to the position of another branch.",
                          "Calibrate it for this branch: limber robot calibrate.")
     return None

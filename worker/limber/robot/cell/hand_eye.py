@@ -86,12 +86,13 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
     """
     robot, seen = np.asarray(robot, float), np.asarray(seen, float)
     if not (np.isfinite(robot).all() and np.isfinite(seen).all()):
-        raise InputError("A view has a number that is not finite.", "", "Leave it out.")
+        raise InputError("A view has a number that is not finite.", "", "Omit it.")
     what = "board" if seen.shape[1] == 6 else "marker"
     fewest = _FEWEST[seen.shape[1]]
     if len(robot) < fewest:
-        raise InputError(f"{len(robot)} views of a {what}.", f"{fewest} fix camera and {what}; "
-                         "ten tell how exactly.", "Move the arm to more poses.")
+        raise InputError(f"{len(robot)} views of a {what}.", f"At least {fewest} determine camera "
+                         f"and {what}; ten also determine the "
+                         "accuracy.", "Move the arm to more poses.")
     moves = matrices(robot) if camera_on == "stand" else inverted(matrices(robot))
     _require_turns(moves, what)
     if what == "marker":
@@ -105,9 +106,9 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
     residuals = np.linalg.norm(rows, axis=1)
     if residuals.max() > largest_residual:
         worst = int(residuals.argmax())
-        raise InputError(f"View {worst + 1} is off by {1000 * residuals[worst]:.1f} mm.",
+        raise InputError(f"View {worst + 1} has a residual of {1000 * residuals[worst]:.1f} mm.",
                          "It belongs to another pose of the arm, the units differ, or the camera "
-                         f"is not on the {camera_on}.", "Leave it out, or correct the file.")
+                         f"is not on the {camera_on}.", "Omit it, or correct the file.")
     free = max(rows.size - len(found.x), 1)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * (2 * found.cost / free)
     board = np.r_[found.x[6:], np.zeros(12 - len(found.x))]
@@ -119,8 +120,9 @@ def _require_turns(moves: np.ndarray, what: str) -> None:
     if spread[1] < _LEAST_TURN:
         raise InputError(
             f"The arm was turned by {np.degrees(spread[1]):.1f} degrees about a second axis.",
-            f"Camera and {what} could slide along the first one and be seen the same.",
-            "Tilt the gripper about two axes, by 20 degrees or more each way.")
+            f"Camera and {what} could be shifted along the first axis without a visible "
+            "difference.",
+            "Tilt the gripper about two axes, by at least 20 degrees in each direction.")
 
 
 def _require_depth(places: np.ndarray, largest_residual: float) -> None:
@@ -129,9 +131,9 @@ def _require_depth(places: np.ndarray, largest_residual: float) -> None:
     needed = least_depth(largest_residual)
     if spread < needed:
         raise InputError(
-            f"The marker was seen in a plane: its places spread by {1000 * spread:.1f} mm out of "
-            f"it (root mean square); {1000 * needed:.0f} mm are needed.",
-            "A mirrored frame would fit as well.",
+            f"The marker positions lie in a plane: they spread by {1000 * spread:.1f} mm out of "
+            f"it (root mean square), and {1000 * needed:.0f} mm are needed.",
+            "A mirrored frame would fit equally well.",
             "Move the marker to poses in front of and behind that plane.")
 
 
@@ -188,9 +190,10 @@ def base_from_camera(fit: CameraFit, scan: np.ndarray, camera_on: CameraOn,
         InputError: the scan is in the frame of a marker, which has no turn.
     """
     if camera_on == "gripper" and scan_pose is None and len(fit.covariance) < 12:
-        raise InputError("The scan is in the board's frame, and only a marker's place was seen.",
-                         "A place has no axes.", "Give the board's turns as well "
-                         "(seen_rx_rad and so on), or --scan-pose.")
+        raise InputError("The scan is in the board's frame, but only the position of a marker was "
+                         "seen.",
+                         "A position has no axes.", "Also give the board's rotations (seen_rx_rad "
+                         "and so on), or --scan-pose.")
 
     def scanned(camera: np.ndarray, board: np.ndarray) -> np.ndarray:
         """The scan's frame in the robot's base."""

@@ -21,14 +21,14 @@ def checked(cell: Cell, stream: SampleStream, dashboard: Dashboard) -> dict[str,
     series = "cb3" if stream.version[0] == 3 else "e"
     arm = cell.arm
     if series != arm.series:
-        raise InputError(f"The controller is version {version}, the cell says {arm.name}.",
-                         "They are of different series, with different arms.",
+        raise InputError(f"The controller has version {version}, but the cell states {arm.name}.",
+                         "They belong to different series of arms.",
                          "Correct robot.model in the cell file.")
     calibrated = cell.robot.version
     if calibrated and calibrated.split(".")[:2] != version.split(".")[:2]:
-        raise InputError(f"The controller is version {version}, the cell was calibrated with "
+        raise InputError(f"The controller has version {version}, but the cell was calibrated with "
                          f"{calibrated}.", "Another version may have other settings of tool, "
-                         "kinematics and safety.", "Calibrate again, or, having compared them, "
+                         "kinematics and safety.", "Calibrate again, or compare the settings and "
                          "correct robot.version in the cell file.")
     facts = {"address": cell.robot.address, "version": version,
              "model": dashboard.ask("get robot model"),
@@ -37,12 +37,13 @@ def checked(cell: Cell, stream: SampleStream, dashboard: Dashboard) -> dict[str,
              "rate_hz": stream.rate, "real_time": claim_real_time()}
     known = facts["model"].lower()
     if known.startswith("ur") and known != arm.name.rstrip("e"):
-        raise InputError(f"The robot says that it is a {facts['model']}, the cell {arm.name}.",
+        raise InputError(f"The robot reports the model {facts['model']}, but the cell states "
+                         f"{arm.name}.",
                          "Reach and limits would be those of another arm.",
                          "Correct robot.model in the cell file.")
     if facts["remote"] == "false":
         raise SafetyStop("The robot is not in remote control.",
-                         "It would not take a program from here.",
+                         "It would not accept a program.",
                          "Switch it to remote control on the pendant.")
     samples = stream.read(1.0)
     if not samples:
@@ -50,10 +51,10 @@ def checked(cell: Cell, stream: SampleStream, dashboard: Dashboard) -> dict[str,
     sample = samples[-1]
     if sample.safety_mode != 1 or sample.robot_mode != 7:
         raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot "
-                         f"mode {sample.robot_mode}.", "Nothing here releases a stop or "
-                         "switches an arm on.", "Do it on the pendant, having looked.")
+                         f"mode {sample.robot_mode}.", "Limber does not release stops or switch "
+                         "an arm on.", "Check the robot, then do it on the pendant.")
     if sample.slider <= 0.0:
-        raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
+        raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
                          "Raise it on the pendant.")
     facts |= {"pose": sample.pose.tolist(), "joints": sample.joints.tolist(),
               "slider": sample.slider}
@@ -87,4 +88,4 @@ def require(done: bool, what: str) -> None:
     """Raise a WorkError where an order of ur-rtde returned no success."""
     if not done:
         raise WorkError(f"The robot did not {what}.", "It returned no success.",
-                        "See its log; restart the program.")
+                        "See the controller's log, and restart the program.")

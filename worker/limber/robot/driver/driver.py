@@ -177,7 +177,7 @@ class Driver:
                 if not self._has_just_woken:
                     self._judge(self.guard.silence(age), at_once=True)
                     if age > _GONE_SECONDS:
-                        self._lost(f"no data came from the robot for {age:.1f} s")
+                        self._lost(f"no data arrived from the robot for {age:.1f} s")
                         return
                 self._feel(self._last)
             self._take(orders)
@@ -198,8 +198,8 @@ class Driver:
         if self._last is None or self._last.arrived > self._woke:
             self._woke = self._listened
         if self._following is not None:
-            self.tell(event="warning", text=f"the computer held the robot's program up for "
-                      f"{1000 * overslept:.0f} ms: nothing was watched in that time")
+            self.tell(event="warning", text="the computer delayed the robot's program by "
+                      f"{1000 * overslept:.0f} ms, and nothing was monitored in that time")
 
     @property
     def _has_just_woken(self) -> bool:
@@ -212,7 +212,7 @@ class Driver:
             except queue.Empty:
                 break
             if order is None:
-                self._judge(self.guard.event("the program that drives the robot is gone"))
+                self._judge(self.guard.event("the program that drives the robot has ended"))
                 self.ended = True
                 return
             self._heard = time.monotonic()
@@ -325,7 +325,8 @@ class Driver:
                 # ur-rtde hands a command over with the controller's next step, 8 ms of a CB3's.
                 is_slow = sample is not None and 1.0 / self._stream.rate > _LONG_STEP_SECONDS
                 if at_once or is_slow:
-                    self._stop_by_dashboard(f"it does not wait for a step: {decision.reason}")
+                    self._stop_by_dashboard("it does not wait for the next step: "
+                                            f"{decision.reason}")
                 self._stop(decision, sample)
             else:
                 self._stopped_at = time.monotonic()
@@ -371,7 +372,7 @@ class Driver:
         """The data connection is gone: nothing is known, so everything that stops is used."""
         moving = self._following is not None
         decision = self.guard.event(reason)
-        self._stop_by_dashboard("the data connection is gone")
+        self._stop_by_dashboard("the data connection was lost")
         self.tell(event="stopped", reason=str(decision), moving=moving)
         self.ended = True
 
@@ -406,7 +407,7 @@ class Driver:
 
     def _require_program(self, sample: Sample) -> None:
         if sample.slider <= 0.0:
-            raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
+            raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
                              "Raise it on the pendant.")
         if not self._control.isProgramRunning():
             self._start_program()
@@ -447,8 +448,8 @@ class Driver:
                                     _LOOKAHEAD, _GAIN)
         if not done:
             self._judge(self.guard.event(
-                "the control program took no target: it ends when it hears nothing for "
-                f"{1 / WATCHDOG_HZ:.2g} s, as where this computer is too busy"))
+                "the control program accepted no target: it ends if it receives nothing for "
+                f"{1 / WATCHDOG_HZ:.2g} s, for example because this computer is too busy"))
             return
         over = following.time >= following.trajectory.duration + 0.5 * _LOOKAHEAD
         still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
@@ -459,7 +460,7 @@ class Driver:
         self._following = None
         self.guard.end()
         if not self._control.servoStop(_STOP_DECELERATION):
-            self._stop_by_dashboard("the control program did not end the motion")
+            self._stop_by_dashboard("the control program did not stop the motion")
         error = float(np.linalg.norm(
             self._require_sample().pose[:3] - following.trajectory.poses[-1, :3]))
         self.tell(event="reached", error_m=error)
@@ -476,7 +477,7 @@ class Driver:
 
     def _grip(self, close: bool) -> None:
         if self._io is None:
-            raise InputError("The cell's gripper is not driven from here.",
+            raise InputError("Limber does not drive the cell's gripper.",
                              f"tool.gripper is {self.cell.tool.gripper}.",
                              "Close and open it by hand.")
         require(self._io.setStandardDigitalOut(self.cell.tool.close_output, close),
@@ -488,7 +489,9 @@ class Driver:
     def _begin_tare(self, seconds: float) -> None:
         sample = self._require_sample()
         if self._following is not None:
-            raise SafetyStop("A tare while the robot moves.", "", "Wait until it stands.")
+            raise SafetyStop("The sensor cannot be tared while the robot "
+                             "moves.", "", "Wait until the robot is at "
+                                                                  "rest.")
         self._chain.start_tare()
         self._tare_until = sample.clock + seconds
 

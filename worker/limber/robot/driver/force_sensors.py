@@ -98,7 +98,7 @@ class Ft300Sensor:
             self._socket = socket.create_connection((address, FT300_PORT), timeout)
         except OSError as error:
             raise WorkError(f"No FT300 answers at {address} port {FT300_PORT} ({error}).",
-                            "The cell names it as the force sensor.",
+                            "The cell states it as the force sensor.",
                             "Check its cable and that its URCap is installed; or name another "
                             "sensor in the cell file.") from error
         self._socket.setblocking(False)
@@ -143,7 +143,7 @@ class ReplayedSensor:
 
         stream = read_stream(path)
         if stream.values.shape[1] < 6:
-            raise InputError(f"{path} has {stream.values.shape[1]} columns beside its time.",
+            raise InputError(f"{path} has {stream.values.shape[1]} columns besides the time.",
                              "A wrench has six.", "Give fx, fy, fz, tx, ty, tz.")
         self._frame = frame_of(np.array(cell.sensor.pose))
         self._times, self._values = stream.times - stream.times[0], stream.values[:, :6]
@@ -173,19 +173,20 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
     if cell.sensor.kind == "replay":
         if not cell.robot.address.startswith("127."):
             raise InputError(f"The cell replays forces from {cell.sensor.file} at robot "
-                             f"{cell.robot.address}.", "The guard would not feel the branch that "
-                             "is there.", "Replay at the virtual robot (127.0.0.x), or name the "
-                             "sensor that is mounted.")
+                             f"{cell.robot.address}.", "The guard would not feel the real "
+                             "branch.", "Replay only with the virtual robot (127.0.0.x), or "
+                             "state the mounted sensor.")
         return ReplayedSensor(cell, Path(cell.sensor.file))
     if cell.sensor.kind == "none":
-        raise InputError("The cell names no force sensor.",
+        raise InputError("The cell states no force sensor.",
                          "The guard does not move a branch that it cannot feel.",
                          "Set sensor.kind to ft300 or controller.")
     if cell.sensor.kind == "ft300":
         return Ft300Sensor(cell)
     if cell.arm.series == "cb3":
-        raise InputError(f"The cell takes the force of the {cell.arm.name}'s own controller.",
-                         "A CB3 estimates it from motor currents, wrong by newtons that wander.",
+        raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
+                         "A CB3 estimates it from motor currents, with drifting errors of several "
+                         "newtons.",
                          "Mount a force-torque sensor and set sensor.kind to ft300.")
     return ControllerSensor(cell)
 
@@ -236,8 +237,8 @@ class WrenchChain:
                         np.full(3, 6 * self.cell.sensor.torque_sigma_nm + 0.05)]
         if np.any(spread > allowed):
             raise WorkError(f"The force spread by {spread[:3].max():.2g} N during the tare.",
-                            "The gripper was touched or moved, or the sensor is bad.",
-                            "Let it hang free and still, and tare again.")
+                            "The gripper was touched or moved, or the sensor is faulty.",
+                            "Let it hang free and at rest, and tare again.")
         self.bias = readings.mean(axis=0)
         self.bias_sigma = spread / np.sqrt(len(readings))
         return self.bias_sigma

@@ -27,10 +27,10 @@ _MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a dif
 _MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides pulls askew
 _PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, on a retreat
 _NO_DOUBT = np.zeros((6, 6))
-_RISES = "the {} rises on the way back"
+_RISES = "the {} rises during the return"
 _UNLIKE = "force unlike the predicted one [N]"
 _SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
-_FELL = "the predicted force fell at once: the branch slipped, broke or came loose [N]"
+_FELL = "the predicted force dropped suddenly: the branch slipped, broke or came loose [N]"
 
 
 class State(Enum):
@@ -169,11 +169,11 @@ class Guard:
         """
         if self.state != State.IDLE:
             raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
-                             "No motion begins before a person has looked.",
+                             "No motion begins before a person has checked.",
                              "Choose: hold, retreat or release.")
         if not self._is_tared:
-            raise SafetyStop("The force sensor is not tared.", "Its bias would pass for a force "
-                             "on the branch.", "Tare it with the gripper hanging free.")
+            raise SafetyStop("The force sensor is not tared.", "Its bias would be taken for a "
+                             "force on the branch.", "Tare it with the gripper hanging free.")
         self.state = State.MOVING
         self._memory = _Memory()
 
@@ -191,11 +191,11 @@ class Guard:
             SafetyStop: the robot moves, or the force is not known.
         """
         if self.state == State.MOVING:
-            raise SafetyStop("The robot is moving.", "", "Stop it before it goes back.")
+            raise SafetyStop("The robot is moving.", "", "Stop it before it returns.")
         if not np.isfinite(wrench).all():
-            raise SafetyStop("The force is not known: the sensor shows no number, or is at the end "
-                             "of its range.", "Whether it falls on the way back could not be "
-                             "seen.", "Open the gripper.")
+            raise SafetyStop("The force is unknown: the sensor gives no number, or is at the end "
+                             "of its range.", "So it is not visible whether the force falls "
+                             "during the return.", "Open the gripper.")
         self.state = State.IDLE
         self.begin()
         self._memory.relief = _Relief(length(wrench[:3]), length(wrench[3:]))
@@ -214,7 +214,7 @@ class Guard:
         """
         if self.state != State.PAUSED:
             raise SafetyStop(f"The robot is {self.state.value}, not paused.", self.reason,
-                             "Only a pause goes on; after a stop choose what to do.")
+                             "Only a pause can be continued; after a stop, choose what to do.")
         self.state = State.MOVING
         self._memory.peak = 0.0
 
@@ -280,8 +280,8 @@ class Guard:
         if self.state != State.MOVING:
             raise SafetyStop(f"The robot is {self.state.value}.", self.reason, "")
         if target.shape != (6,) or not np.isfinite(target).all():
-            self._stop("a target that is no pose")
-            raise SafetyStop("A target that is no pose.", f"{target}", "")
+            self._stop("an invalid target pose")
+            raise SafetyStop("An invalid target pose was given.", f"{target}", "")
         limits = self._settings.limits
         way = length(target[:3] - current[:3])
         turn = length(turn_between(current, target))
@@ -294,7 +294,7 @@ class Guard:
     def _check_clock(self, sample: Sample) -> Decision:
         last, self._memory.clock = self._memory.clock, sample.clock
         if not np.isfinite(sample.clock):
-            return self._stop("the controller's clock shows no number")
+            return self._stop("the controller's clock gives no number")
         if last is None:
             return _GO
         passed = sample.clock - last
@@ -317,7 +317,7 @@ class Guard:
     def _check_wrench(self, sample: Sample, wrench: np.ndarray, raw: np.ndarray) -> Decision:
         numbers = np.concatenate((wrench, sample.wrench, sample.pose, sample.joints, sample.speed))
         if not np.isfinite(numbers).all():
-            return self._stop("a sensor shows no number")
+            return self._stop("a sensor gives no number")
         memory = self._memory
         # Turning a wrench to other axes and back leaves rounding in its last digits.
         if memory.raw is None or np.abs(raw - memory.raw).max(axis=1).min() > _SAME:
@@ -335,7 +335,7 @@ class Guard:
             # Nothing moves yet, and what a sensor shows before its tare is its bias.
             return _GO
         if np.isnan(wrench).any():
-            return self._stop("a sensor shows no number")
+            return self._stop("a sensor gives no number")
         force, torque = length(wrench[:3]), length(wrench[3:])
         most_force, most_torque = limits.hard_force_n, limits.hard_torque_nm
         told = "hard {} limit"
@@ -374,7 +374,7 @@ class Guard:
                     and length(grasp - mark) > settings.relief_way)
         if mark is None or has_gone or sample.clock - relief.marked_clock > settings.relief_time:
             if force > limits.soft_force_n and force > relief.marked_force - settings.least_force:
-                return self._stop("the force does not fall on the way back [N]", force,
+                return self._stop("the force does not fall during the return [N]", force,
                                   limits.soft_force_n)
             relief.marked_force, relief.marked_clock, relief.marked_grasp = (
                 force, sample.clock, grasp)
@@ -442,7 +442,7 @@ class Guard:
             memory.peak = max(memory.peak * np.exp(-self._step / settings.loss_time), force)
             lost = memory.peak - force
             if lost > max(settings.lost_share * memory.peak, settings.least_force):
-                return self._stop("the force fell at once: slip or break [N]", lost,
+                return self._stop("the force dropped suddenly: slip or break [N]", lost,
                                   max(settings.lost_share * memory.peak, settings.least_force))
             return _GO
         doubt = _NO_DOUBT if doubt is None else doubt

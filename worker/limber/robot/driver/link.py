@@ -86,7 +86,7 @@ class RobotLink:
         self._sampled.clear()
         if not self._sampled.wait(seconds):
             raise WorkError(f"The robot's driver sends no samples in {seconds:.0f} s.",
-                            "A port may be silent.", "Look at the robot.")
+                            "A port may be silent.", "Check the robot.")
         return self._latest
 
     def tare(self, seconds: float = 0.5) -> dict[str, Any]:
@@ -180,9 +180,9 @@ class RobotLink:
                     raise self._why_it_ended()
                 left = end - time.monotonic()
                 if left <= 0:
-                    raise WorkError(f"The robot's driver says nothing of {' or '.join(kinds)} "
+                    raise WorkError(f"The robot's driver reported neither {' nor '.join(kinds)} "
                                     f"for {seconds:.0f} s.", "A port may be silent.",
-                                    "Look at the robot.")
+                                    "Check the robot.")
                 self._news.wait(left)
 
     def _why_it_ended(self) -> LimberError:
@@ -193,11 +193,12 @@ class RobotLink:
         if ended_by_deadline(code):
             return SafetyStop(
                 "The robot was stopped: the controller did not answer its driver for "
-                f"{CALL_SECONDS:g} s, and the driver was ended.", "Its connection carries one way "
-                "alone, or not at all.", "Look at the robot, which its own watchdog has stopped; "
-                "check the cable and the network before connecting again.")
+                f"{CALL_SECONDS:g} s, and the driver was ended.", "Its connection works in one "
+                "direction only, or not at "
+                "all.", "Check the robot, which its own watchdog has stopped. "
+                "Check cable and network before connecting again.")
         return WorkError("The robot's driver has ended.", "Its connection broke.",
-                         "Look at the robot; its own watchdog has stopped it.")
+                         "Check the robot; its own watchdog has stopped it.")
 
     def abandon(self) -> None:
         """Close the pipe without a word, as a program does that is killed."""
@@ -222,7 +223,7 @@ class RobotLink:
                 self.process.stdin.write(line + "\n")
                 self.process.stdin.flush()
             except (OSError, ValueError) as error:
-                raise WorkError(f"The robot's driver is gone ({error}).") from error
+                raise WorkError(f"The robot's driver has ended ({error}).") from error
 
     def _beat(self) -> None:
         while not self._closing.wait(_BEAT_SECONDS):

@@ -81,8 +81,9 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
             says where and why.
     """
     if speed > cell.limits.speed_m_s:
-        raise InputError(f"{speed:g} m/s is over the cell's {cell.limits.speed_m_s:g} m/s.",
-                         "The guard would slow it down and the force would not fit the time.",
+        raise InputError(f"{speed:g} m/s exceeds the cell's {cell.limits.speed_m_s:g} m/s.",
+                         "The guard would slow the motion down, and the predicted forces would "
+                         "not match.",
                          "Reduce --speed, or raise limits.speed_m_s in the cell file.")
     wanted = across(axis) if rotation is None else [np.asarray(rotation, float)]
     ways: list[_Way] = []

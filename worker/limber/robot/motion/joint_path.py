@@ -66,7 +66,7 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
     frames = np.asarray(frames, float)
     if frames.ndim != 3 or frames.shape[1:] != (4, 4) or not np.isfinite(frames).all():
         raise InputError(f"Frames of shape {frames.shape}, or not finite.",
-                         "A path is a list of 4 x 4 transforms.", "Check the poses.")
+                         "A path consists of finite 4 x 4 transforms.", "Check the poses.")
     limits = arm.joint_limits if joint_limits is None else np.asarray(joint_limits, float)
     solutions = inverse(arm, frames)
     paths, refusals = [], []
@@ -156,9 +156,10 @@ def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
     place = ", ".join(f"{value:.3f}" for value in frames[farthest.index, :3, 3])
     reasons = sorted({refusal.reason for refusal in refusals if refusal.index == farthest.index})
     return NoPathError(
-        f"No joint branch of the arm carries the path: the best one ends at pose "
+        "No configuration of the arm can follow the path. The best one ends at pose "
         f"{farthest.index + 1} of {len(frames)}, flange at ({place}) m in the robot's base frame: "
         f"{'; '.join(reasons)}.",
         "The arm ends short of it." if reasons == [_OUT_OF_REACH] else
-        "The arm would have to turn over on the way, and would swing the branch.",
-        "Move the robot's base, choose a path nearer to it, or turn the tool.")
+        ("The arm would have to change its configuration on the path, which would swing the "
+         "branch."),
+        "Move the robot's base, choose a path nearer to it, or rotate the tool.")

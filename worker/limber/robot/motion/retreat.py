@@ -60,7 +60,8 @@ class WayBack:
             SafetyStop: there is no way back, the arm left it, or stands otherwise than on it.
         """
         if not self._poses:
-            raise SafetyStop("There is no way back.", "Nothing was followed yet.", "")
+            raise SafetyStop("There is no path to return along.", "Nothing has been followed yet.",
+                             "")
         poses = np.array(self._poses)
         off = np.linalg.norm(poses[:, :3] - sample.pose[:3], axis=1) / POSITION_M
         # Turns of those alone that are near: a long way has many, and the watchdog waits.
@@ -71,14 +72,16 @@ class WayBack:
         if off[nearest] > 1.0:
             away = length(sample.pose[:3] - poses[nearest, :3])
             turn = np.degrees(length(turn_between(poses[nearest], sample.pose)))
-            raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees from the way "
-                             "that it came.", "Something has moved it since.",
+            raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees away from "
+                             "its path.", "Something has moved it.",
                              "Free the branch by hand.")
         if told := different_joints(sample.joints, self._joints[nearest]):
-            raise SafetyStop(f"The arm does not stand as it came: {'; '.join(told)}.",
-                             "Something has moved it since.", "Free the branch by hand.")
+            raise SafetyStop("The arm is not in the configuration in which it came: "
+                             f"{'; '.join(told)}.",
+                             "Something has moved it.", "Free the branch by hand.")
         if length(sample.pose - poses[0]) < _STANDS:
-            raise SafetyStop("There is no way back.", "The arm stands where it began.", "")
+            raise SafetyStop("There is no path to return "
+                             "along.", "The arm is at its starting point.", "")
         # At least to the start: against something stiff a fraction of a millimetre is a way.
         back = np.vstack([sample.pose, poses[:max(_first_time(off), 1)][::-1]])
         speed, turn_speed = _SLOWER * self._speeds

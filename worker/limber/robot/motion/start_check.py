@@ -34,9 +34,9 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
     """
     away = length(start[:3] - pose[:3])
     if away > POSITION_M:
-        raise SafetyStop(f"The path starts {1000 * away:.1f} mm from where the robot is.",
-                         f"At most {1000 * POSITION_M:.0f} mm are bridged.",
-                         "Move the robot to the start, or plan from its actual pose.")
+        raise SafetyStop(f"The path starts {1000 * away:.1f} mm away from the robot.",
+                         f"At most {1000 * POSITION_M:.0f} mm are allowed.",
+                         "Move the robot to the start, or plan from its current pose.")
     told = []
     turn = length(turn_between(start, pose))
     if turn > ROTATION_RAD:
@@ -46,10 +46,11 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
     told += [] if start_joints is None else different_joints(joints, start_joints)
     if told:
         raise SafetyStop(
-            f"The arm does not stand as the path was checked for: {'; '.join(told)}.",
-            "On the way its links, joints and cables would go where nothing was checked.",
-            "Turn the gripper to the path's start." if start_joints is None else
-            f"Move the joints to {in_degrees(start_joints)} degrees: a dry run of `limber "
+            "The arm is not in the configuration that the path was checked for: "
+            f"{'; '.join(told)}.",
+            "Its links, joints and cables would move where nothing was checked.",
+            "Rotate the gripper to the path's start." if start_joints is None else
+            f"Move the joints to {in_degrees(start_joints)} degrees. A dry run of `limber "
             "execute` states them as start_joints_rad.")
 
 
@@ -60,8 +61,8 @@ def different_joints(joints: np.ndarray, wanted: np.ndarray) -> list[str]:
         turns = (joints[number] - wanted[number]) / (2 * np.pi)
         whole = round(turns) != 0 and abs(turns - round(turns)) * 2 * np.pi <= JOINT_RAD
         told.append(f"joint {number + 1} ({_JOINTS[number]}) is at "
-                    f"{np.degrees(joints[number]):.1f} degrees, and "
-                    f"{np.degrees(wanted[number]):.1f} was expected"
+                    f"{np.degrees(joints[number]):.1f} degrees instead of "
+                    f"{np.degrees(wanted[number]):.1f}"
                     + (" (whole turns apart)" if whole else ""))
     return told
 

@@ -34,18 +34,18 @@ class Trajectory:
                   and self.poses.shape == (len(self.times), 6))
         if not shaped or not np.isfinite(self.poses).all() or np.any(np.diff(self.times) <= 0):
             raise InputError(f"A trajectory of {self.times.shape} times and {self.poses.shape} "
-                             "poses.", "It needs ascending times and one finite pose each.",
+                             "poses.", "It needs ascending times, each with one finite pose.",
                              "Check the path.")
         if self.expected is not None and (
                 self.expected.wrenches.shape != self.poses.shape
                 or not all(np.isfinite(part).all() for part in (
                     self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
-            raise InputError("Expected wrenches that do not fit the poses.",
-                             "Each pose has one of six numbers.", "Check the plan.")
+            raise InputError("The expected wrenches do not match the poses.",
+                             "Each pose needs a wrench of six numbers.", "Check the plan.")
         if self.joints is not None and (self.joints.shape != self.poses.shape
                                         or not np.isfinite(self.joints).all()):
             raise InputError(f"Joint angles of shape {self.joints.shape} for {len(self.poses)} "
-                             "poses, or not finite.", "Each pose has six.", "Check the path.")
+                             "poses, or not finite.", "Each pose needs six.", "Check the path.")
 
     @property
     def duration(self) -> float:

@@ -112,5 +112,5 @@ def arm_named(name: str) -> Arm:
     arm = ARMS.get(name.lower().replace("-", "").replace(" ", ""))
     if arm is None:
         raise InputError(f"Robot {name!r} is unknown.", "Its link lengths are needed.",
-                         f"Known are {', '.join(ARMS)}.")
+                         f"Known robots: {', '.join(ARMS)}.")
     return arm

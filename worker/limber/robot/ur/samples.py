@@ -76,15 +76,15 @@ class SampleStream:
             self._socket = socket.create_connection((address, RTDE_PORT), timeout)
         except OSError as error:
             raise WorkError(f"No robot answers at {address} port {RTDE_PORT} ({error}).",
-                            "Nothing is moved without its data.",
-                            "Check that it is on, its address and the network.") from error
+                            "Nothing moves without its data.",
+                            "Check its power, its address and the network.") from error
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._handshake(timeout)
         except (OSError, ValueError) as error:
             self._socket.close()
             raise WorkError(f"{address} port {RTDE_PORT} does not answer as a robot ({error}).",
-                            "It accepted the connection, but speaks no RTDE.",
+                            "It accepted the connection, but does not speak RTDE.",
                             "Check the address; restart the controller if it is one.") from error
 
     def _handshake(self, timeout: float) -> None:
@@ -183,8 +183,9 @@ class Dashboard:
             self._file.readline()
         except OSError as error:
             raise WorkError(f"The dashboard of {address} does not answer ({error}).",
-                            "It is the second way to stop the robot.",
-                            "Check the network; the e-Series can forbid it in its settings.",
+                            "The dashboard is the second way to stop the robot.",
+                            "Check the network. The e-Series can disable the dashboard in its "
+                            "settings.",
                             ) from error
 
     def ask(self, command: str) -> str:

@@ -216,10 +216,10 @@ def line_move(arm: Arm, start: np.ndarray, start_pose: np.ndarray, waypoints: li
     offset[np.isnan(solutions).any(axis=(0, 2))] = np.inf
     branch = int(offset.argmin())
     if not offset[branch] < 0.05:
-        raise Unreachable("a pose on the way is out of reach")
+        raise Unreachable("a pose on the path is out of reach")
     joints = np.unwrap(np.vstack([start, solutions[:, branch]]), axis=0)[1:]
     if len(joints) > 1 and np.abs(np.diff(joints, axis=0)).max() > 0.5:
-        raise Unreachable("the way passes a singularity")
+        raise Unreachable("the path passes a singularity")
     return _timed(arm, joints, curve, curve.points[:, :3], waypoints)
 
 

@@ -49,9 +49,10 @@ class VirtualCamera:
             told = json.loads(self._stream.readline() or b"{}")
             packed = self._stream.read(told.get("bytes", 0))
         except (OSError, ValueError) as error:
-            raise WorkError(f"The virtual camera is gone ({error}).") from error
+            raise WorkError(f"The connection to the virtual camera was lost ({error}).") from error
         if "error" in told or not packed:
-            raise WorkError(f"The virtual camera gave no image: {told.get('error', 'it is gone')}.")
+            raise WorkError("The virtual camera returned no image: "
+                            f"{told.get('error', 'it is gone')}.")
         steps = np.frombuffer(zlib.decompress(packed), "<u2")
         return steps.reshape(camera.height, camera.width) / camera.depth_scale
 
@@ -62,8 +63,8 @@ def views_around(middle: np.ndarray, distance: float, count: int,
     below.
     """
     if count < 1 or not distance > 0:
-        raise InputError(f"{count} views from {distance:g} m.", "A scan has one or more, from "
-                         "outside of the branch.", "Ask for 8 from 0.6 m.")
+        raise InputError(f"{count} views from {distance:g} m.", "A scan needs at least one view, "
+                         "from outside of the branch.", "Use 8 views from 0.6 m, for example.")
     found = []
     for number in range(count):
         turn, tilt = 2 * np.pi * number / count, 0.35 * (-1) ** number
@@ -85,8 +86,10 @@ def scanned(address: str, cameras: list[Camera]) -> np.ndarray:
             parts.append(depth_to_cloud(camera, depth, _inner(depth)).points)
     points = np.concatenate(parts)
     if not len(points):
-        raise WorkError(f"{len(cameras)} views show nothing.", "The cameras look past the branch.",
-                        "Give another middle or distance.")
+        raise WorkError(f"The {len(cameras)} views show "
+                        "nothing.", "The cameras do not see the "
+                                                               "branch.",
+                        "Give another --middle or --distance.")
     return points
 
 

@@ -72,7 +72,7 @@ class VirtualRobot:
             self.process.stdin.write(json.dumps({"action": action, **values}) + "\n")
             self.process.stdin.flush()
         except OSError as error:
-            raise WorkError(f"The virtual robot is gone ({error}).") from error
+            raise WorkError(f"The connection to the virtual robot was lost ({error}).") from error
         state = self._answer(10.0)
         if "error" in state:
             raise WorkError(state["error"])

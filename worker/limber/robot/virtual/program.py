@@ -111,7 +111,7 @@ class ControlProgram:
         action = _ACTIONS.get(command)
         if action is None:
             # The real controller would do it; this one must not pretend that it did.
-            controller.stop_program(f"command {command} is not there in the virtual controller")
+            controller.stop_program(f"the virtual controller has no command {command}")
             return
         try:
             waiting = action(self, controller)

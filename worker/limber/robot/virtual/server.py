@@ -48,8 +48,8 @@ class Server:
 
     def __init__(self, controller: Controller, address: str):
         if not address.startswith("127.") and address not in ("localhost", "::1"):
-            raise InputError(f"Address {address}.", "The virtual robot obeys whoever connects: it "
-                             "must not be reached from outside.", "Use 127.0.0.1 or 127.0.0.x.")
+            raise InputError(f"Address {address}.", "The virtual robot obeys any client, so it "
+                             "must not be reachable from outside.", "Use 127.0.0.1 or 127.0.0.x.")
         self.controller = controller
         self.address = address
         self.delay = 0.0
@@ -85,8 +85,8 @@ class Server:
         except OSError as error:
             await self.close()
             raise WorkError(f"Port {port} of {self.address} cannot be opened ({error}).",
-                            "Another virtual robot or program has it; the client library knows no "
-                            "other port.", "End that program, or give --address 127.0.0.2 "
+                            "Another virtual robot or program uses it, and the client library "
+                            "knows no other port.", "End that program, or give --address 127.0.0.2 "
                             "(Linux, Windows).") from error
 
     async def close(self) -> None:
