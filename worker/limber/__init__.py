@@ -62,4 +62,5 @@ _PLACES = {
 }
 
 __getattr__, __dir__ = _exports(__name__, _PLACES)
-__all__ = ["__version__", *_PLACES]
+__all__ = ["__version__"]
+__all__ += list(_PLACES)

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import sys
+import types
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -41,16 +42,36 @@ def run_stage(name: str, given: Mapping[str, Any], *, quiet: bool) -> tuple[str,
     told: list[str] = []
     stage = stage_description(name)
     try:
-        with _in_python_words(), _sink(name, quiet) as sink:
+        with in_python_words(), _script_run_once(), _sink(name, quiet) as sink:
             inputs, settings, options = stage.models(
                 {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
                  else value for key, value in given.items()})
             result = stage.run(inputs, settings, options, Progress(sink, told.append))
     finally:
         for text in told:
-            # At the line that calls the verb: run_stage, the verb's helper and the verb lie between.
-            warnings.warn(_with_python_names(text), stacklevel=4)
+            warnings.warn(_with_python_names(text), stacklevel=_users_level())
     return stage.entry(inputs, settings), {"warnings": told} | plain(result)
+
+
+def _users_level() -> int:
+    """How many calls lie between the function that asks and the line that called a verb."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals["__name__"].startswith("limber."):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+@contextlib.contextmanager
+def _script_run_once() -> Iterator[None]:
+    """Keep the processes that a stage starts from importing the user's script: that would run it
+    again, and they need nothing of it.
+    """
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 @contextlib.contextmanager
@@ -69,7 +90,7 @@ def _sink(title: str, quiet: bool) -> Iterator[Sink | None]:
 
 
 @contextlib.contextmanager
-def _in_python_words() -> Iterator[None]:
+def in_python_words() -> Iterator[None]:
     """Let the messages of errors name keyword arguments where they name options."""
     try:
         yield

@@ -1,4 +1,8 @@
-"""What the verbs return: frozen results with units, that print, draw and become tables."""
+"""What the verbs return: frozen results with units, that print, draw and become tables.
+
+Arrays are read-only. ``table()`` gives columns by name, as ``pandas.DataFrame(...)`` takes them;
+``plot()`` gives a figure of matplotlib, which a notebook shows and ``savefig`` writes.
+"""
 
 import html
 from collections.abc import Callable, Mapping
@@ -19,6 +23,8 @@ if TYPE_CHECKING:
     from limber.planning.field.energy_field import EnergyField as FittedField
     from limber.planning.plan_file import PlanFile
     from limber.recordings.recording import Pull as Recording
+
+_MOST_PRINTED = 7  # values in one line; a notebook's table has them all
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -47,8 +53,10 @@ class Result:
                 for name, value in self.values.items() if isinstance(value, bool | int | float)}
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{label} {text}" for label, text in self._shown().items())
-        return f"{type(self).__name__}({told})"
+        told = [f"{label} {text}" for label, text in self._shown().items()]
+        if len(told) > _MOST_PRINTED:
+            told[_MOST_PRINTED:] = ["..."]
+        return f"{type(self).__name__}({', '.join(told)})"
 
     def _repr_html_(self) -> str:
         rows = "".join(f"<tr><td>{html.escape(label)}</td><td>{html.escape(text)}</td></tr>"
@@ -246,7 +254,7 @@ class Load(Result):
     """What wind, snow, fruit or a cut do to the branch.
 
     Attributes:
-        sag: Of the tip [m].
+        sag: How far the tip comes down [m].
         sag_interval: Its 95 % interval [m], shape [2]; NaN where nothing tells how sure E is.
         greatest_strain: Largest principal strain.
         strain_over_limit: That strain over the one at which the wood is taken to fail.

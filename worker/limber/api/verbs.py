@@ -2,12 +2,10 @@
 
 Every verb works alike. What it needs comes first, without its name; all else are the inputs,
 settings and options of its command by name (``--mesh-spacing 4`` is ``mesh_spacing=4``), which
-:func:`limber.settings` lists. ``quiet=True`` shows no progress. A verb runs its stage in this process,
-writes what the command writes, and returns a frozen result. What has not changed is not computed
-again. Errors are those of :mod:`limber.core.errors`; what the work warns of are Python warnings.
-
-A script that runs :meth:`Branch.energy_field`, :meth:`Branch.plan` or :meth:`Branch.session` needs
-``if __name__ == "__main__":`` around it, since these start processes; a notebook does not.
+:func:`limber.settings` lists. ``quiet=True`` shows no progress. A verb runs its stage in this
+process, writes what the command writes, and returns a frozen result. What has not changed is not
+computed again. Errors are those of :mod:`limber.core.errors`; what the work warns of are Python
+warnings.
 """
 
 import html
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import numpy as np
 
-from limber.api.running import run_stage, stage_of
+from limber.api.running import in_python_words, run_stage, stage_of
 from limber.api.typed_results import (
     EnergyField,
     Estimate,
@@ -33,6 +31,7 @@ from limber.api.typed_results import (
     Result,
     Simulation,
     Written,
+    drawn,
     read_result,
 )
 from limber.core.errors import InputError
@@ -59,7 +58,7 @@ def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> Gener
         settings: ``length`` [m], ``fork_count``, ``noise`` [m], ``seed`` and those that
             ``limber.settings("generate")`` lists.
 
-    >>> scan = limber.generate(folder / "scan", length=0.3, fork_count=0, seed=1)
+    >>> scan = limber.generate("scan", length=0.3, fork_count=0, seed=1)
     >>> scan.cloud.name, scan.young.shape
     ('cloud.ply', (4,))
     """
@@ -84,9 +83,9 @@ def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: Path
     Raises:
         InputError: the scan or a setting cannot be used. WorkError: no branch came out.
 
-    >>> branch = limber.reconstruct(folder / "scan" / "cloud.ply", folder / "a.branch", quiet=True)
-    >>> branch.mesh.tet_count > 100
-    True
+    >>> branch = limber.reconstruct("scan/cloud.ply", "new.branch", mesh_spacing=4)
+    >>> branch.mesh.cell_data["young"].max() / 1e6
+    100.0
     """
     if isinstance(cloud, str | os.PathLike):
         if Path(cloud).is_dir():
@@ -121,7 +120,7 @@ def open(folder: PathLike) -> "Branch":
     Raises:
         BranchFolderError: there is no such folder, or it is damaged or of a newer format.
 
-    >>> limber.open(folder / "a.branch").name
+    >>> limber.open("a.branch").name
     'a'
     """
     return Branch(folder)
@@ -133,15 +132,12 @@ def settings(verb: str) -> "SettingsTable":
     Raises:
         InputError: there is no such verb.
 
-    >>> limber.settings("plan")["max_force"].default is None
-    True
+    >>> limber.settings("plan")["max_force"]
+    Setting(meaning='Force of the gripper that no pose may exceed [N].', default=None)
     """
-    from limber.stages.registry import stage_description, stage_summaries
+    from limber.stages.registry import stage_description
 
-    name = stage_of(verb)
-    if name not in stage_summaries():
-        raise InputError(f"There is no {verb!r}.", nearest(name, list(stage_summaries())))
-    stage = stage_description(name)
+    stage = stage_description(_known_stage(verb))
     return SettingsTable(verb, {
         field: Setting(about.description or "",
                        "required" if about.is_required() else about.default)
@@ -220,10 +216,16 @@ class Branch:
     Raises:
         BranchFolderError: there is no such folder, or it is damaged or of a newer format.
 
-    >>> branch = limber.open(folder / "a.branch")
-    >>> pull = branch.virtual_pull(frames=8, seed=1, quiet=True)
-    >>> pull.forces.shape, list(branch.pulls)
-    ((8, 3), ['pull-1'])
+    >>> branch = limber.open("a.branch")
+    >>> bent = branch.simulate(move=(0.01, 0, 0), kind="static", duration=0.1, hold=0)
+    >>> bent.times.shape, bent.converged, bool(bent.energies[-1] > 0)
+    ((7,), True, True)
+    >>> list(branch.pulls), branch.pulls["pull-1"].forces.shape
+    (['pull-1'], (24, 3))
+    >>> branch.plan(gaol=(0, 0, 1))
+    Traceback (most recent call last):
+    ...
+    limber.core.errors.InputError: plan has no 'gaol'. Did you mean goal? ...
     """
 
     def __init__(self, folder: PathLike):
@@ -272,14 +274,14 @@ class Branch:
 
     def plot(self) -> "Figure":
         """Draw the scan and its skeleton from the front and from the side."""
-        from limber.api.typed_results import drawn
         from limber.results.report.figures import scan_and_skeleton
 
         branch = self._read()
         branch.require("cloud.ply", "reconstruct")
         return drawn(lambda: scan_and_skeleton(branch, []))
 
-    def add_pull(self, source: PathLike, name: str, *, quiet: bool = False, **settings: Any) -> Pull:
+    def add_pull(self, source: PathLike, name: str, *, quiet: bool = False,
+                 **settings: Any) -> Pull:
         """Bring a recording of a pull into the branch folder.
 
         Args:
@@ -453,7 +455,7 @@ class Branch:
         Raises:
             InputError: there is no such stage, or a setting is refused.
         """
-        if stage_of(stage) in ("generate", "reconstruct", "mesh"):
+        if _known_stage(stage) in ("generate", "reconstruct", "mesh"):
             raise InputError(f"{stage} makes a branch.", "", f"Call limber.{stage}.")
         _, values = self._values(stage, quiet, settings)
         return Result(MappingProxyType(values))
@@ -478,7 +480,8 @@ class Branch:
         for name in settings:
             if name not in known:
                 raise InputError(f"session has no {name!r}.", nearest(name, known))
-        checked_settings(SessionSettings, {"mode": mode, **settings})
+        with in_python_words():
+            checked_settings(SessionSettings, {"mode": mode, **settings})
         return InteractiveSession(self.folder, mode=mode, **settings)
 
     def __repr__(self) -> str:
@@ -509,6 +512,20 @@ class Branch:
              **needed: Any) -> Result:
         entry, values = self._values(verb, quiet, settings, **needed)
         return read_result(self._read(), key or entry, values)
+
+
+def _known_stage(verb: str) -> str:
+    """Return the name of a verb's command.
+
+    Raises:
+        InputError: there is none.
+    """
+    from limber.stages.registry import stage_summaries
+
+    name, known = stage_of(verb), list(stage_summaries())
+    if name not in known:
+        raise InputError(f"There is no stage {verb!r}.", nearest(name, known))
+    return name
 
 
 def _made(stage: str, folder: PathLike, quiet: bool, given: dict[str, Any]) -> Branch:
