@@ -31,7 +31,7 @@ def run(*command: object, **environment: str) -> str:
 
 def test_all_are_run_here():
     assert {path.name for path in SCRIPTS.iterdir()} == {
-        "estimate.sh", "render.sh", "bend.py", "night.toml"}
+        "estimate.sh", "render.sh", "bend.py", "night.toml", "scan_to_plan.ipynb"}
 
 
 @pytest.mark.slow
@@ -49,12 +49,45 @@ def test_the_core_in_ten_lines(tmp_path):
     assert len([line for line in text.splitlines() if line.strip()]) <= 10
 
 
+def notebook_code() -> list[str]:
+    """The code cells of the notebook."""
+    content = json.loads((SCRIPTS / "scan_to_plan.ipynb").read_text(encoding="utf-8"))
+    assert (content["nbformat"], content["nbformat_minor"]) == (4, 5)
+    for cell in content["cells"]:
+        assert {"cell_type", "id", "metadata", "source"} <= set(cell)
+        assert cell["cell_type"] == "markdown" or cell["outputs"] == []
+    return ["".join(cell["source"]) for cell in content["cells"] if cell["cell_type"] == "code"]
+
+
+@pytest.mark.slow
+def test_the_notebook(tmp_path):
+    """From a scan to a plan with a picture in eight lines; the modulus is about the true one."""
+    first, *others = notebook_code()
+    assert len([line for line in first.splitlines() if line.strip()]) <= 8
+    script = tmp_path / "cells.py"
+    # A cell's last line is what a notebook shows.
+    script.write_text("\n".join(
+        f"{cell.rpartition(chr(10))[0]}\n({cell.rpartition(chr(10))[2]}).savefig('{number}.png')"
+        for number, cell in enumerate((first, *others))))
+    done = subprocess.run([sys.executable, "-W", "ignore", script], cwd=tmp_path, check=False,
+                          capture_output=True, text=True, timeout=250)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Estimate(E [MPa] ") and "% above the best" in done.stdout
+    for number in range(len(others) + 1):
+        assert (tmp_path / f"{number}.png").read_bytes().startswith(b"\x89PNG")
+    true = json.loads((tmp_path / "scan" / "truth.json").read_text())["young_pa"]
+    told = json.loads((tmp_path / "apple.branch" / "estimate.json").read_text())["young_pa"]
+    assert np.abs(np.log(np.array(told) / true)).max() < np.log(1.6)
+
+
 @pytest.mark.slow
 def test_the_readmes_python(tmp_path):
     """Its blocks run as they stand, in a folder that has the branch they name."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"),
                         re.MULTILINE | re.DOTALL)
     assert blocks
+    # That of the notebook is run above.
+    blocks = [block for block in blocks if block.strip() != notebook_code()[0].strip()]
     shutil.copytree(EXAMPLE, tmp_path / "apple.branch")
     script = tmp_path / "readme.py"
     script.write_text("if __name__ == '__main__':\n" + "\n".join(

@@ -120,8 +120,8 @@ def open(folder: PathLike) -> "Branch":
     Raises:
         BranchFolderError: there is no such folder, or it is damaged or of a newer format.
 
-    >>> limber.open("a.branch").name
-    'a'
+    >>> limber.open("a.branch").mesh.is_quadratic
+    True
     """
     return Branch(folder)
 
@@ -534,12 +534,12 @@ def _made(stage: str, folder: PathLike, quiet: bool, given: dict[str, Any]) -> B
 
 
 def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
-    """Write an array or columns as a PLY file.
+    """Write points or columns as a PLY file.
 
     Raises:
         InputError: they are no points.
     """
-    from plyfile import PlyData, PlyElement
+    from limber.geometry.io.clouds import cloud_of_columns
 
     names = getattr(getattr(cloud, "dtype", None), "names", None) or (
         list(cloud) if hasattr(cloud, "keys") else None)
@@ -552,8 +552,4 @@ def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
         columns = dict(zip("xyz", points.T, strict=True))
     else:
         columns = {str(name): np.asarray(cloud[name]) for name in names}
-    table = np.empty(len(next(iter(columns.values()))), [
-        (name, "f8" if name in "xyz" else column.dtype) for name, column in columns.items()])
-    for name, column in columns.items():
-        table[name] = column
-    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(path))
+    cloud_of_columns(list(columns), columns).write_ply(path)

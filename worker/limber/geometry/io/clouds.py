@@ -87,8 +87,12 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
     return replace(cloud.subset(finite), not_finite=cloud.not_finite + int((~finite).sum()))
 
 
-def _from_columns(names: list[str], columns: dict[str, np.ndarray]) -> Cloud:
-    """Sort named columns into positions, normals, colours and scalars."""
+def cloud_of_columns(names: list[str], columns: dict[str, np.ndarray]) -> Cloud:
+    """Sort named columns, shape [n] each, into positions, normals, colours and scalars.
+
+    Raises:
+        InputError: coordinates are missing.
+    """
     axes = next((a for a in _AXES if all(name in columns for name in a)), None)
     if axes is None:
         raise InputError(f"There are columns {', '.join(names)}.", "x, y and z are missing.",
@@ -116,7 +120,7 @@ def _read_ply(path: Path) -> Cloud:
     table = content["vertex"].data
     names = list(table.dtype.names)
     scalar = {name: np.asarray(table[name]) for name in names if table.dtype[name].kind in "iuf"}
-    cloud = _from_columns([name for name in names if name in scalar], scalar)
+    cloud = cloud_of_columns([name for name in names if name in scalar], scalar)
     return replace(cloud, titles=titles)
 
 
@@ -161,7 +165,7 @@ def _read_pcd(path: Path) -> Cloud:
         packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
         columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
         names = [name for name in names if name != "rgb"] + ["r", "g", "b"]
-    return replace(_from_columns(names, columns), titles=titles)
+    return replace(cloud_of_columns(names, columns), titles=titles)
 
 
 def _pcd_stream(path: Path) -> tuple[io.BytesIO, dict[str, str]]:
@@ -203,7 +207,7 @@ def _read_text(path: Path) -> Cloud:
     names, titles, table = read_table(path)
     # A column of the same name as one before would take its place.
     names = property_names(names)
-    cloud = _from_columns(names, {name: table[:, k] for k, name in enumerate(names)})
+    cloud = cloud_of_columns(names, {name: table[:, k] for k, name in enumerate(names)})
     return replace(cloud, titles=dict(zip(names, titles, strict=True)))
 
 
@@ -244,7 +248,7 @@ def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> Cloud:
     names = ("points", "xyz", "positions", "vertices", "arr_0")
     key = next((name for name in names if name in arrays), None)
     if key is None:
-        return _from_columns(list(arrays), arrays)
+        return cloud_of_columns(list(arrays), arrays)
     points = np.asarray(arrays.pop(key), np.float64)
     if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:
         raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
