@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import doctest
+import importlib.util
 import inspect
 import io
 import json
@@ -193,6 +194,7 @@ def test_a_branch_tells_what_it_holds(example):
     (lambda branch: branch.session(mode="held"), "mode 'held'"),
     (lambda branch: branch.estimate(follow=True), 'branch.run("estimate", follow=True)'),
     (lambda branch: branch.run("plann"), "There is no stage 'plann'. Did you mean plan"),
+    (lambda branch: branch.run("target"), "limber.settings('target') lists what it takes."),
     (lambda branch: branch.run("mesh"), "Call limber.mesh."),
     (lambda branch: branch.export(branch.folder / "a.doc"), "suffix"),
     (lambda branch: limber.reconstruct(np.zeros((4, 2)), "x"), "shape (4, 2)"),
@@ -204,6 +206,29 @@ def test_what_is_wrong_is_said_in_a_python_users_words(example, wrong, told):
     with pytest.raises(InputError, match=re.escape(told)) as refused:
         wrong(example)
     assert "--" not in str(refused.value)
+
+
+def test_a_command_in_a_message_stays_whole(tmp_path):
+    """An option becomes a keyword argument, a command that is to be typed stays one."""
+    from limber.api.running import in_python_words
+
+    with pytest.raises(WorkError) as told, in_python_words():
+        raise WorkError("--no-gravity is given.", "--max-force is not.", "Run `limber x --force`.")
+    assert str(told.value) == "gravity=False is given. max_force is not. Run `limber x --force`."
+
+
+def test_verbs_in_two_threads_give_the_script_back():
+    """It is hidden until the last of them has ended, in whatever order they do."""
+    from limber.api.running import script_run_once
+
+    script = sys.modules["__main__"]
+    first, second = script_run_once(), script_run_once()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert not hasattr(sys.modules["__main__"], "__file__")
+    second.__exit__(None, None, None)
+    assert sys.modules["__main__"] is script
 
 
 def test_a_missing_folder_is_refused(tmp_path):
@@ -349,6 +374,14 @@ def test_verbs_are_the_commands(own, tmp_path):
     cell = standing_at(Folder.read(own.folder), "127.0.0.1", fraction=0.667)
     dry = own.execute(cell_file(cell, tmp_path), name="p")
     assert not dry.armed and dry.peak_force is None and "armed no" in repr(dry)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs bpy")
+def test_a_scene_is_written(own, tmp_path):
+    """The verb names its file."""
+    written = own.scene(tmp_path / "a.blend")
+    assert written.path.stat().st_size > 10_000 and written.values["scene"] == str(written.path)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import sys
+import threading
 import types
 import warnings
 from collections.abc import Iterator, Mapping
@@ -10,13 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import LimberError
+from limber.core.errors import InputError, LimberError
 from limber.core.json_values import plain
 from limber.core.progress import BarSink, LineSink, Progress, Sink
-from limber.stages.registry import stage_description
+from limber.core.settings import Settings
+from limber.stages.registry import StageDescription, stage_description
 
 _STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
-_OPTION = re.compile(r"(?<![\w-])--(no-)?([a-z][a-z0-9]*(?:-[a-z0-9]+)*)")
+_OPTION = re.compile(r"`limber [^`]*`|(?<![\w-])--(no-)?([a-z][a-z0-9]*(?:-[a-z0-9]+)*)")
+"""An option in a message, or a whole command line, which stays as it is."""
+_lock = threading.Lock()
+_hidden: list[types.ModuleType] = []
+"""The user's script, once for each stage that runs."""
 
 
 def stage_of(verb: str) -> str:
@@ -42,15 +48,24 @@ def run_stage(name: str, given: Mapping[str, Any], *, quiet: bool) -> tuple[str,
     told: list[str] = []
     stage = stage_description(name)
     try:
-        with in_python_words(), _script_run_once(), _sink(name, quiet) as sink:
-            inputs, settings, options = stage.models(
-                {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
-                 else value for key, value in given.items()})
+        with in_python_words(), script_run_once(), _sink(name, quiet) as sink:
+            inputs, settings, options = _models(stage, given)
             result = stage.run(inputs, settings, options, Progress(sink, told.append))
     finally:
         for text in told:
             warnings.warn(_with_python_names(text), stacklevel=_users_level())
     return stage.entry(inputs, settings), {"warnings": told} | plain(result)
+
+
+def _models(stage: StageDescription, given: Mapping[str, Any],
+            ) -> tuple[Settings, Settings, Settings]:
+    try:
+        return stage.models(
+            {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
+             else value for key, value in given.items()})
+    except InputError as error:
+        error.fix = f"limber.settings({stage.name!r}) lists what it takes."
+        raise
 
 
 def _users_level() -> int:
@@ -62,16 +77,20 @@ def _users_level() -> int:
 
 
 @contextlib.contextmanager
-def _script_run_once() -> Iterator[None]:
+def script_run_once() -> Iterator[None]:
     """Keep the processes that a stage starts from importing the user's script: that would run it
     again, and they need nothing of it.
     """
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = types.ModuleType("__main__")
+    with _lock:
+        _hidden.append(_hidden[0] if _hidden else sys.modules["__main__"])
+        sys.modules["__main__"] = types.ModuleType("__main__")
     try:
         yield
     finally:
-        sys.modules["__main__"] = script
+        with _lock:
+            script = _hidden.pop()
+            if not _hidden:
+                sys.modules["__main__"] = script
 
 
 @contextlib.contextmanager
@@ -102,5 +121,7 @@ def in_python_words() -> Iterator[None]:
 
 
 def _with_python_names(text: str) -> str:
-    return _OPTION.sub(lambda found: found[2].replace("-", "_") + ("=False" if found[1] else ""),
-                       text)
+    def named(found: re.Match[str]) -> str:
+        name = (found[2] or "").replace("-", "_")
+        return name + ("=False" if found[1] else "") if name else found[0]
+    return _OPTION.sub(named, text)

@@ -77,8 +77,7 @@ class StageDescription:
         known = [name for kind in kinds for name in kind.model_fields]
         for name in values:
             if name not in known:
-                raise InputError(f"{self.name} has no {name!r}.", nearest(name, known),
-                                 f"`limber {self.name} --help-all` explains them all.")
+                raise InputError(f"{self.name} has no {name!r}.", nearest(name, known))
         inputs, settings, options = (
             checked_settings(kind, {name: value for name, value in values.items()
                                     if name in kind.model_fields}) for kind in kinds)
