@@ -1,6 +1,8 @@
 """Material laws from outside of the package: all that one file needs to bend a branch with them."""
 
+import doctest
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from tests.subjects.meshes import box_mesh
 
 from limber.cli.main import call
 from limber.core.errors import InputError
+from limber.core.settings import checked_settings
 from limber.mechanics import (
     BranchModel,
     EnergyMomentumSettings,
@@ -26,8 +29,10 @@ from limber.mechanics import (
     young_weights,
 )
 from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.materials import law as law_module
 from limber.mechanics.materials import registry
 from limber.mechanics.materials.law import contracted, determinant, right_cauchy_green
+from limber.mechanics.pull_simulation import SimulateSettings
 from limber.mechanics.statics.solve import solve_prescribed
 from limber.mechanics.strain import peak_load, strain_state
 from limber.reduced.strain_polynomial import make_polynomial
@@ -320,6 +325,8 @@ def test_the_command_takes_it(capsys, folder, kind):
     assert stiffer > 2 * built_in
     code, told = simulated(capsys, folder, "wooden")
     assert code == 2 and "fibres" in told.err
+    with pytest.raises(InputError, match=r"--material 'wooden': it must be one of .*fibres"):
+        checked_settings(SimulateSettings, {"material": "wooden"})
 
 
 def test_an_installed_package_gives_its_law_to_commands(capsys, folder, tmp_path, monkeypatch):
@@ -359,6 +366,25 @@ def test_what_cannot_use_it_refuses(mesh):
         rod_tree(fibres, None, 0.02)
     assert as_deformable(mooney, tip).young == pytest.approx(
         as_deformable(mooney.with_material("st_venant_kirchhoff"), tip).young, rel=1e-6)
+
+
+def test_another_process_gets_it(mesh):
+    """A model goes to the processes of a pool with its law; what they compute is the same."""
+    model = make_model(mesh, "mooney_rivlin")
+    moved = 0.02 * mesh.nodes
+    registry._registered.clear()
+    again = pickle.loads(pickle.dumps(model))
+    assert np.array_equal(again.internal(moved).force, model.internal(moved).force)
+    with pytest.raises(InputError, match="no material 'mooney_rivlin'"):
+        make_model(mesh, "mooney_rivlin")
+
+
+def test_the_example_of_a_law_is_one():
+    """What the documentation shows as a law is accepted as it stands there."""
+    shown = {}
+    for step in doctest.DocTestParser().get_examples(law_module.__doc__):
+        exec(step.source, shown)
+    assert register_material(shown["Cubic"]()).name == "cubic"
 
 
 def _law(**parts):

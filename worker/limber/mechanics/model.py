@@ -28,12 +28,7 @@ from limber.mechanics.elements.principal import largest_principal_strains
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.grip import stiffening
 from limber.mechanics.linear.equations import Equations, Viscous
-from limber.mechanics.materials.law import (
-    MULTIPLICITY,
-    MaterialLaw,
-    hooke_strain,
-    hooke_stress,
-)
+from limber.mechanics.materials.law import MaterialLaw, hooke_strain, hooke_stress
 from limber.mechanics.materials.materials import (
     RayleighDamping,
     check_poisson,
@@ -333,17 +328,17 @@ class BranchModel:
         """Return the exact derivative of the internal force [N] along ``direction`` [m]."""
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         product = np.empty((self.mesh.node_count, 3))
-        layout, of_moduli = self._data.layout, None
+        layout, of_change = self._data.layout, None
         if not self.material.is_compiled:
             strain = self.strains(displacement)
             growth, memory = 0.0, self.bearing_strain(strain, viscous)
-            of_moduli = self._of_moduli(displacement, direction, strain, viscous)
+            of_change = self._stress_change_force(displacement, direction, strain, viscous)
         tangent_times(for_kernels(displacement), for_kernels(direction), layout.gradients,
                       layout.weights, layout.per_element(self.lame_lambda),
                       layout.per_element(self.lame_mu), layout.nodes, self.material.kernel, growth,
                       memory, self.mesh.tet_count, product)
-        if of_moduli is not None:
-            product += of_moduli
+        if of_change is not None:
+            product += of_change
         return product if self.weight_stiffness is None else product + self._weight_times(direction)
 
     def bearing_strain(self, strain: np.ndarray, viscous: Viscous | None = None,
@@ -366,14 +361,12 @@ class BranchModel:
             stress = stress + hooke_stress((viscous.growth - 1) * strain + viscous.memory, lam, mu)
         return hooke_strain(stress, *own)
 
-    def _of_moduli(self, displacement: np.ndarray, direction: np.ndarray, strain: np.ndarray,
-                   viscous: Viscous | None) -> np.ndarray:
-        """Return the forces [N] of the stress' change along ``direction``, by the law's moduli."""
+    def _stress_change_force(self, displacement: np.ndarray, direction: np.ndarray,
+                             strain: np.ndarray, viscous: Viscous | None) -> np.ndarray:
+        """Return the forces [N] of the stress' change along ``direction`` [m]."""
         change = self.strain_changes(displacement, direction)
         lam, mu = self.lame_lambda[:, None], self.lame_mu[:, None]
-        stress = np.einsum("eqkl,eql->eqk", self.material.moduli(strain, lam, mu),
-                           change * MULTIPLICITY)
-        bearing = hooke_strain(stress, lam, mu)
+        bearing = hooke_strain(self.material.stress_change(strain, change, lam, mu), lam, mu)
         if viscous is not None:
             bearing = bearing + (viscous.growth - 1) * change
         # Lamé coefficients that are given leave the weight out.

@@ -5,6 +5,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.elements.shapes import shape_functions, shape_gradients
 
 _CANDIDATES = 40
 
@@ -23,7 +24,7 @@ def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
     """
     points = np.asarray(rest_points, float)
     tets, local, outside = _located(mesh, points)
-    values, _ = _shape(local, mesh.is_quadratic)
+    values = shape_functions(local, mesh.tets.shape[1])
     count, width = values.shape
     rows = np.repeat(np.arange(count), width)
     scalar = sparse.csr_matrix((values.ravel(), (rows, mesh.tets[tets, :width].ravel())),
@@ -52,13 +53,11 @@ def _stalks(mesh: TetMesh, points: np.ndarray, outside: np.ndarray) -> sparse.cs
     # About the thickness of a slender body.
     thickness = float(np.sqrt(volume.sum() / np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
     tree, total = cKDTree(mesh.centroids), sparse.lil_matrix((len(points), mesh.node_count))
-    centre = np.full((1, 4), 0.25)
     for row in np.flatnonzero(size > 1e-3 * thickness):
         middle = points[row] - outside[row] * (1 + 0.5 * thickness / size[row])
         near = np.array(tree.query_ball_point(middle, 0.75 * thickness), int)
         near = near if len(near) else tree.query(middle, k=1)[1].reshape(1)
-        _, gradients = _shape(np.repeat(centre, len(near), axis=0), mesh.is_quadratic)
-        slopes = _slopes(mesh, near, gradients)
+        slopes = _slopes(mesh, near)
         share = volume[near] / volume[near].sum()
         weights = np.einsum("t,taj,j->ta", share, slopes, outside[row])
         nodes = mesh.tets[near, :weights.shape[1]]
@@ -68,13 +67,14 @@ def _stalks(mesh: TetMesh, points: np.ndarray, outside: np.ndarray) -> sparse.cs
     return total.tocsr()
 
 
-def _slopes(mesh: TetMesh, tets: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-    """Gradients of the shape functions in space [1/m], shape [t, nodes, 3]."""
+def _slopes(mesh: TetMesh, tets: np.ndarray) -> np.ndarray:
+    """Gradients of the shape functions in space in the middle of tetrahedra [1/m], [t, nodes, 3].
+    """
     corners = mesh.nodes[mesh.tets[tets, :4]]
     edges = np.transpose(corners[:, 1:] - corners[:, :1], (0, 2, 1))
-    # d xi / d x is the inverse of the edges; the first barycentric coordinate follows the others.
-    inverse = np.linalg.inv(edges)
-    return np.einsum("mak,mkj->maj", gradients[:, :, 1:] - gradients[:, :, :1], inverse)
+    # d xi / d x is the inverse of the edges.
+    local = shape_gradients(np.full((1, 4), 0.25), mesh.tets.shape[1])[0]
+    return np.einsum("ka,mkj->maj", local, np.linalg.inv(edges))
 
 
 def _located(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,20 +95,3 @@ def _located(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         local.append(inside[best])
         outside.append(point - foot[best])
     return np.array(tets), np.array(local), np.array(outside)
-
-
-def _shape(local: np.ndarray, quadratic: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Shape functions [m, a] and their derivatives to barycentric coordinates [m, a, 4]."""
-    count = len(local)
-    if not quadratic:
-        return local, np.broadcast_to(np.eye(4), (count, 4, 4))
-    pairs = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
-    first, second = local[:, pairs[:, 0]], local[:, pairs[:, 1]]
-    values = np.hstack([local * (2 * local - 1), 4 * first * second])
-    gradients = np.zeros((count, 10, 4))
-    for corner in range(4):
-        gradients[:, corner, corner] = 4 * local[:, corner] - 1
-    for edge, (a, b) in enumerate(pairs):
-        gradients[:, 4 + edge, a] = 4 * second[:, edge]
-        gradients[:, 4 + edge, b] = 4 * first[:, edge]
-    return values, gradients

@@ -13,7 +13,9 @@ from limber.mechanics.elements.stiffness_pairs import LANES, scatter_block
 
 
 @compiled
-def moduli_stiffness(displacement, gradients, weights, moduli, nodes, slots, lengths, values):
+def moduli_stiffness(displacement: np.ndarray, gradients: np.ndarray, weights: np.ndarray,
+                     moduli: np.ndarray, nodes: np.ndarray, slots: np.ndarray,
+                     lengths: np.ndarray, values: np.ndarray) -> None:
     """Add the integral of B^T C B [N/m] of all elements to ``values``, B the strain's change.
 
     Args:
@@ -50,7 +52,7 @@ def moduli_stiffness(displacement, gradients, weights, moduli, nodes, slots, len
 
 
 @compiled
-def _strain_changes(F, gradients, out):
+def _strain_changes(F: np.ndarray, gradients: np.ndarray, out: np.ndarray) -> None:
     """Write how strain and shear angles change as a node moves along each axis, by axes."""
     for i in range(3):
         for l in range(LANES):
@@ -67,7 +69,8 @@ def _strain_changes(F, gradients, out):
 
 
 @compiled
-def _stress_changes(moduli, weight, changes, out):
+def _stress_changes(moduli: np.ndarray, weight: np.ndarray, changes: np.ndarray,
+                    out: np.ndarray) -> None:
     """Write weight times moduli times the changes along each axis."""
     for l in range(LANES):
         for row in range(6):
@@ -83,7 +86,7 @@ def _stress_changes(moduli, weight, changes, out):
 
 
 @compiled
-def _add_block(changes, stresses, block):
+def _add_block(changes: np.ndarray, stresses: np.ndarray, block: np.ndarray) -> None:
     for l in range(LANES):
         b00 = b10 = b20 = b01 = b11 = b21 = b02 = b12 = b22 = 0.0
         for k in range(6):

@@ -116,11 +116,7 @@ def node_weights(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         consistent [m^3], shape [tet_count, n, n], and lumped [m^3], shape [tet_count, n]: the
         diagonal scaled to the element's volume (Hinton, Rock and Zienkiewicz 1976), positive.
     """
-    rule = quadrature(5)
-    shape = shape_functions(rule.points, mesh.tets.shape[1])
-    local = shape_gradients(rule.points, mesh.tets.shape[1])
-    determinant = np.linalg.det(np.einsum("qla,eax->eqlx", local, mesh.nodes[mesh.tets]))
-    weights = determinant / 6.0 * rule.weights
+    shape, weights = _weighted_shapes(mesh)
     consistent = np.einsum("eq,qa,qb->eab", weights, shape, shape, optimize=True)
     diagonal = np.einsum("eaa->ea", consistent)
     scale = weights.sum(axis=1) / diagonal.sum(axis=1)
@@ -132,11 +128,17 @@ def volume_weights(mesh: TetMesh) -> np.ndarray:
 
     Those of the corners of a quadratic element are negative: gravity times density is consistent.
     """
+    shape, weights = _weighted_shapes(mesh)
+    return np.einsum("eq,qa->ea", weights, shape)
+
+
+def _weighted_shapes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return shape functions [q, n] and volume weights [m^3], [tet_count, q], of degree 5."""
     rule = quadrature(5)
-    shape = shape_functions(rule.points, mesh.tets.shape[1])
     local = shape_gradients(rule.points, mesh.tets.shape[1])
     determinant = np.linalg.det(np.einsum("qla,eax->eqlx", local, mesh.nodes[mesh.tets]))
-    return np.einsum("eq,qa->ea", determinant / 6.0 * rule.weights, shape)
+    return (shape_functions(rule.points, mesh.tets.shape[1]),
+            determinant / 6.0 * rule.weights)
 
 
 def _check_orientation(mesh: TetMesh, determinant: np.ndarray) -> None:
