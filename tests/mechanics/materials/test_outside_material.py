@@ -329,6 +329,20 @@ def test_the_command_takes_it(capsys, folder, kind):
         checked_settings(SimulateSettings, {"material": "wooden"})
 
 
+def test_a_changed_law_is_computed_again(capsys, folder):
+    """Results of a law of the same name that now gives other stress are out of date."""
+    def energy_and_frames():
+        code, told = simulated(capsys, folder, "second_stvk", "--kind", "static")
+        assert code == 0
+        return (json.loads(told.out.splitlines()[-1])["energy_j"],
+                (folder / "frames" / "simulate.pc2").stat().st_mtime_ns)
+
+    first = energy_and_frames()
+    assert energy_and_frames() == first
+    register_material(_law(name="second_stvk", energy=Fibres().energy))
+    assert energy_and_frames()[0] > 2 * first[0]
+
+
 def test_an_installed_package_gives_its_law_to_commands(capsys, folder, tmp_path, monkeypatch):
     """By an entry point: the name is a choice, the law is loaded when it is asked for."""
     (tmp_path / "softwood.py").write_text(

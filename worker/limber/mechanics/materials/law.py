@@ -14,6 +14,8 @@ A law is a subclass of :class:`MaterialLaw` with a name and an energy density:
 Tensors are written in one row, 00 11 22 01 02 12.
 """
 
+import hashlib
+
 import numpy as np
 
 from limber.core.errors import InputError
@@ -157,6 +159,14 @@ def is_hookean_at_rest(law: MaterialLaw) -> bool:
     return bool(np.abs(law.moduli(np.zeros(6), lam, mu) - hooke).max() < 1e-6)
 
 
+def law_digest(law: MaterialLaw) -> str:
+    """Return a digest of what a law gives at a few strains: one that was changed has another."""
+    strain, lam, mu = _tried()
+    values = [law.energy(strain, lam, mu), *law.stress(strain, lam, mu).T]
+    return hashlib.sha256(" ".join(f"{value:.9e}" for value in np.ravel(values)).encode()
+                          ).hexdigest()
+
+
 def check_law(law: MaterialLaw) -> None:
     """Try a law from outside at a few strains.
 
@@ -164,9 +174,8 @@ def check_law(law: MaterialLaw) -> None:
         InputError: it is stressed at rest, its derivatives are not those of its energy, it is
             not linear in the Lamé coefficients, or it is unstable at rest.
     """
-    rng = np.random.default_rng(0)
-    strain = _TRIED * rng.standard_normal((8, 6))
-    lam, mu, other = rng.uniform(1.0, 3.0, (3, 8))
+    strain, lam, mu = _tried()
+    other = lam[::-1]
     energy = law.energy(strain, lam, mu)
     if np.shape(energy) != (8,) or not np.isfinite(energy).all():
         raise _wrong(law, f"gives an energy of shape {np.shape(energy)}, or not finite, for"
@@ -192,6 +201,13 @@ def check_law(law: MaterialLaw) -> None:
                      "Give its own constants as ratios to them.")
     if np.linalg.eigvalsh(law.moduli(rest, lam, mu)).min() <= 0:
         raise _wrong(law, "is not stable without strain", "Its moduli must be positive there.")
+
+
+def _tried() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Strains [8, 6] and Lamé coefficients [8] at which laws from outside are looked at."""
+    rng = np.random.default_rng(0)
+    lam, mu = rng.uniform(1.0, 3.0, (2, 8))
+    return _TRIED * rng.standard_normal((8, 6)), lam, mu
 
 
 def _slopes(law: MaterialLaw, strain: np.ndarray, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:

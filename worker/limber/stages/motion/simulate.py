@@ -63,6 +63,8 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         InputError: options that do not fit. ConvergenceError: the branch could not follow; the
             frames up to there are written.
     """
+    from limber.mechanics.materials.law import law_digest
+    from limber.mechanics.materials.registry import material_named
     from limber.mechanics.pull_simulation import (
         load_case_of,
         motion_of,
@@ -75,6 +77,9 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     branch.require("mesh.vtu", "reconstruct")
     require_one_drive(settings, along)
     digests = {"along": along.digest()} if along else {}
+    law = material_named(settings.material)
+    if not law.is_compiled:
+        digests["material"] = law_digest(law)
     reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json")
              if branch.has(name)]
     stored = branch.manifest.stages.get(key)
