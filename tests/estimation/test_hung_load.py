@@ -14,7 +14,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.hung_load import settled
-from limber.recordings.importing import _against
+from limber.recordings.importing.loads import against_load
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Observations, read_pull
 from limber.recordings.registration import read_nominal, register
@@ -261,8 +261,8 @@ def test_another_frame_of_reference_is_refused(rig, tmp_path, capsys):
 def test_motion_against_the_load_is_named():
     """Across the load is what an upright branch does; against it is a sign or a frame."""
     load = np.array([0.0, 0.0, -1.0])
-    assert _against(np.array([[0.02, 0.0, -0.001], [0.001, 0.0, 0.001]]), load) == ""
-    assert "170 degrees" in _against(np.array([[0.0, 0.00353, 0.02]]), load)
+    assert against_load(np.array([[0.02, 0.0, -0.001], [0.001, 0.0, 0.001]]), load) == ""
+    assert "170 degrees" in against_load(np.array([[0.0, 0.00353, 0.02]]), load)
 
 
 @pytest.mark.parametrize("sag", [0.7e-3, 3e-3, 20e-3])

@@ -7,8 +7,8 @@ import pytest
 
 from limber.cli.main import call
 from limber.core.errors import InputError
-from limber.geometry.io.skeletons import read_skeleton
-from limber.geometry.mesh_skeleton import is_model
+from limber.geometry.io.skeletons import SKELETONS, read_skeleton
+from limber.geometry.mesh_skeleton import body_format
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.stages.results.export import ExportSettings, export
 from limber.stages.shape.mesh import mesh_surface
@@ -34,6 +34,10 @@ def test_a_model_of_another_program_becomes_the_branch_again(tmp_path):
     np.testing.assert_allclose(other.nodes[-1] - other.nodes[0], one.nodes[-1] - one.nodes[0],
                                atol=1e-6)
     assert (load_branch(made).model.young == 2e8).all()
+
+
+def is_model(path):
+    return body_format(path) in SKELETONS.readers()
 
 
 def test_what_is_a_model_and_what_is_refused(tmp_path):

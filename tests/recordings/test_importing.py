@@ -12,9 +12,11 @@ from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, read_camera, write_camera
 from limber.perception.observe import list_frames, read_depth, write_depth
-from limber.recordings.importing import ImportSettings, markers_from_c3d
+from limber.recordings.importing.formats import RECORDINGS
+from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.masks import read_mask
 from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, read_stream, write_stream
 from limber.stages.pulls.import_pull import import_pull
 from limber.store import Branch
@@ -115,7 +117,8 @@ def test_a_force_table_gives_a_slope_and_the_reason_why_no_modulus(recorded_data
 def test_c3d_holds_what_its_table_holds(recorded_data):
     """The silicone beam's C3D file and its CSV table are the same motion."""
     folder = recorded_data / "silicone_beam"
-    stream, labels = markers_from_c3d(folder / "beam_load52_V2_a.c3d")
+    path = folder / "beam_load52_V2_a.c3d"
+    stream, labels = RECORDINGS.read(path, request=ImportRequest(path))
     table = read_stream(folder / "beam_load52_V2_a.csv")
     assert labels[0] == "Tip - 1" and len(labels) == 6
     assert np.allclose(stream.values, table.values, atol=2e-6)

@@ -22,7 +22,7 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.importing import ImportSettings
+from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, write_stream
 from limber.stages.moduli.estimate import estimate
 from limber.stages.moduli.predict import predict

@@ -191,9 +191,10 @@ def _c3d(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_c3d(_template: Path, path: Path) -> Any:
-    from limber.recordings.importing import markers_from_c3d
+    from limber.recordings.importing.formats import RECORDINGS
+    from limber.recordings.importing.import_request import ImportRequest
 
-    return markers_from_c3d(path)
+    return RECORDINGS.read(path, request=ImportRequest(path))
 
 
 def _tables(_template: Path, folder: Path) -> list[Path]:

@@ -539,7 +539,7 @@ def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
     Raises:
         InputError: they are no points.
     """
-    from limber.geometry.io.clouds import cloud_of_columns
+    from limber.geometry.cloud.cloud import Cloud
 
     names = getattr(getattr(cloud, "dtype", None), "names", None) or (
         list(cloud) if hasattr(cloud, "keys") else None)
@@ -552,4 +552,4 @@ def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
         columns = dict(zip("xyz", points.T, strict=True))
     else:
         columns = {str(name): np.asarray(cloud[name]) for name in names}
-    cloud_of_columns(list(columns), columns).write_ply(path)
+    Cloud.from_columns(columns).write_ply(path)

@@ -1,7 +1,8 @@
-"""What a package exports, loaded when it is asked for: `limber --help` waits for no package."""
+"""What is loaded when it is asked for: `limber --help` waits for no package."""
 
 import importlib
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 from typing import Any
 
 
@@ -22,3 +23,11 @@ def exports(package: str, places: Mapping[str, str],
         return sorted(places)
 
     return get, names
+
+
+def loaded(function: Any) -> Any:
+    """Return a function, or what its place ``module:name`` stands for."""
+    if not isinstance(function, str):
+        return function
+    module, _, name = function.partition(":")
+    return attrgetter(name)(importlib.import_module(module))

@@ -8,29 +8,25 @@ import numpy as np
 from limber.core.alignment import Alignment
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.reading import read_text
 from limber.core.progress import SILENT, Progress
-from limber.geometry.io.skeletons import read_skeleton
+from limber.geometry.io.formats import Format, known_format
+from limber.geometry.io.skeletons import SKELETONS, read_skeleton
+from limber.geometry.io.surfaces import SURFACES
 from limber.geometry.mesh_surface import MeshedBody
 from limber.geometry.reconstruction import gravity_after, mesh_skeleton
+from limber.geometry.sections import SECTIONS
 from limber.geometry.settings import MeshSurfaceSettings, ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.upright import upright_rotation
 
-SUFFIXES = (".mat", ".swc", ".mtg")
-"""Of cylinder models; a .csv may be one, or a table of sections."""
 
-
-def is_model(path: Path) -> bool:
-    """Whether a file is a cylinder model rather than a surface or a table of sections.
+def body_format(path: Path) -> Format:
+    """Return what a file that `limber mesh` is given is: a cylinder model, sections or a surface.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: none is known.
     """
-    if path.suffix.lower() != ".csv":
-        return path.suffix.lower() in SUFFIXES
-    lines = (line for line in read_text(path, "a table").splitlines() if not line.startswith("#"))
-    return "radius" in [title.strip().lower() for title in next(lines, "").split(",")]
+    return known_format(path, "body", [*SKELETONS.readers(), SECTIONS, *SURFACES.readers()])
 
 
 def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = SILENT,
@@ -38,7 +34,7 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
     """Return the branch that a cylinder model tells, and the masses of twigs the mesh leaves out.
 
     Args:
-        path: ``.mat`` of TreeQSM or SmartQSM, rTwig's or SimpleForest's ``.csv``, MTG or SWC.
+        path: In a format of :data:`~limber.geometry.io.skeletons.SKELETONS`.
         settings: ``unit``, ``up``, ``upright`` and the wood; the model has its own root.
         progress: Called as it goes; gets what the user should know.
 

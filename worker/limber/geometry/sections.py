@@ -14,6 +14,7 @@ import numpy as np
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files.reading import read_text
+from limber.geometry.io.formats import Format
 from limber.geometry.mesh_surface import MeshedBody, aligned_body, numbers_of
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
@@ -95,6 +96,9 @@ def read_sections(path: Path, unit: str) -> Sections:
         raise InputError(f"{path} has the same place twice in a row.",
                          "Between two sections the body has a length.", "Omit one of them.")
     return made
+
+
+SECTIONS = Format("sections", (".csv",), read_sections)
 
 
 def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,

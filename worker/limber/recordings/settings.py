@@ -1,13 +1,11 @@
 """Settings of an import; they load nothing heavy."""
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Groups, Settings
-
-Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement", "bag",
-               "robot"]
+from limber.core.settings import Groups, OneOf, Settings
+from limber.recordings.importing.formats import kind_names
 
 
 class ImportSettings(Settings):
@@ -25,7 +23,8 @@ class ImportSettings(Settings):
     }
     common = ("unit", "grasp_point", "cell")
 
-    kind: Kind = Field("auto", description="Kind of SOURCE. auto: by its name and content.")
+    kind: Annotated[str, OneOf(kind_names)] = Field(
+        "auto", description="Kind of SOURCE. auto: by its name and content.")
     robot: str | None = Field(None, description="CSV of the gripper with time, pose and wrench.")
     unit: Literal["m", "cm", "mm"] | None = Field(
         None, description="Unit of positions in SOURCE. Default: the unit in the columns' names, "

@@ -16,7 +16,8 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.present import present
-from limber.recordings.importing import markers_from_c3d
+from limber.recordings.importing.formats import RECORDINGS
+from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.tables import read_table, split_title, time_stream
 from limber.recordings.time_series import Stream
 
@@ -59,7 +60,7 @@ class Ringing:
 
 
 def read_record(path: Path) -> Stream:
-    """Read a record: a table of times and readings in any unit, or the marker tracks of a C3D file.
+    """Read a record: a table of times and readings in any unit, or a C3D file's marker tracks.
 
     Columns with gaps, as of a marker that was out of sight, are left out.
 
@@ -67,8 +68,10 @@ def read_record(path: Path) -> Stream:
         InputError: it cannot be read, has no times or no readings, or its times do not ascend in
             even steps.
     """
-    if path.suffix.lower() == ".c3d":
-        stream = markers_from_c3d(path)[0]
+    tracks = [one for one in RECORDINGS.readers() if path.suffix.lower() in one.suffixes
+              and one.holds == "markers" and one.name != "markers"]
+    if tracks:
+        stream = RECORDINGS.read_as(tracks[0], path, request=ImportRequest(path))[0]
     else:
         stream = time_stream(read_table(path))
     used = [number for number, title in enumerate(stream.columns)

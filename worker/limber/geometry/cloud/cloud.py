@@ -6,8 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.core.errors import InputError
 from limber.geometry.cloud.columns import ply_columns, valid_columns
 
+POINTS = "\0points"
+"""Name of the coordinates [n, 3] among columns of any name."""
+_AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("X", "Y", "Z"),
+         ("//X", "Y", "Z"))
+_THREE = {"normal": (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("Nx", "Ny", "Nz")),
+          "color": (("red", "green", "blue"), ("r", "g", "b"), ("R", "G", "B"))}
 _LONGEST_TITLE = 1000  # characters of a title that a file's header repeats
 
 
@@ -27,6 +34,29 @@ class Cloud:
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
     not_finite: int = 0
     titles: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_columns(cls, columns: dict[str, np.ndarray], titles: dict[str, str] | None = None,
+                     ) -> "Cloud":
+        """Sort named columns into positions, normals, colours and scalars.
+
+        Raises:
+            InputError: none are called x, y and z.
+        """
+        axes = _first(_AXES, columns)
+        if axes is None:
+            raise InputError(f"There are columns {', '.join(columns)}.", "x, y and z are missing.",
+                             "Name the coordinates x, y, z.")
+        used = set(axes)
+        attributes: dict[str, np.ndarray] = {}
+        for target, choices in _THREE.items():
+            if found := _first(choices, columns):
+                attributes[target] = np.stack([columns[name] for name in found], axis=1)
+                used |= set(found)
+        attributes |= {name: np.ascontiguousarray(values) for name, values in columns.items()
+                       if name not in used}
+        points = np.stack([np.asarray(columns[name], np.float64) for name in axes], axis=1)
+        return cls(points, attributes, titles=titles or {})
 
     def __len__(self) -> int:
         return len(self.points)
@@ -65,3 +95,8 @@ class Cloud:
                   for name, title in valid.titles.items()]
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<",
                 comments=[comment, *titles]).write(str(path))
+
+
+def _first(choices: tuple[tuple[str, ...], ...], columns: dict[str, np.ndarray],
+           ) -> tuple[str, ...] | None:
+    return next((names for names in choices if all(name in columns for name in names)), None)

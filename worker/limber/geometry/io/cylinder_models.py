@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.atomic import write_lines
 from limber.core.optional import require_extra
 from limber.geometry.io.isolated_readers import read_apart
 from limber.geometry.io.matlab import is_hdf5, struct_arrays
@@ -71,7 +72,7 @@ def _fields(path: Path) -> dict[str, Any]:
     if is_new:
         require_extra("matlab", ("h5py",), f"{path} is a MAT file of version 7.3, which "
                       "(unless you save it in Matlab with -v7)")
-        return read_apart(f"{__name__}:mat_v73_fields", path)
+        return read_apart(mat_v73_fields, path)
     return _older_fields(path)
 
 
@@ -142,8 +143,8 @@ def write_treeqsm(skeleton: Skeleton, path: Path) -> None:
             do_compression=True)
 
 
-def rtwig_text(skeleton: Skeleton) -> str:
-    """Return rTwig's minimal table [m]: what its ``reconstruct_qsm`` needs, with branch and order.
+def write_rtwig(skeleton: Skeleton, path: Path) -> None:
+    """Write rTwig's minimal table [m]: what its ``reconstruct_qsm`` needs, with branch and order.
     """
     lines = ["id,parent,start_x,start_y,start_z,end_x,end_y,end_z,radius,branch,branch_order"]
     for node in range(1, skeleton.node_count):
@@ -152,11 +153,11 @@ def rtwig_text(skeleton: Skeleton) -> str:
         lines.append(",".join([str(node), str(up), *(f"{value:.9g}" for value in ends),
                                f"{skeleton.radius[node]:.9g}", str(skeleton.branch[node] + 1),
                                str(skeleton.order[node])]))
-    return "\n".join(lines) + "\n"
+    write_lines(path, lines)
 
 
-def simpleforest_text(skeleton: Skeleton) -> str:
-    """Return a table with SimpleForest's names [m]."""
+def write_simpleforest(skeleton: Skeleton, path: Path) -> None:
+    """Write a table with SimpleForest's names [m]."""
     head = ("ID,parentID,startX,startY,startZ,endX,endY,endZ,axisX,axisY,axisZ,radius,length,"
             "branchID,branchOrder")
     lines = [head]
@@ -168,4 +169,4 @@ def simpleforest_text(skeleton: Skeleton) -> str:
                    skeleton.radius[node], length)
         lines.append(",".join([str(node - 1), str(up - 1), *(f"{v:.9g}" for v in numbers),
                                str(skeleton.branch[node]), str(skeleton.order[node])]))
-    return "\n".join(lines) + "\n"
+    write_lines(path, lines)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.atomic import write_lines
 from limber.core.files.reading import read_text, require_finite
 from limber.geometry.skeleton.skeleton import Skeleton
 
@@ -35,14 +36,14 @@ class _Vertex:
     tail: int = field(default=-1)
 
 
-def read_mtg(path: Path, *, scale: float = 1.0) -> Skeleton:
+def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
     """Read the nodes of an MTG: vertices with places, each on the one that it grows from.
 
     A vertex without a radius or diameter has that of the node before it.
 
     Args:
         path: The file.
-        scale: Metres per unit; an MTG does not say its own.
+        scale: Metres per unit, which an MTG does not say; None takes metres.
 
     Raises:
         InputError: no MTG; no places or radii in it; or not one tree.
@@ -52,7 +53,7 @@ def read_mtg(path: Path, *, scale: float = 1.0) -> Skeleton:
     reader = _Reader(path, scales, *_header(path, body))
     for number, line in body[1:]:
         reader.take(number, line)
-    return reader.skeleton(scale)
+    return reader.skeleton(1.0 if scale is None else scale)
 
 
 def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[int, str]]]:
@@ -205,8 +206,8 @@ class _Reader:
                           "Correct that line.")
 
 
-def mtg_text(skeleton: Skeleton) -> str:
-    """Return an MTG: a plant of axes of nodes, with places and radii [m].
+def write_mtg(skeleton: Skeleton, path: Path) -> None:
+    """Write an MTG: a plant of axes of nodes, with places and radii [m].
 
     An axis hangs with ``+`` on the node that it grows from; nodes follow each other with ``<``.
     """
@@ -218,8 +219,7 @@ def mtg_text(skeleton: Skeleton) -> str:
              "N\t2\tFREE\tFREE\tIMPLICIT", "", "DESCRIPTION:", "LEFT\tRIGHT\tRELTYPE\tMAX",
              "N\tN\t+\t?", "N\tN\t<\t?", "", "FEATURES:", "NAME\tTYPE", "XX\tREAL", "YY\tREAL",
              "ZZ\tREAL", "Radius\tREAL", "", "MTG:",
-             f"ENTITY-CODE{tabs}XX\tYY\tZZ\tRadius", f"/P1{tabs}", ""]
-    lines.pop()
+             f"ENTITY-CODE{tabs}XX\tYY\tZZ\tRadius", f"/P1{tabs}"]
     children: dict[int, list[int]] = {}
     for node in range(1, skeleton.node_count):
         children.setdefault(int(skeleton.parent[node]), []).append(node)
@@ -236,4 +236,4 @@ def mtg_text(skeleton: Skeleton) -> str:
         after = children.get(node, [])
         on = [one for one in after if skeleton.branch[one] == skeleton.branch[node]]
         waiting += on + [one for one in after if one not in on]
-    return "\n".join(lines) + "\n"
+    write_lines(path, lines)

@@ -1,4 +1,4 @@
-"""Skeletons of other programs: SWC trees and cylinder models (QSM) as CSV."""
+"""Skeletons of other programs and the registry of their formats; SWC, cylinder models as CSV."""
 
 import csv
 from collections.abc import Sequence
@@ -8,33 +8,33 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.geometry.io.cylinder_models import read_treeqsm
-from limber.geometry.io.mtg import read_mtg
+from limber.geometry.io.cylinder_models import (
+    read_treeqsm,
+    write_rtwig,
+    write_simpleforest,
+    write_treeqsm,
+)
+from limber.geometry.io.formats import Format, Registry, head_of
+from limber.geometry.io.mtg import read_mtg, write_mtg
 from limber.geometry.skeleton.skeleton import STATES, Skeleton
 
 _ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
     f"{end}{axis}": f"{end[0]}{axis}" for end in ("start", "end") for axis in "xyz"}}
 """Names of columns in rTwig and SimpleForest, in small letters and without underscores."""
+_HEAD = 4096  # bytes that a search for the format reads
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read a skeleton: ``.swc``, ``.mtg``, or a cylinder model: ``.csv``, or TreeQSM's ``.mat``.
+    """Read a skeleton of any format of :data:`SKELETONS`.
 
-    See :func:`read_swc`, :func:`~.mtg.read_mtg`, :func:`read_cylinders` and
-    :func:`~.cylinder_models.read_treeqsm`, which knows SmartQSM's, too.
+    Args:
+        path: The file.
+        scale: Metres per unit; None takes the file's own, or metres.
+
+    Raises:
+        InputError: its format is not known, or it is no tree; see the formats' readers.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".csv":
-        return read_cylinders(path, scale=1.0 if scale is None else scale)
-    if path.suffix.lower() == ".mat":
-        read = read_treeqsm(path)
-        table = np.column_stack([read["id"], read["parent"], read["start"], read["end"],
-                                 read["radius"]])
-        return _tree_of(path, table, 1.0 if scale is None else scale,
-                        start_radius=read["start_radius"])
-    if path.suffix.lower() == ".mtg":
-        return read_mtg(path, scale=1.0 if scale is None else scale)
-    return read_swc(path, scale=scale)
+    return SKELETONS.read(Path(path), scale=scale)
 
 
 def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
@@ -54,9 +54,8 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
             continue
         if not line.strip():
             continue
-        parts = line.replace(",", " ").split()
         try:
-            rows.append([int(float(parts[0])), *map(float, parts[2:6]), int(float(parts[6]))])
+            rows.append(_swc_node(line))
         except (ValueError, IndexError, OverflowError) as error:
             raise InputError(
                 f"{path}, line {number}: {line.strip()[:60]!r} is not a node.",
@@ -71,7 +70,29 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
     return Skeleton.from_edges(table[:, 1:4] * factor, parent, table[:, 4] * factor)
 
 
-def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
+def _swc_node(line: str) -> list[float]:
+    parts = line.replace(",", " ").split()
+    return [int(float(parts[0])), *map(float, parts[2:6]), int(float(parts[6]))]
+
+
+def _first_line(path: Path) -> str:
+    """The first line that is no comment, as far as a search for the format reads."""
+    lines = head_of(path, _HEAD).decode("utf-8", "replace").splitlines()
+    return next((line for line in lines if line.strip() and not line.startswith("#")), "")
+
+
+def _is_swc(path: Path) -> bool:
+    try:
+        return bool(_swc_node(_first_line(path)))
+    except (ValueError, IndexError, OverflowError):
+        return False
+
+
+def _is_cylinders(path: Path) -> bool:
+    return "radius" in [title.strip().lower() for title in _first_line(path).split(",")]
+
+
+def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
     """Read a cylinder model: columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order).
 
     A cylinder's end becomes a node that hangs on the end of its parent; the root's start becomes
@@ -80,7 +101,7 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
 
     Args:
         path: The CSV file.
-        scale: Metres per unit.
+        scale: Metres per unit; None takes metres.
 
     Raises:
         InputError: columns are missing, a value is no number, or it is not one tree.
@@ -102,10 +123,20 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
     return _tree_of(path, table, scale, rows)
 
 
-def _tree_of(path: Path, table: np.ndarray, scale: float,
+def _of_arrays(path: Path, read: dict[str, np.ndarray], *, scale: float | None = None) -> Skeleton:
+    table = np.column_stack([read[name] for name in ("id", "parent", "start", "end", "radius")])
+    return _tree_of(path, table, scale, start_radius=read.get("start_radius"))
+
+
+def _read_mat(path: Path, *, scale: float | None = None) -> Skeleton:
+    return _of_arrays(path, read_treeqsm(path), scale=scale)
+
+
+def _tree_of(path: Path, table: np.ndarray, scale: float | None,
              rows: Sequence[dict[str, str]] = (), *,
              start_radius: np.ndarray | None = None) -> Skeleton:
     """The skeleton of cylinders: id, parent, start, end and radius, shape [n, 9]."""
+    scale = 1.0 if scale is None else scale
     _require_whole(path, table[:, :2])
     ids, up = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
     # Some programs count from 1 and give the root the parent 0.
@@ -245,3 +276,18 @@ def _without_repeats(nodes: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray,
     new_index = np.cumsum(keep) - 1
     moved = np.where(parent < 0, -1, new_index[target[parent]])
     return moved[keep], keep
+
+
+SKELETONS = Registry("skeleton", "limber.skeletons", [
+    Format("SWC", (".swc",), read_swc, Skeleton.write_swc, recognises=_is_swc,
+           about="axes with radii"),
+    Format("cylinders", (".csv",), read_cylinders, write_cylinders, recognises=_is_cylinders,
+           about="cylinders of Limber, rTwig or SimpleForest"),
+    Format("rtwig", (".csv",), write=write_rtwig),
+    Format("simpleforest", (".csv",), write=write_simpleforest),
+    Format("TreeQSM", (".mat",), _read_mat, write_treeqsm,
+           about="cylinders of TreeQSM or SmartQSM"),
+    Format("MTG", (".mtg",), read_mtg, write_mtg, about="multiscale tree graph of the axes"),
+], of_arrays=_of_arrays)
+"""Readers take ``scale``, the metres per unit or None; what they write is in metres. Arrays that a
+format reads are cylinders: ``id``, ``parent`` (-1: none), ``start``, ``end`` and ``radius``."""

@@ -1,13 +1,19 @@
-"""What a user's own surface must be before it can be filled, and what to do where it is not."""
+"""Surfaces of other programs: the registry of their formats, and what a surface must be before it
+can be filled.
+"""
 
 from pathlib import Path
 
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.geometry.io.formats import Format, Registry
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.surface_checks import crossings, pieces
 
+SURFACES = Registry("surface", "limber.surfaces", [
+    Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])
+"""Readers take ``scale``, the metres per unit."""
 _LONG, _SHORT = 60.0, 0.01  # [m]: no branch is longer or shorter
 
 

@@ -16,7 +16,6 @@ from limber.core.errors import InputError
 from limber.core.optional import require_extra
 from limber.geometry.io.isolated_readers import read_apart
 
-SUFFIXES = (".mcap", ".db3", ".bag")
 LIMBER, PULL_TOML = "limber", "pull.toml"
 """Name of the MCAP metadata record of an exported pull, and its entry with ``pull.toml``."""
 
@@ -72,11 +71,6 @@ class Bag:
         return self.kinds.get(kind, ())
 
 
-def is_bag(path: Path) -> bool:
-    """Return whether a path looks like a bag."""
-    return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
-
-
 def read_bag(path: Path) -> Bag:
     """Read a bag.
 
@@ -85,7 +79,7 @@ def read_bag(path: Path) -> Bag:
         InputError: it is damaged, or none of its messages can be decoded.
     """
     require_extra("bags", ("rosbags",), f"Reading {path.name}")
-    arrays = read_apart("limber.recordings.bags.bag_reader:bag_arrays", path)
+    arrays = read_apart(bag_arrays, path)
     kinds: dict[str, list[Topic]] = {}
     for number in range(int(arrays["topic_count"])):
         def part(name: str, number: int = number) -> np.ndarray:

@@ -11,8 +11,7 @@ from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import inverted, matrices
 from limber.core.present import present
 from limber.core.progress import Progress
-from limber.geometry.io.surfaces import usable_surface
-from limber.geometry.surface.surface import Surface
+from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.goals.camera_view import View
@@ -62,7 +61,7 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
             found.append(Box(name, 0.5 * np.array(entry.size_m), frame[:3, 3], frame[:3, :3].T))
             continue
         path = folder / entry.file
-        surface, _ = usable_surface(Surface.read(path, scale=_UNITS[entry.unit]), path)
+        surface, _ = usable_surface(SURFACES.read(path, scale=_UNITS[entry.unit]), path)
         size = float(np.ptp(surface.vertices, axis=0).max())
         if size > _LARGE:
             raise InputError(f"The obstacle {path} is {size:.0f} m long.",

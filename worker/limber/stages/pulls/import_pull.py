@@ -13,13 +13,14 @@ from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
+from limber.recordings.importing.formats import RECORDINGS, recording_format
 from limber.recordings.settings import ImportSettings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.recordings.importing import BranchFrame, RobotKnown
+    from limber.recordings.importing.import_request import BranchFrame, RobotKnown
 
 _JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
@@ -30,8 +31,7 @@ class ImportInputs(BranchInputs):
     groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",),
                                "simulation": ("swing",)}
 
-    source: Path = argument("Marker CSV, C3D, PLY or RGB-D folder, force table, MCAP, rosbag2, "
-                            "RTDE log.")
+    source: Path = argument(f"A recording: {RECORDINGS.listed()}.")
     name: str = required("Name of the pull.", "pull-1")
     swing: bool = Field(
         False, description="The branch is released without a robot. Markers with --weight or "
@@ -45,19 +45,21 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     """Bring a recording into ``pulls/NAME`` of a branch folder.
 
     Returns:
-        ``pull``, ``kind`` and what :func:`limber.recordings.importing.import_recording` found.
+        ``pull``, ``kind`` and what :func:`~.importing.pulls.import_recording` found.
 
     Raises:
         InputError: SOURCE cannot be read as what it is said to be.
     """
-    from limber.recordings.importing import import_recording, kind_of
+    from limber.recordings.importing.import_request import BranchFrame, ImportRequest
+    from limber.recordings.importing.pulls import import_recording
 
     source = Path(source)
     if not source.exists():
         raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
-    kind = kind_of(source) if settings.kind == "auto" else settings.kind
+    kind = RECORDINGS.of(source).name if settings.kind == "auto" else settings.kind
+    is_force = recording_format(kind).holds == "force"
     settings, robot = _of_cell(settings)
-    branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
+    branch = (Branch.create if is_force else Branch.open)(branch_folder)
     key, digests = f"pull:{name}", {"source": _digest(source)}
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
                           ("yolo", settings.yolo_weights), ("cell", settings.cell)):
@@ -70,9 +72,9 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
         for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
-        stage.result.update(import_recording(kind, source, folder, name, settings,
-                                             _frame(branch, kind, settings), progress,
-                                             robot=robot))
+        frame = BranchFrame() if is_force else _frame(branch, settings)
+        stage.result.update(import_recording(kind, ImportRequest(
+            source, folder, name, settings, frame, robot, progress)))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
 
@@ -82,7 +84,7 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     if settings.cell is None:
         return settings, None
     from limber.core.numerics.rigid import matrices, pose_vectors
-    from limber.recordings.importing import RobotKnown
+    from limber.recordings.importing.import_request import RobotKnown
     from limber.robot.cell.cell import read_cell
     from limber.robot.recorder import known_errors, known_noise
     from limber.robot.ur.kinematics import forward
@@ -105,12 +107,10 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
                                 lambda seconds: known_errors(cell, seconds))
 
 
-def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:
-    from limber.recordings.importing import BranchFrame
+def _frame(branch: Branch, settings: ImportSettings) -> BranchFrame:
+    from limber.recordings.importing.import_request import BranchFrame
     from limber.store.loading import load_mesh
 
-    if kind == "force-displacement":
-        return BranchFrame()
     loaded = settings.weight is not None or settings.load is not None
     return BranchFrame(branch.manifest.alignment, branch.gravity,
                        load_mesh(branch).nodes if loaded or branch.has("mesh.vtu") else None)

@@ -1,23 +1,12 @@
 """Write the branch for other programs: robot simulators, finite elements, cylinder models.
 
-What is written goes by OUTPUT's suffix:
-
-\b
-  .xml    MuJoCo (MJCF): rigid links on springs, at rest as scanned
-  .urdf   the same links; springs as Gazebo reads them
-  .usd    USD (.usda: as text): a deformable body of linear tetrahedra with one modulus
-  .inp    Abaqus, CalculiX: the quadratic tetrahedra, held base, a static and a frequency step
-  .mat    cylinder model of TreeQSM, which SmartQSM shares
-  .csv    cylinder model: --columns rtwig or simpleforest
-  .mtg    multiscale tree graph of the axes
-  .swc    the axes with their radii
-
-Links and cylinders are in the branch's frame, in metres. Modulus and damping are those that the
-folder knows: of the last estimate or swing.
+What is written goes by OUTPUT's suffix. Links and cylinders are in the branch's frame, in metres.
+Modulus and damping are those that the folder knows: of the last estimate or swing.
 """
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -27,6 +16,8 @@ from pydantic import Field
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
+from limber.geometry.io.formats import Format, Registry, listed, unknown_suffix
+from limber.geometry.io.skeletons import SKELETONS
 from limber.stages.inputs import BranchInputs, NoOptions
 from limber.stages.registry import StageDescription
 from limber.store import Branch
@@ -34,18 +25,6 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.geometry.skeleton.skeleton import Skeleton
     from limber.mechanics.model import BranchModel
-
-_RODS, _ELEMENTS, _CYLINDERS = (".xml", ".urdf"), (".inp",), (".mat", ".csv", ".mtg", ".swc")
-_SCENES = (".usd", ".usda", ".usdc")
-
-
-class ExportInputs(BranchInputs):
-    """A branch folder, and the file to write."""
-
-    groups: ClassVar[Groups] = {"output": ("output",)}
-
-    output: Path = Field(description="File to write. Its suffix states the format.",
-                         json_schema_extra={"short": "-o", "example": "{stem}.urdf"})
 
 
 class ExportSettings(Settings):
@@ -76,27 +55,44 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
         InputError: no such format, or it cannot be written. BranchFolderError: the folder lacks
             mesh or skeleton. MissingDependencyError: USD is not installed.
     """
-    branch, suffix = Branch.read(folder), output.suffix.lower()
-    branch, suffix = Branch.open(folder), output.suffix.lower()
-    text: str | bytes | None
-    if suffix in _RODS:
-        text, told = _rods(branch, suffix, settings, progress)
-    elif suffix in _ELEMENTS:
-        text, told = _elements(branch, settings, progress)
-    elif suffix in _SCENES:
-        text, told = _scene(branch, output, progress)
-    elif suffix in _CYLINDERS:
-        text, told = _cylinders(branch, output, settings)
-    else:
-        known = " ".join((*_RODS, *_SCENES, *_ELEMENTS, *_CYLINDERS))
-        raise InputError(f"{output} has an unknown suffix.", f"Known suffixes: {known}.",
-                         "Use one of them.")
-    _written(output, text)
-    return {"output": output, "format": suffix, **told}
+    from limber.core.files.atomic import write_atomically
+
+    branch, chosen = Branch.read(folder), _format_of(output, settings.columns)
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, f"branch{output.suffix.lower()}")
+        if chosen in SKELETONS.writers():
+            told = _write_skeleton(branch, path, chosen)
+        else:
+            told = EXPORTS.write_as(chosen, branch, path, settings, progress)
+        content = path.read_bytes()
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(output, content)
+    except OSError as error:
+        raise InputError(f"{output} cannot be written ({error.strerror}).",
+                         "The export goes there.", "Choose another location.") from error
+    return {"output": output, "format": output.suffix.lower(), **told}
 
 
-def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progress,
-          ) -> tuple[str, dict[str, Any]]:
+def _format_of(output: Path, columns: str) -> Format:
+    """The format of a suffix; of several that share it the one whose columns are asked for."""
+    known = [*EXPORTS.writers(), *SKELETONS.writers()]
+    named = [one for one in known if output.suffix.lower() in one.suffixes]
+    if not named:
+        raise unknown_suffix(output, known, "Use one of them.")
+    return next((one for one in named if one.name == columns), named[0])
+
+
+def _write_skeleton(branch: Branch, path: Path, chosen: Format) -> dict[str, Any]:
+    from limber.store.loading import load_skeleton
+
+    skeleton = load_skeleton(branch)
+    SKELETONS.write_as(chosen, skeleton, path)
+    return {"cylinder_count": skeleton.node_count - 1}
+
+
+def _write_links(branch: Branch, path: Path, settings: ExportSettings, progress: Progress,
+                 ) -> dict[str, Any]:
     from limber.results.exports.mjcf import mjcf_text
     from limber.results.exports.rigid_links import matched, rod_tree
     from limber.results.exports.urdf import urdf_text
@@ -104,27 +100,26 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
 
     skeleton = load_skeleton(branch)
     loaded = load_branch(branch, gravity=settings.gravity, progress=progress)
-    path = skeleton.main_path()
-    spacing = float(skeleton.arc_length[path[-1]]) / settings.links
-    tip = skeleton.nodes[path[-1]]
+    end = skeleton.main_path()[-1]
+    spacing = float(skeleton.arc_length[end]) / settings.links
     tree, factor = matched(rod_tree(loaded.model, skeleton, spacing), loaded.model,
                            _tip(loaded.model, skeleton))
     damping = known_damping(branch, progress)
-    if suffix == ".urdf":
+    if path.suffix == ".urdf":
         text = urdf_text(tree, damping, branch.name)
     else:
         sites = {target.name: target.position for target in load_targets(branch)}
         if loaded.grasp_point is not None:
             sites = {"grasp": loaded.grasp_point, **sites}
         text = mjcf_text(tree, damping, branch.name,
-                         {"tip": tuple(tip), **sites})
-    return text, {"link_count": tree.count, "mass_kg": float(tree.mass.sum()),
-                  "stiffness_factor": factor,
-                  "damping_stiffness_s": damping.stiffness}
+                         {"tip": tuple(skeleton.nodes[end]), **sites})
+    path.write_bytes(text.encode())
+    return {"link_count": tree.count, "mass_kg": float(tree.mass.sum()),
+            "stiffness_factor": factor, "damping_stiffness_s": damping.stiffness}
 
 
-def _elements(branch: Branch, settings: ExportSettings, progress: Progress,
-              ) -> tuple[str, dict[str, Any]]:
+def _write_elements(branch: Branch, path: Path, settings: ExportSettings, progress: Progress,
+                    ) -> dict[str, Any]:
     from limber.results.exports.abaqus import inp_text
     from limber.store.loading import load_branch, load_skeleton
 
@@ -134,14 +129,13 @@ def _elements(branch: Branch, settings: ExportSettings, progress: Progress,
         progress.warn("An .inp file does not contain what hangs on the branch (twigs, leaves, "
                       "targets).")
     load = None if settings.load is None else np.array(settings.load)
-    text = inp_text(model, branch.name, tip, load)
-    return text, {"tet_count": model.mesh.tet_count, "node_count": model.mesh.node_count,
-                  "tip_node": tip + 1}
+    path.write_bytes(inp_text(model, branch.name, tip, load).encode())
+    return {"tet_count": model.mesh.tet_count, "node_count": model.mesh.node_count,
+            "tip_node": tip + 1}
 
 
-def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dict[str, Any]]:
-    import tempfile
-
+def _write_body(branch: Branch, path: Path, _settings: ExportSettings, progress: Progress,
+                ) -> dict[str, Any]:
     from limber.core.optional import require_extra
     from limber.results.exports.usd import as_deformable, write_usd
     from limber.store.loading import known_damping, load_branch, load_skeleton
@@ -153,13 +147,10 @@ def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dic
                       "targets).")
     tip = _tip(model, load_skeleton(branch))
     made = as_deformable(model, tip)
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place, f"branch{output.suffix.lower()}")
-        write_usd(made, known_damping(branch, progress), branch.name, path)
-        content = path.read_bytes()
+    write_usd(made, known_damping(branch, progress), branch.name, path)
     mesh = made.model.mesh
-    return content, {"tet_count": mesh.tet_count, "node_count": mesh.node_count, "tip_node": tip,
-                     "young_pa": made.young}
+    return {"tet_count": mesh.tet_count, "node_count": mesh.node_count, "tip_node": tip,
+            "young_pa": made.young}
 
 
 def _tip(model: BranchModel, skeleton: Skeleton) -> int:
@@ -168,47 +159,29 @@ def _tip(model: BranchModel, skeleton: Skeleton) -> int:
     return int(np.linalg.norm(model.mesh.nodes - end, axis=1).argmin())
 
 
-def _cylinders(branch: Branch, output: Path, settings: ExportSettings,
-               ) -> tuple[str | None, dict[str, Any]]:
-    from limber.geometry.io import cylinder_models
-    from limber.geometry.io.mtg import mtg_text
-    from limber.store.loading import load_skeleton
-
-    skeleton = load_skeleton(branch)
-    told = {"cylinder_count": skeleton.node_count - 1}
-    suffix = output.suffix.lower()
-    if suffix == ".csv":
-        write = {"rtwig": cylinder_models.rtwig_text,
-                 "simpleforest": cylinder_models.simpleforest_text}[settings.columns]
-        return write(skeleton), told
-    if suffix == ".mtg":
-        return mtg_text(skeleton), told
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        if suffix == ".swc":
-            skeleton.write_swc(output)
-        else:
-            cylinder_models.write_treeqsm(skeleton, output)
-    except OSError as error:
-        raise _cannot_write(output, error) from error
-    return None, told
+EXPORTS = Registry("export", "limber.exports", [
+    Format("MuJoCo", (".xml",), write=_write_links,
+           about="MJCF of MuJoCo: rigid links on springs, at rest as scanned"),
+    Format("URDF", (".urdf",), write=_write_links,
+           about="the same links; springs as Gazebo reads them"),
+    Format("USD", (".usd", ".usda", ".usdc"), write=_write_body,
+           about="USD: a deformable body of linear tetrahedra with one modulus"),
+    Format("Abaqus", (".inp",), write=_write_elements, about="Abaqus, CalculiX: the quadratic "
+           "tetrahedra, held base, a static and a frequency step")])
+"""``write`` is called with the open branch folder, the path, the settings and progress; it returns
+what the file holds. All formats of :data:`~limber.geometry.io.skeletons.SKELETONS` are written
+too."""
 
 
-def _written(output: Path, text: str | bytes | None) -> None:
-    from limber.core.files.atomic import write_atomically
+class ExportInputs(BranchInputs):
+    """A branch folder, and the file to write."""
 
-    if text is None:
-        return
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(output, text)
-    except OSError as error:
-        raise _cannot_write(output, error) from error
+    groups: ClassVar[Groups] = {"output": ("output",)}
 
-
-def _cannot_write(output: Path, error: OSError) -> InputError:
-    return InputError(f"{output} cannot be written ({error.strerror}).", "The export goes there.",
-                      "Choose another location.")
+    output: Path = Field(
+        description="File to write; its suffix says what: "
+        f"{listed([*EXPORTS.writers(), *SKELETONS.writers()])}.",
+        json_schema_extra={"short": "-o", "example": "{stem}.urdf"})
 
 
 def run(inputs: ExportInputs, settings: ExportSettings, _options: NoOptions,

@@ -1,21 +1,20 @@
-"""Closed surface (STL, PLY, OBJ), a table of sections or a cylinder model to tetrahedra."""
+"""Closed surface, a table of sections or a cylinder model to tetrahedra."""
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from pydantic import Field
 
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
+from limber.geometry.io.skeletons import SKELETONS, write_cylinders
+from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.stages.inputs import RunOptions, argument
 from limber.stages.registry import StageDescription
 from limber.store import Branch
-
-if TYPE_CHECKING:
-    from limber.geometry.surface.surface import Surface
 
 
 class MeshInputs(Settings):
@@ -24,9 +23,9 @@ class MeshInputs(Settings):
     groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
 
     surface: Path = argument(
-        "A closed surface (STL, PLY, OBJ or OFF); a CSV of sections from the fixed end, with x, "
-        "y, z, width, height and optionally mass_kg of what hangs there; or a cylinder model "
-        "(.mat of TreeQSM or SmartQSM, CSV of rTwig or SimpleForest, MTG, SWC).")
+        f"A closed surface: {SURFACES.listed()}; a .csv of sections along an axis from the end "
+        "that is held: x, y, z, width, height, and perhaps mass_kg, what hangs there; or a "
+        f"cylinder model: {SKELETONS.listed()}.")
     output: Path = Field(description="The branch folder to make.",
                          json_schema_extra={"short": "-o", "example": "{stem}.branch"})
 
@@ -36,7 +35,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     """Fill a closed surface with tetrahedra and mark base, control points and grasp.
 
     Args:
-        path: STL, PLY, OBJ or OFF, a CSV of sections, or a cylinder model.
+        path: A surface, a CSV of sections, or a cylinder model.
         folder: The branch folder to make or renew.
         settings: How.
         force: Run even if nothing has changed.
@@ -49,21 +48,23 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
             cannot be used (:func:`limber.geometry.mesh_skeleton.mesh_model`).
         MeshingError: fTetWild failed.
     """
-    from limber.geometry.io.skeletons import write_cylinders
-    from limber.geometry.mesh_skeleton import is_model, mesh_model
+    from limber.core.constants import UNIT_METRES
+    from limber.geometry.mesh_skeleton import body_format, mesh_model
     from limber.geometry.mesh_surface import mesh_body
-    from limber.geometry.sections import mesh_sections, read_sections
+    from limber.geometry.sections import SECTIONS, mesh_sections, read_sections
 
     settings = settings or MeshSurfaceSettings()
     path, drawn = require_file(path, "A surface"), None
     warnings: list[str] = []
-    has_cylinders = is_model(path)
+    chosen = body_format(path)
+    has_cylinders = chosen in SKELETONS.readers()
     if has_cylinders:
         progress = progress.keeping(warnings)
-    elif path.suffix.lower() == ".csv":
+    elif chosen is SECTIONS:
         drawn = read_sections(path, settings.unit)
     else:
-        surface, warnings = _usable(path, settings)
+        surface, warnings = usable_surface(
+            SURFACES.read_as(chosen, path, scale=UNIT_METRES[settings.unit]), path)
     branch = Branch.create(folder)
     digests = {"surface": file_digest(path)}
     if not force and branch.is_current("mesh", settings, digests=digests):
@@ -93,14 +94,6 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         stage.result.update(made.numbers | {"warnings": warnings})
         progress(1.0, "meshed", tets=made.mesh.tet_count)
     return branch.manifest.stages["mesh"].result
-
-
-def _usable(path: Path, settings: MeshSurfaceSettings) -> "tuple[Surface, list[str]]":
-    from limber.core.constants import UNIT_METRES
-    from limber.geometry.io.surfaces import usable_surface
-    from limber.geometry.surface.surface import Surface
-
-    return usable_surface(Surface.read(path, scale=UNIT_METRES[settings.unit]), path)
 
 
 def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,

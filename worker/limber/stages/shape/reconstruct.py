@@ -16,6 +16,8 @@ from limber.core.errors import Cancelled, InputError, LimberError, WorkError
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
+from limber.geometry.io.clouds import CLOUDS, read_points
+from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, write_cylinders
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.inputs import RunOptions, argument
 from limber.stages.registry import StageDescription
@@ -44,16 +46,15 @@ class ReconstructInputs(Settings):
                                "output": ("output",)}
     common = ("camera",)
 
-    cloud: Path = argument("A point cloud, or a folder of them. Each file of a folder becomes a "
-                           "branch folder in the output folder, and a bad one does not stop the "
-                           "others.")
+    cloud: Path = argument(
+        f"A point cloud file ({' '.join(CLOUDS.suffixes())}), or a folder of them: then each "
+        "becomes a branch folder in the output folder, and a bad one does not stop the others.")
     output: Path = Field(
         description="The branch folder to make. With a folder of scans: where to make the branch "
                     "folders.",
         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
     skeleton: Path | None = Field(
-        None, description="Your own skeleton in the cloud's coordinates: SWC, cylinder CSV (ours, "
-        "rTwig's, SimpleForest's), .mat of TreeQSM or SmartQSM, or MTG.")
+        None, description=f"Your own skeleton in the cloud's coordinates: {SKELETONS.listed()}.")
     edits: Path | None = Field(
         None, description="Edits of the skeleton (JSON, see `limber skeleton`). They stay in the "
         "branch folder, and each reconstruct without --skeleton applies them again.")
@@ -77,8 +78,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
         folder: The branch folder to make or renew.
         settings: How.
-        skeleton_path: The user's own skeleton in the scan's coordinates and unit (SWC or
-            cylinder CSV), instead of ours.
+        skeleton_path: The user's own skeleton in the scan's coordinates and unit, instead of ours.
         edits_path: Edits of the skeleton; without them those that the folder has, if the
             skeleton is not the user's own.
         camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
@@ -94,9 +94,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         WorkError: the work failed; the folder is as it was but for the kept skeleton.
     """
     from limber.core.constants import UNIT_METRES
-    from limber.geometry.io.clouds import read_points
     from limber.geometry.io.depth_images import read_depth
-    from limber.geometry.io.skeletons import read_skeleton
     from limber.geometry.reconstruction import reconstruct_cloud
     from limber.geometry.skeleton.edits import edits_text, read_edits
 
@@ -176,12 +174,11 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
         InputError: there is no scan.
         WorkError: all of them failed.
     """
-    from limber.geometry.io.clouds import READERS
-
-    paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in READERS)
+    known = CLOUDS.suffixes()
+    paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in known)
     if not paths:
-        raise InputError(f"{clouds} has no point clouds.",
-                         f"Known are: {' '.join(sorted(READERS))}.", "Name another folder.")
+        raise InputError(f"{clouds} has no point clouds.", f"Known are: {' '.join(known)}.",
+                         "Name another folder.")
     done: dict[str, Any] = {}
     failed: dict[str, str] = {}
     for number, path in enumerate(paths):
@@ -202,8 +199,6 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
 
 def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit: str) -> None:
     """Write a skeleton in the coordinates and the unit of the scan's file."""
-    from limber.geometry.io.skeletons import write_cylinders
-
     in_file = skeleton.in_file(alignment)
     in_file.write_swc(stage.path(f"{FOUND_SKELETON}.swc"), unit=unit)
     write_cylinders(in_file, stage.path(f"{FOUND_SKELETON}.csv"))
@@ -232,8 +227,6 @@ def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str
 
 def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
     """Write the files of a branch that has been meshed."""
-    from limber.geometry.io.skeletons import write_cylinders
-
     cloud.write_ply(stage.path("cloud.ply"))
     meshed.skeleton.write_swc(stage.path("skeleton.swc"))
     write_cylinders(meshed.skeleton, stage.path("skeleton.csv"))
@@ -275,7 +268,6 @@ def _eye(camera_path: Path | None) -> np.ndarray | None:
 def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
     from limber.geometry.generated import read_truth
-    from limber.geometry.io.skeletons import read_swc
     from limber.geometry.surface.surface import Surface
 
     source = cloud_path.parent / "truth.json"

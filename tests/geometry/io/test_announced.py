@@ -8,6 +8,7 @@ import pytest
 from limber.core.errors import InputError
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.isolated_readers import read_apart
+from limber.geometry.io.las import las_columns
 
 PLY = "ply\nformat {form} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n" \
       "property float z\nend_header\n"
@@ -62,7 +63,7 @@ def test_a_reader_apart_tells_what_went_wrong(tmp_path):
     path = tmp_path / "a.laz"
     path.write_bytes(b"LASF" + bytes(400))
     with pytest.raises(InputError, match=r"a\.laz cannot be read"):
-        read_apart("las", path)
+        read_apart(las_columns, path)
 
 
 def test_vertices_of_two_numbers(tmp_path):

@@ -1,0 +1,64 @@
+"""A format of clouds of another package: registered, it is read wherever clouds are."""
+
+import json
+
+import numpy as np
+import pytest
+
+from limber.cli.main import call
+from limber.core.errors import InputError
+from limber.geometry.generated import generate_branch
+from limber.geometry.io.clouds import CLOUDS, read_points
+from limber.geometry.io.formats import Format, starts_with
+
+
+class Dots:
+    """Coordinates as doubles behind the word dots."""
+
+    @staticmethod
+    def write(points, path):
+        path.write_bytes(b"dots" + np.asarray(points, "<f8").tobytes())
+
+    @staticmethod
+    def read(path):
+        points = np.frombuffer(path.read_bytes()[4:], "<f8").reshape(-1, 3)
+        return dict(zip("xyz", points.T, strict=True))
+
+
+@pytest.fixture(params=[False, True], ids=["here", "isolated"])
+def dots(request):
+    CLOUDS.register(Format("dots", (".foo",), Dots.read, recognises=starts_with(b"dots"),
+                           isolated=request.param))
+    yield
+    del CLOUDS.formats[0]
+
+
+@pytest.mark.slow
+def test_it_is_read_by_suffix_and_by_content(dots, tmp_path):
+    """A mangled file is refused as those of any format are."""
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    for name in ("a.foo", "a.bar"):
+        Dots.write(points, tmp_path / name)
+        np.testing.assert_array_equal(read_points(tmp_path / name).points, points)
+    (tmp_path / "cut.foo").write_bytes(b"dots1234")
+    with pytest.raises(InputError, match=r"cut\.foo cannot be read"):
+        read_points(tmp_path / "cut.foo")
+
+
+def test_its_suffix_is_listed_and_its_name_is_its_own(dots, tmp_path):
+    (tmp_path / "a.docx").write_bytes(b"nonsense")
+    with pytest.raises(InputError, match=r"\.foo .*\.ply"):
+        read_points(tmp_path / "a.docx")
+    with pytest.raises(ValueError, match="dots"):
+        CLOUDS.register(Format("dots", (".dots",), Dots.read))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dots", [False], indirect=True)
+def test_reconstruct_takes_it(dots, tmp_path, capsys):
+    """A file of it, and a folder with one among files of other kinds."""
+    Dots.write(generate_branch(1, length=0.3, fork_count=0).cloud.points, tmp_path / "in.foo")
+    (tmp_path / "notes.docx").write_bytes(b"nonsense")
+    assert call(["reconstruct", str(tmp_path), "-o", str(tmp_path / "out"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["done_count"] == 1 and told["done"]["in.foo"]["watertight"]

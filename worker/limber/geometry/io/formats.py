@@ -1,0 +1,223 @@
+"""Registries of file formats: all that must know which files there are asks one of them.
+
+A format is an entry of a registry. Other packages add theirs by a call::
+
+    from limber.geometry.io.clouds import CLOUDS
+    from limber.geometry.io.formats import Format
+    CLOUDS.register(Format("FOO", (".foo",), read_foo))
+
+or by an entry point of the registry's group whose value is a :class:`Format`; it is loaded when the
+registry is first asked.
+"""
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from limber.core.errors import InputError, LimberError, MissingDependencyError
+from limber.core.lazy import loaded
+from limber.core.machine_errors import machine_error
+from limber.geometry.io.isolated_readers import read_apart
+
+Function = Callable[..., Any] | str
+"""A function, or ``module:name`` of one, which is imported when it is called."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """What is known of a kind of files.
+
+    Attributes:
+        name: What people call it.
+        suffixes: Of its files' names, in small letters with the dot.
+        read: Called with the path and the registry's options; returns what the registry is of, or
+            arrays of which its ``of_arrays`` makes that. None: it is only written.
+        write: Called with the object and the path. None: it is only read.
+        recognises: Whether a path is one by its content: asked where the suffix is of no format,
+            or of several.
+        check: Refuses a file whose header announces more than the file holds.
+        isolated: Whether ``read``, a function of a module, is called in a process of its own with
+            the path alone, and returns arrays: compiled code may abort on a mangled file.
+        about: What help texts say of it beside its suffixes.
+    """
+
+    name: str
+    suffixes: tuple[str, ...] = ()
+    read: Function | None = None
+    write: Function | None = None
+    recognises: Function | None = None
+    check: Callable[[Path], None] | None = None
+    isolated: bool | Callable[[Path], bool] = False
+    about: str = ""
+
+
+Kind = TypeVar("Kind", bound=Format)
+
+
+@dataclass
+class Registry(Generic[Kind]):
+    """The formats of one kind of content.
+
+    Attributes:
+        what: What its files hold, for messages.
+        group: The entry points of other packages.
+        formats: Those that are registered; those registered later are asked before.
+        of_arrays: Called with the path, the arrays that a format read, and the options.
+    """
+
+    what: str
+    group: str
+    formats: list[Kind] = field(default_factory=list)
+    of_arrays: Function | None = None
+    _is_complete: bool = False
+
+    def register(self, added: Kind) -> None:
+        """Add a format.
+
+        Raises:
+            ValueError: there is one of that name.
+        """
+        if any(one.name == added.name for one in self.formats):
+            raise ValueError(f"There is a format {added.name!r} of a {self.what}.")
+        self.formats.insert(0, added)
+
+    def __iter__(self) -> Iterator[Kind]:
+        """All formats, those of other packages first."""
+        if not self._is_complete:
+            self._is_complete = True
+            for entry in entry_points(group=self.group):
+                try:
+                    self.register(entry.load())
+                except Exception as error:  # it must not stop work that does without it
+                    warnings.warn(f"The package of {entry.value} adds no format of a {self.what} "
+                                  f"({type(error).__name__}: {error}).", stacklevel=2)
+        return iter(tuple(self.formats))
+
+    def suffixes(self) -> tuple[str, ...]:
+        """Return the suffixes that are read, sorted."""
+        return suffixes_of(self.readers())
+
+    def listed(self) -> str:
+        """Return the suffixes that are read and what they stand for, as a text for people."""
+        return listed(self.readers())
+
+    def of(self, path: Path) -> Kind:
+        """Return the format of a file by its suffix, else by its content.
+
+        Raises:
+            InputError: none is known.
+        """
+        return known_format(path, self.what, self.readers())
+
+    def read(self, path: Path, **options: Any) -> Any:
+        """Return what a file holds.
+
+        Raises:
+            InputError: its format is not known, or it cannot be read. MissingDependencyError: its
+                format needs a package that is not installed.
+        """
+        return self.read_as(self.of(path), path, **options)
+
+    def read_as(self, chosen: Format, path: Path, **options: Any) -> Any:
+        """Return what a file holds that is of this format; see :meth:`read`."""
+        try:
+            return self._read(chosen, path, options)
+        except (LimberError, MemoryError):
+            raise
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"Reading {path.suffix} needs the package {error.name}.", "It is not installed.",
+                f"Install it, or export the {self.what} in another format.") from error
+        except Exception as error:  # each format's package raises its own
+            raise machine_error(error, path) or InputError(
+                f"{path} cannot be read ({type(error).__name__}: {error}).",
+                "It is damaged, cut short, or not what its suffix says.",
+                "Export it again.") from error
+
+    def write_as(self, chosen: Format, content: Any, path: Path, *further: Any) -> Any:
+        """Write ``content`` to a file in this format."""
+        return loaded(chosen.write)(content, path, *further)
+
+    def _read(self, chosen: Format, path: Path, options: dict[str, Any]) -> Any:
+        if chosen.check is not None:
+            chosen.check(path)
+        isolated = chosen.isolated(path) if callable(chosen.isolated) else chosen.isolated
+        read = loaded(chosen.read)
+        found = read_apart(read, path) if isolated else read(path, **options)
+        return loaded(self.of_arrays)(path, found, **options) if isinstance(found, dict) else found
+
+    def readers(self) -> list[Kind]:
+        """Return the formats that are read."""
+        return [one for one in self if one.read is not None]
+
+    def writers(self) -> list[Kind]:
+        """Return the formats that are written."""
+        return [one for one in self if one.write is not None]
+
+
+def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
+    """Return the format of a path among these.
+
+    The suffix says it. Where several have it, or none, the content does; of several, one that does
+    not look at the content takes what no other recognises.
+
+    Args:
+        what: What the file holds, for messages.
+
+    Raises:
+        InputError: none is known.
+    """
+    found = _format_of(path, formats)
+    if found is None:
+        raise unknown_suffix(path, formats, f"Export the {what} as one of these.")
+    return found
+
+
+def unknown_suffix(path: Path, formats: Iterable[Format], fix: str) -> InputError:
+    """Return the refusal of a file whose suffix is of none of these formats."""
+    return InputError(f"{path.name} has a suffix that is not known.",
+                      f"Known are: {' '.join(suffixes_of(formats))}.", fix)
+
+
+def suffixes_of(formats: Iterable[Format]) -> tuple[str, ...]:
+    """Return the suffixes of formats, sorted."""
+    return tuple(sorted({suffix for one in formats for suffix in one.suffixes}))
+
+
+def listed(formats: Iterable[Format]) -> str:
+    """Return the suffixes of formats and what they stand for, as a text for people."""
+    told: dict[str, list[str]] = {}
+    for one in formats:
+        told.setdefault(" ".join(one.suffixes), []).extend([one.about] if one.about else [])
+    return "; ".join(f"{suffixes} ({', '.join(abouts)})" if suffixes and abouts
+                     else suffixes or ", ".join(abouts) for suffixes, abouts in told.items())
+
+
+def _format_of(path: Path, known: Sequence[Kind]) -> Kind | None:
+    named = [one for one in known if path.suffix.lower() in one.suffixes]
+    if len(named) == 1:
+        return named[0]
+    plain = [one for one in named if one.recognises is None]
+    if path.exists():
+        for one in named if plain else (*named, *known):
+            if one.recognises is not None and loaded(one.recognises)(path):
+                return one
+    return plain[0] if plain else None
+
+
+def head_of(path: Path, count: int) -> bytes:
+    """Return the first bytes of a file; none of a folder."""
+    if path.is_dir():
+        return b""
+    with open(path, "rb") as stream:
+        return stream.read(count)
+
+
+def starts_with(*marks: bytes) -> Callable[[Path], bool]:
+    """Return what recognises files that begin with one of ``marks``."""
+    def recognises(path: Path) -> bool:
+        return head_of(path, max(map(len, marks))).startswith(marks)
+    return recognises

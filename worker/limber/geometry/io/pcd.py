@@ -1,0 +1,60 @@
+"""Clouds as PCD files, of all versions."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.files.declared_sizes import header_bytes
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.columns import property_names
+
+_PADDING = "#$%&~~"  # how pypcd4 begins the names of fields that are called _
+
+
+def read_pcd(path: Path) -> Cloud:
+    """Return the points of a PCD file, with its own names of what is renamed."""
+    from pypcd4 import PointCloud
+
+    stream, titles = _stream(path)
+    content = PointCloud.from_fileobj(stream)
+    columns = {name: np.asarray(content.pc_data[name]).ravel() for name in content.fields
+               if not name.startswith(_PADDING)}
+    if "rgb" in columns:
+        packed = columns.pop("rgb")
+        packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
+        columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
+    return Cloud.from_columns(columns, titles)
+
+
+def _stream(path: Path) -> tuple[io.BytesIO, dict[str, str]]:
+    """A PCD file as its package reads it, and what the file calls fields of other names.
+
+    Versions before 0.7 lack entries of the header; some programs end lines with blanks, or have
+    marks in the names of fields.
+    """
+    raw, body = header_bytes(path, b"\nDATA")
+    said = {words[0]: words[1:] for line in raw.decode("utf-8", "replace").splitlines()
+            if (words := line.split()) and not words[0].startswith("#")}
+    for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
+        if not said.get(key):
+            raise InputError(f"{path} has no {key} in its header.", "A PCD file says it there.",
+                             "Export it again.")
+    fields = said["FIELDS"]
+    own = [title for title in fields if title != "_"]
+    names = iter(property_names(own))
+    renamed = [title if title == "_" else next(names) for title in fields]
+    size = int(said["WIDTH"][0]) * int(said.get("HEIGHT", "1")[0])
+    told = {"VERSION": ["0.7"], "FIELDS": renamed, "SIZE": said["SIZE"], "TYPE": said["TYPE"],
+            "COUNT": said.get("COUNT") or ["1"] * len(fields), "WIDTH": said["WIDTH"],
+            "HEIGHT": said.get("HEIGHT") or ["1"], "POINTS": said.get("POINTS") or [str(size)],
+            "DATA": said["DATA"]}
+    header = "".join(f"{key} {' '.join(words)}\n" for key, words in told.items()).encode()
+    with open(path, "rb") as stream:
+        stream.seek(body)
+        points = stream.read()
+    if said["DATA"][0] == "ascii":
+        points = b"\n".join(b" ".join(line.split()) for line in points.splitlines())
+    return io.BytesIO(header + points), {
+        name: title for name, title in zip(renamed, fields, strict=True) if name != title}

@@ -1,0 +1,53 @@
+"""Clouds as PLY files, whose headers programs also write in other letters than ASCII."""
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.files.declared_sizes import header_bytes
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.columns import property_names
+
+
+def read_ply(path: Path) -> Cloud:
+    """Return the vertices of a PLY file, with its own names of what is renamed."""
+    content, titles = _ply_content(path)
+    if "vertex" not in content:
+        raise InputError(f"{path} has no vertices.", "A cloud is an element `vertex`.",
+                         "Export it again.")
+    table = content["vertex"].data
+    names = list(table.dtype.names)
+    return Cloud.from_columns({name: np.asarray(table[name]) for name in names
+                               if table.dtype[name].kind in "iuf"}, titles)
+
+
+def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:
+    """Read a PLY file, and what it calls the properties whose names are no ASCII.
+
+    A header is ASCII by the standard; programs write comments and names in other letters too.
+    """
+    from plyfile import PlyData
+
+    raw, body = header_bytes(path, b"end_header")
+    if raw.isascii():
+        return PlyData.read(str(path)), {}
+    try:
+        header = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        header = raw.decode("latin-1")
+    lines = re.split(r"(\r\n|\r|\n)", header)
+    words = {k: line.split() for k, line in enumerate(lines) if line.startswith("property")}
+    other = [k for k, parts in words.items() if not parts[-1].isascii()]
+    taken = [parts[-1] for k, parts in words.items() if k not in other]
+    names = property_names((words[k][-1] for k in other), taken)
+    for k, name in zip(other, names, strict=True):
+        lines[k] = " ".join([*words[k][:-1], name])
+    plain = "".join(lines).encode("ascii", "replace")
+    with open(path, "rb") as stream:
+        stream.seek(body)
+        content = PlyData.read(io.BytesIO(plain + stream.read()))
+    return content, {name: words[k][-1] for k, name in zip(other, names, strict=True)}

@@ -1,0 +1,1 @@
+"""Recordings of other programs into the pull format, and the registry of their formats."""

@@ -1,0 +1,49 @@
+"""C3D files of motion capture, read in a process of their own."""
+
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.recordings.tables import LENGTH_UNITS_M
+from limber.recordings.time_series import Stream
+
+
+def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return what a C3D file tells of its markers: ``points`` [3, m, n], rate, unit, labels.
+
+    Compiled code reads it, which a mangled file may abort.
+    """
+    import ezc3d
+
+    data = ezc3d.c3d(str(path))
+    told = data["parameters"]["POINT"]
+    labels = [str(label) for label in told["LABELS"]["value"]]
+    unit = (told.get("UNITS", {}).get("value") or ["mm"])[0].strip()
+    return {"points": np.asarray(data["data"]["points"][:3], float),
+            "rate": np.array(float(data["header"]["points"]["frame_rate"])),
+            "unit": np.array(unit), "labels": np.array(labels, "U64")}
+
+
+def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: object,
+                      ) -> tuple[Stream, list[str]]:
+    """Return marker tracks [m] and labels of arrays as :func:`c3d_arrays` gives them.
+
+    Raises:
+        InputError: there are no points, no times, or places that are not finite.
+    """
+    points, labels = data["points"], [str(label) for label in data["labels"]]
+    if not points.size:
+        raise InputError(f"{path} has no points.", "Marker tracks were expected.",
+                         "Export the trajectories as well.")
+    scale = LENGTH_UNITS_M.get(str(data["unit"]).lower(), 1e-3)
+    rate = float(data["rate"])
+    if not (np.isfinite(rate) and rate > 0) or np.isinf(points).any():
+        raise InputError(f"{path} has {rate:g} frames a second, or places that are not finite.",
+                         "Without times and places there is no motion.", "Export it again.")
+    positions = np.moveaxis(points, 0, -1).transpose(1, 0, 2) * scale
+    # An unseen marker is written as (0, 0, 0) by many programs, as NaN by others.
+    positions[np.all(positions == 0.0, axis=2)] = np.nan
+    times = np.arange(len(positions)) / rate
+    names = tuple(f"m{k}_{axis}_m" for k in range(positions.shape[1]) for axis in "xyz")
+    return Stream(times, positions.reshape(len(times), -1), names), labels[:positions.shape[1]]

@@ -1,0 +1,56 @@
+"""The registry of formats of recordings; what reads them is imported when it is needed."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from limber.geometry.io.formats import Format, Registry
+
+_TABLES = (".csv", ".tsv", ".txt")
+_HERE = "limber.recordings.importing"
+_READERS = f"{_HERE}.readers"
+
+
+@dataclass(frozen=True)
+class RecordingFormat(Format):
+    """A format of recordings; ``read`` is also called with ``request``, an :class:`ImportRequest`.
+
+    Attributes:
+        holds: What ``read`` returns. ``markers``: their tracks as a stream with three columns each
+            [m], and their labels. ``robot``: a stream of the gripper's poses and wrenches in the
+            branch's frame. ``clouds`` and ``depth``: warnings; it puts them into the folder of the
+            pull. ``pull``: a whole :class:`Pull`. ``force``: displacements [m], forces [N] and
+            warnings.
+    """
+
+    holds: Literal["markers", "robot", "clouds", "depth", "pull", "force"] = "markers"
+
+
+RECORDINGS = Registry("recording", "limber.recordings", [
+    RecordingFormat("bag", (".mcap", ".db3", ".bag"), f"{_HERE}.bag_import:read_bag_pull",
+                    recognises=f"{_READERS}:is_bag_folder", holds="pull",
+                    about="bag of ROS, also as a folder"),
+    RecordingFormat("pull", (), f"{_READERS}:read_folder", recognises=f"{_READERS}:is_pull",
+                    holds="pull", about="pull of Limber"),
+    RecordingFormat("rgbd", (), f"{_READERS}:read_rgbd", recognises=f"{_READERS}:has_depth",
+                    holds="depth", about="RGB-D folder"),
+    RecordingFormat("clouds", (), f"{_READERS}:read_clouds", recognises=f"{_READERS}:is_folder",
+                    holds="clouds", about="folder of clouds"),
+    RecordingFormat("c3d", (".c3d",), f"{_HERE}.c3d:c3d_arrays", isolated=True, about="markers"),
+    RecordingFormat("force-displacement", _TABLES, f"{_READERS}:read_force_table",
+                    recognises=f"{_READERS}:is_force_table", holds="force", about="force table"),
+    RecordingFormat("robot", _TABLES, f"{_READERS}:read_robot",
+                    recognises=f"{_READERS}:is_robot_log", holds="robot", about="RTDE log"),
+    RecordingFormat("markers", _TABLES, f"{_READERS}:read_markers",
+                    recognises=f"{_READERS}:is_file", about="markers"),
+], of_arrays=f"{_HERE}.c3d:markers_of_arrays")
+"""Arrays that a format reads are markers, as :func:`.c3d.c3d_arrays` gives them."""
+
+
+def kind_names() -> tuple[str, ...]:
+    """Return what a user may say a recording is."""
+    return "auto", *(one.name for one in RECORDINGS)
+
+
+def recording_format(name: str) -> RecordingFormat:
+    """Return the format of a name among :func:`kind_names`."""
+    return next(one for one in RECORDINGS if one.name == name)

@@ -1,0 +1,156 @@
+"""What an import is asked: the recording, where it goes, the settings, the branch and the robot."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.alignment import Alignment
+from limber.core.constants import GRAVITY
+from limber.core.errors import InputError
+from limber.core.progress import SILENT, Progress
+from limber.recordings.bags.bag_pull import JointPoses
+from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.recording import GraspEntry, PullEntry, SensorEntry
+from limber.recordings.registration import Registration, read_nominal, register
+from limber.recordings.settings import ImportSettings
+
+
+@dataclass(frozen=True)
+class BranchFrame:
+    """What an import must know of the branch.
+
+    Attributes:
+        alignment: From the scan's coordinates to the branch's.
+        gravity: [m/s^2] in the branch's frame.
+        nodes: Of its mesh [m], shape [n, 3]; a steady load asks for them. None: there is no mesh
+            yet, and nothing can be held against it.
+    """
+
+    alignment: Alignment = field(default_factory=Alignment)
+    gravity: tuple[float, float, float] = GRAVITY
+    nodes: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class RobotKnown:
+    """What is known of the robot that a recording was made with.
+
+    Attributes:
+        joint_poses: Where its gripper is by its joint angles.
+        noise: Of its force sensor.
+        errors: What is left open of a recording of so many seconds.
+    """
+
+    joint_poses: JointPoses
+    noise: SensorEntry
+    errors: Callable[[float], CalibrationEntry]
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """An import into the pull format.
+
+    Attributes:
+        source: The recording.
+        folder: Of the pull; images and clouds go there.
+        name: Of the pull.
+        settings: How to read it.
+        branch: What is known of the branch.
+        robot: What is known of the robot, where a cell says it.
+        progress: Called as it goes; gets what the user should know.
+    """
+
+    source: Path
+    folder: Path = Path()
+    name: str = ""
+    settings: ImportSettings = field(default_factory=ImportSettings)
+    branch: BranchFrame = field(default_factory=BranchFrame)
+    robot: RobotKnown | None = None
+    progress: Progress = SILENT
+
+    @property
+    def given(self) -> set[str]:
+        """What of the settings is not as it is without being asked for."""
+        return {name for name, field in ImportSettings.model_fields.items()
+                if getattr(self.settings, name) != field.default}
+
+    def in_branch(self, points: np.ndarray) -> np.ndarray:
+        """Return points [m] of the user's frame in the branch's, shape [n, 3]."""
+        alignment = self.branch.alignment
+        if self.settings.coordinates == "branch":
+            return points
+        return alignment.apply(points / alignment.scale)
+
+    def grasp_or(self, otherwise: Callable[[], np.ndarray]) -> tuple[float, float, float]:
+        """Return the grasp point in the branch's frame [m]; where none was given, another."""
+        point = self.settings.grasp_point
+        x, y, z = otherwise()[:3] if point is None else self.in_branch(np.array([point]))[0]
+        return float(x), float(y), float(z)
+
+    def registered(self, rest: np.ndarray, labels: list[str]) -> Registration | None:
+        """Return how markers [m, 3] are laid onto their places on the branch, if those are given.
+        """
+        if self.settings.nominal is None:
+            return None
+        known, nominal = read_nominal(Path(self.settings.nominal))
+        return register(rest, labels, known, self.in_branch(nominal), self.name)
+
+    def entry(self, observation: Any, rest: np.ndarray | None, *, drive: Any, mode: Any,
+              sigma: float, grasp: tuple[float, float, float]) -> PullEntry:
+        """Return the description of the pull.
+
+        Args:
+            observation: As in the pull format.
+            rest: Markers at rest in the branch's frame [m], shape [m, 3], where they are known.
+            drive: As in the pull format.
+            mode: Of the grasp.
+            sigma: Standard deviation of positions [m].
+            grasp: Where it is, in the branch's frame [m].
+        """
+        settings = self.settings
+        return PullEntry(
+            observation=observation, drive=drive, motion=settings.motion,
+            gravity_m_s2=self.branch.gravity if settings.own_weight else None,
+            time_offset_s=settings.time_offset or 0.0, source=self.source.name,
+            grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=mode),
+            sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma,
+                               torque_sigma_nm=settings.torque_sigma),
+            rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))
+
+
+def require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) -> None:
+    """Refuse a grasp in the air beside the branch.
+
+    Raises:
+        InputError: no node lies within two grasp radii (and 5 mm) of it.
+    """
+    if nodes is None:
+        return
+    off = float(np.linalg.norm(nodes - np.array(grasp.point_m), axis=1).min())
+    if off > 2 * grasp.radius_m + 5e-3:
+        place = ", ".join(f"{value:.4g}" for value in grasp.point_m)
+        raise InputError(
+            f"{name}: the grasp point ({place}) m lies {off * 1e3:.0f} mm from the branch.",
+            "The gripper would hold nothing: the point, or the whole recording, is in another "
+            "frame of reference or unit.",
+            "Give --grasp-point on the branch (in the frame that --coordinates says), and check "
+            "--unit.")
+
+
+def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
+    """Refuse markers that lie elsewhere than the branch, as those of a capture's own frame do.
+
+    Raises:
+        InputError: one is farther from the mesh than a quarter of its extent.
+    """
+    off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in rest])
+    extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    if off.max() > 0.25 * extent:
+        raise InputError(
+            f"{name}: at rest a marker lies {off.max() * 1e3:.0f} mm from the branch, which is "
+            f"{extent * 1e3:.0f} mm long.",
+            "The recording is in another frame of reference, or in another unit.",
+            "Say with --nominal where on the branch the markers are, and check --unit.")

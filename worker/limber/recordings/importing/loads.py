@@ -1,0 +1,176 @@
+"""Pulls without a robot: markers on a branch that a steady load bends, or that is let go."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.present import present
+from limber.recordings.cell_errors import WITHOUT_GRIPPER
+from limber.recordings.hung_load import settled, swung
+from limber.recordings.importing.formats import RecordingFormat
+from limber.recordings.importing.import_request import (
+    ImportRequest,
+    require_near,
+    require_on_branch,
+)
+from limber.recordings.recording import Observations, Pull, SwingEntry, write_pull
+from limber.recordings.time_series import Stream
+
+
+def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
+    """Refuse what does not go together with a load.
+
+    Raises:
+        InputError: no markers; two loads; nothing says where it hangs; or inertia counts.
+    """
+    settings = request.settings
+    if chosen.holds != "markers":
+        raise InputError(
+            f"A steady load was given, but {request.source.name} is {chosen.name}.",
+            "Its rest is found in marker tracks.", "Give a CSV or C3D of markers.")
+    if settings.weight is not None and settings.load is not None:
+        raise InputError("Both --weight and --load were given.", "One load hangs on the branch.",
+                         "Give one of them.")
+    sags = settings.weight == 0 and settings.own_weight
+    if settings.grasp_point is None and not sags:
+        raise InputError("A load was given, but not where it hangs.",
+                         "How far it bends the branch depends on that.", "Give --grasp-point.")
+    if settings.motion == "dynamic":
+        raise InputError("A steady load was given for a dynamic pull.",
+                         "It shows a branch that is let go and swings, or that rests.",
+                         "Give --motion swing and run `limber swing`; or leave --motion out, for "
+                         "the place of rest.")
+
+
+def import_load(stream: Stream, labels: list[str], request: ImportRequest) -> dict[str, Any]:
+    """Make a pull of marker tracks of a branch under a load, and say what it comes to."""
+    for message in stream.warnings:
+        request.progress.warn(message)
+    seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
+    if request.settings.motion == "swing":
+        return _import_swing(seen, labels, request)
+    return _import_rest(seen, labels, request)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Markers in the branch's frame [m]: at rest [m, 3] and over time [f, m, 3]."""
+
+    rest: np.ndarray
+    positions: np.ndarray
+    labels: list[str]
+    rms: float | None
+
+    def numbers(self, load: np.ndarray) -> dict[str, Any]:
+        return {"frame_count": len(self.positions), "point_count": len(self.rest),
+                "time_offset_s": 0.0, "labels": self.labels, "load_n": load.tolist(),
+                "registration_rms_m": self.rms}
+
+
+def _placed(rest: np.ndarray, positions: np.ndarray, labels: list[str], request: ImportRequest,
+            warnings: Sequence[str] = ()) -> _Placed:
+    placed = request.registered(rest, labels)
+    used = placed.used if placed else np.flatnonzero(np.isfinite(rest).all(axis=1))
+    rest, positions = rest[used], positions[:, used]
+    if placed:
+        rest, positions = placed.apply(rest), placed.apply(positions)
+    for message in (*warnings, *(placed.warnings if placed else ())):
+        request.progress.warn(message)
+    require_near(rest, request.name, _nodes(request))
+    return _Placed(rest, positions, [labels[k] for k in used], placed.rms if placed else None)
+
+
+def _nodes(request: ImportRequest) -> np.ndarray:
+    return present(request.branch.nodes, "mesh of the branch")
+
+
+def _import_rest(seen: Observations, labels: list[str], request: ImportRequest) -> dict[str, Any]:
+    """A few frames of a branch at rest under a load."""
+    still = settled(seen, request.name)
+    found = _placed(still.rest, still.positions, labels, request, still.warnings)
+    sigma = request.settings.position_sigma or still.sigma(
+        1e-3 if found.rms is None else found.rms)
+    load = _load(request)
+    moved = found.positions[-1] - found.rest
+    _write(request, found, still.times, moved[None], load, sigma)
+    if suspicion := against_load(moved, load):
+        request.progress.warn(f"{request.name}: {suspicion}")
+    return found.numbers(load) | {
+        "displacement_m": moved.tolist(), "settled_s": still.duration, "position_sigma_m": sigma}
+
+
+def _import_swing(seen: Observations, labels: list[str], request: ImportRequest,
+                  ) -> dict[str, Any]:
+    """A branch that is let go: all frames, the load, and what swings with it."""
+    settings = request.settings
+    rest, noise = swung(seen, settings.swing_start, request.name)
+    found = _placed(rest, seen.positions, labels, request)
+    load, mass = _load(request), 0.0
+    if settings.weight is not None and settings.swing_start == "held":
+        mass = settings.weight / float(np.linalg.norm(request.branch.gravity))
+    _write(request, found, seen.times, found.positions - found.rest, load,
+           settings.position_sigma or noise, swing=SwingEntry(
+               start=settings.swing_start, load_mass_kg=mass, noise_m=noise,
+               registration_m=found.rms))
+    return found.numbers(load) | {"load_mass_kg": mass}
+
+
+def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.ndarray,
+           load: np.ndarray, sigma: float, **further: SwingEntry) -> None:
+    """Write a pull without a robot: a steady load [N], shape [3], where the grasp is.
+
+    Args:
+        moved: Displacements of the markers [m], shape [frames, m, 3].
+        sigma: Standard deviation of their positions [m].
+        further: Entries beside those of a pull with a robot.
+    """
+    nodes = _nodes(request)
+    # Of the branch's own weight alone no load hangs anywhere: where it is seen to move most.
+    grasp = request.grasp_or(lambda: _nearest(nodes, found.rest[_farthest(moved)]))
+    entry = request.entry("markers", found.rest, drive="force", mode="pinned", grasp=grasp,
+                          sigma=sigma)
+    entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER, **further})
+    require_on_branch(entry.grasp, request.name, nodes)
+    poses = np.zeros((2, 6))
+    poses[:, :3] = entry.grasp.point_m
+    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
+    write_pull(request.folder, Pull(request.name, entry, times[[0, -1]], poses, wrenches,
+                                    Observations(times, found.positions)))
+
+
+def _nearest(nodes: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The node nearest to a place [m]."""
+    return nodes[np.linalg.norm(nodes - place, axis=1).argmin()]
+
+
+def _farthest(moved: np.ndarray) -> int:
+    """Which marker is seen to move farthest, by displacements [m], shape [frames, m, 3]."""
+    # A marker out of sight has not been seen to move.
+    return int(np.nan_to_num(np.linalg.norm(moved, axis=2)).max(axis=0).argmax())
+
+
+def against_load(moved: np.ndarray, load: np.ndarray) -> str:
+    """Say it where markers go against the load (displacements [m], load [N]); across it is well:
+    an upright branch gives way to a weight sideways.
+    """
+    size = np.linalg.norm(moved, axis=1)
+    mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)
+    turn = np.degrees(np.arccos(np.clip(
+        mean @ load / max(np.linalg.norm(mean) * np.linalg.norm(load), 1e-12), -1, 1)))
+    if turn < 100:
+        return ""
+    return (f"the markers move at {turn:.0f} degrees to the load. Is the recording in the "
+            "branch's frame (--nominal), and does the load pull that way?")
+
+
+def _load(request: ImportRequest) -> np.ndarray:
+    """Force on the branch [N] in the branch's frame, shape [3]."""
+    settings, branch = request.settings, request.branch
+    if settings.load is None:
+        down = np.array(branch.gravity)
+        return settings.weight * down / np.linalg.norm(down)
+    turn = np.array(branch.alignment.rotation)
+    return turn @ settings.load if settings.coordinates == "scan" else np.array(settings.load)

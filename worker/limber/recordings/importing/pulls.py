@@ -1,0 +1,151 @@
+"""A recording of another program into ``pulls/NAME``."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope
+from limber.recordings.importing.formats import RECORDINGS, RecordingFormat, recording_format
+from limber.recordings.importing.import_request import ImportRequest, require_on_branch
+from limber.recordings.importing.loads import import_load, require_loadable
+from limber.recordings.importing.readers import read_robot
+from limber.recordings.importing.robot_knowledge import of_known_robot
+from limber.recordings.recording import (
+    Observations,
+    Pull,
+    PullEntry,
+    write_entry,
+    write_pull,
+)
+from limber.recordings.sensor_checks import clean
+from limber.recordings.synchronisation import estimate_offset
+from limber.recordings.time_series import Stream
+
+
+def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
+    """Bring a recording into the folder of a pull, in the pull format.
+
+    Args:
+        kind: The name of its format among :data:`~.formats.RECORDINGS`.
+        request: What is imported, and where to.
+
+    Returns:
+        ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
+        load ``displacement_m``, ``settled_s`` and ``registration_rms_m``; of a force table
+        ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
+
+    Raises:
+        InputError: the recording cannot be read as what it is said to be.
+    """
+    request.progress(0.1, f"reading {kind}")
+    chosen, settings = recording_format(kind), request.settings
+    if chosen.holds == "force":
+        return _import_force(*_read(chosen, request), request)
+    if settings.weight is not None or settings.load is not None:
+        require_loadable(chosen, request)
+        return import_load(*_read(chosen, request), request)
+    return _import_motion(chosen, replace(request, progress=request.progress.part(0.1, 1.0)))
+
+
+def _read(chosen: RecordingFormat, request: ImportRequest) -> Any:
+    return RECORDINGS.read_as(chosen, request.source, request=request)
+
+
+def _import_force(displacement: np.ndarray, force: np.ndarray, warnings: list[str],
+                  request: ImportRequest) -> dict[str, Any]:
+    found = force_slope(displacement, force, warnings=warnings)
+    for message in found.warnings:
+        request.progress.warn(message)
+    request.progress.warn(f"No modulus from {request.source.name}. {WHY_NO_MODULUS}")
+    table = np.column_stack([displacement, force])
+    np.savetxt(request.folder / "force.csv", table, "%.9g", ",", header="displacement_m,force_n",
+               comments="")
+    return {"slope_n_per_m": found.slope, "slope_interval_n_per_m": list(found.interval),
+            "contact_m": found.contact, "contact_seen": found.contact_seen,
+            "baseline_n": found.baseline, "stiffening": found.stiffening,
+            "slips_m": list(found.slips), "slope_before_slip_n_per_m": found.slope_before_slip,
+            "return_slope_n_per_m": found.return_slope, "energy_lost": found.energy_lost,
+            "frame_count": len(force), "why_no_modulus": WHY_NO_MODULUS}
+
+
+def _import_motion(chosen: RecordingFormat, request: ImportRequest) -> dict[str, Any]:
+    is_whole = chosen.holds == "pull"
+    pull = _read(chosen, request) if is_whole else _assembled(chosen, request)
+    if not (request.folder / "pull.toml").exists():
+        write_pull(request.folder, pull)
+    cleaned = clean(pull)
+    for message in cleaned.warnings:
+        request.progress.warn(message)
+    entry, seen = pull.entry, cleaned.observations
+    if not is_whole and request.settings.time_offset is None and seen is not None:
+        entry = _with_offset(cleaned, seen.times, request)
+        write_entry(request.folder / "pull.toml", entry)
+    return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
+            "point_count": seen.point_count if seen is not None else 0,
+            "time_offset_s": entry.time_offset_s}
+
+
+def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEntry:
+    """The pull's entry with the clocks' offset, as far as the recording tells it.
+
+    Args:
+        seen: Times of the observations [s].
+    """
+    offset = 0.0
+    if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
+        offset = float(pull.times[0] - seen[0])
+        request.progress.warn(
+            f"{pull.name}: the two clocks have no moment in common; the recordings were taken to "
+            "start together, and the offset was estimated from there.")
+    entry = pull.entry.model_copy(update={"time_offset_s": offset})
+    found, sigma = estimate_offset(replace(pull, entry=entry))
+    if sigma < 0.02:
+        return entry.model_copy(update={"time_offset_s": found})
+    request.progress.warn(
+        f"{pull.name}: the clocks' offset cannot be told from this pull; {offset:g} s was taken.")
+    return entry
+
+
+def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
+    """The pull of what was seen of the branch, or of the robot's log, and the robot's table."""
+    found, settings = _read(chosen, request), request.settings
+    observations: Observations | None = None
+    rest: np.ndarray | None = None
+    messages: list[str] = []
+    if chosen.holds == "markers":
+        observations, rest, messages = _seen(*found, request)
+    elif chosen.holds != "robot":
+        messages = found
+    robot: Stream = found if chosen.holds == "robot" else _gripper(request)
+    poses, wrenches = (np.ascontiguousarray(part) for part in np.hsplit(robot.values, 2))
+    entry = request.entry(
+        "none" if chosen.holds == "robot" else chosen.holds, rest, drive=settings.drive,
+        mode=settings.grasp_mode, sigma=settings.position_sigma or 1e-3,
+        grasp=request.grasp_or(lambda: poses[np.isfinite(poses).all(axis=1)][0]))
+    require_on_branch(entry.grasp, request.name, request.branch.nodes)
+    pull = Pull(request.name, entry, robot.times, poses, wrenches, observations,
+                (*messages, *robot.warnings))
+    return of_known_robot(pull, request) if chosen.holds == "robot" else pull
+
+
+def _gripper(request: ImportRequest) -> Stream:
+    if request.settings.robot is None:
+        raise InputError("No robot table was given.",
+                         "A pull needs what the gripper did: pose, and force where measured.",
+                         "Give it with --robot ROBOT.csv; a hung weight with --weight.")
+    return read_robot(Path(request.settings.robot), request)
+
+
+def _seen(stream: Stream, labels: list[str], request: ImportRequest,
+          ) -> tuple[Observations, np.ndarray | None, list[str]]:
+    """Markers [m], their places at rest where those are given, and warnings."""
+    seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
+    placed = request.registered(seen.positions[0], labels)
+    if placed is None:
+        return seen, None, list(stream.warnings)
+    moved = placed.apply(seen.positions[:, placed.used])
+    return (replace(seen, positions=moved), moved[0],
+            [*stream.warnings, *placed.warnings])

@@ -1,0 +1,115 @@
+"""What recognises and reads the recordings that are no bags: folders, tables, logs."""
+
+import re
+import shutil
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.files.safe_names import refuse_links
+from limber.recordings.force_slope import read_force_displacement
+from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into
+from limber.recordings.importing.import_request import ImportRequest
+from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, Pull, read_pull
+from limber.recordings.tables import (
+    Title,
+    is_robot_table,
+    marker_stream,
+    read_table,
+    robot_stream,
+    split_title,
+    with_columns,
+)
+from limber.recordings.time_series import Stream
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Whether it is a folder of rosbag2."""
+    return (path / "metadata.yaml").is_file()
+
+
+def is_pull(path: Path) -> bool:
+    """Whether it is a folder in the pull format."""
+    return (path / "pull.toml").exists()
+
+
+def read_folder(path: Path, request: ImportRequest) -> Pull:
+    """Copy a folder in the pull format and read it."""
+    refuse_links(path)
+    shutil.copytree(path, request.folder, dirs_exist_ok=True)
+    return read_pull(request.folder)
+
+
+def has_depth(path: Path) -> bool:
+    """Whether it is a folder of depth images."""
+    return (path / "depth").is_dir()
+
+
+def read_rgbd(path: Path, request: ImportRequest) -> list[str]:
+    """Copy a folder of depth images; return warnings."""
+    return copy_rgbd(path, request.folder, request.settings, request.progress)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether it is a folder, which may hold clouds."""
+    return path.is_dir()
+
+
+def read_clouds(path: Path, request: ImportRequest) -> list[str]:
+    """Copy a folder of clouds; return warnings."""
+    return copy_clouds(path, request.folder, request.settings, request.progress)
+
+
+def is_force_table(path: Path) -> bool:
+    """Whether it is a table of displacement and force."""
+    names = [title.name.lower() for title in _titles(path)]
+    moved = any(re.search(r"displacement|travel|stroke|deflection", name) for name in names)
+    return moved and any(re.search(r"force|load", name) for name in names)
+
+
+def read_force_table(path: Path, request: ImportRequest,
+                     ) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return displacements [m], forces [N] and warnings."""
+    return read_force_displacement(path, unit=request.settings.unit,
+                                   force_unit=request.settings.force_unit)
+
+
+def is_robot_log(path: Path) -> bool:
+    """Whether it is a table of a gripper's position and force."""
+    return is_robot_table(_titles(path))
+
+
+def read_robot(path: Path, request: ImportRequest) -> Stream:
+    """Return the gripper's poses and the wrenches about them, in the branch's frame."""
+    settings = request.settings
+    robot = robot_stream(path, settings.force_unit, settings.rate_hz)
+    stream = with_columns(robot, POSE_COLUMNS + WRENCH_COLUMNS)
+    if settings.frame_pose is None:
+        return stream
+    moved = moved_into(settings.frame_pose, stream.values[:, :6], stream.values[:, 6:])
+    return Stream(stream.times, np.hstack(moved), stream.columns, stream.warnings)
+
+
+def is_file(path: Path) -> bool:
+    """Whether it is a file: a table, if it is nothing else."""
+    return path.is_file()
+
+
+def read_markers(path: Path, request: ImportRequest) -> tuple[Stream, list[str]]:
+    """Return tracks of markers [m], and their labels."""
+    return marker_stream(path, request.settings.unit, request.settings.rate_hz)
+
+
+def _titles(path: Path) -> list[Title]:
+    return _titles_of(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _titles_of(path: Path, _changed: int) -> list[Title]:
+    """The columns of a table, of which several formats ask; none where it is no table."""
+    try:
+        return [split_title(title) for title in read_table(path).titles]
+    except InputError:
+        return []
