@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
+from limber.recordings.robot_tables import robot_stream
 from limber.recordings.tables import (
     marker_stream,
     read_table,
-    robot_stream,
     same_label,
     split_title,
     time_stream,

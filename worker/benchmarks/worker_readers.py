@@ -412,7 +412,8 @@ def _rtde(_template: Path, folder: Path) -> list[Path]:
 
 def _log(_template: Path, path: Path) -> Any:
     """A robot's log up to the pull that is made of it."""
-    from limber.recordings.tables import is_robot_table, read_table, robot_stream, split_title
+    from limber.recordings.robot_tables import is_robot_table, robot_stream
+    from limber.recordings.tables import read_table, split_title
 
     return is_robot_table([split_title(title) for title in read_table(path).titles]), robot_stream(
         path)

@@ -6,14 +6,14 @@ Stamp" and count it in milliseconds; here they become streams in SI units, at th
 """
 
 import re
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from limber.core.constants import FORCE_UNITS_N
 from limber.core.errors import InputError
-from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
 from limber.recordings.time_series import Stream, in_order
 
 LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "metres": 1.0,
@@ -27,6 +27,8 @@ TIME_UNITS_S = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0
 ANGLE_UNITS_RAD = {"rad": 1.0, "deg": np.pi / 180}
 TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
 
+_UNITS = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
+                                    *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
 _TIME_NAME = r"t|time|times|timestamp|timestamps|elapsed|elapsedtime|clock"
 _EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
 
@@ -90,10 +92,8 @@ def split_title(title: str) -> Title:
     bracket = re.search(r"[(\[]\s*([^)\]]*)\s*[)\]]\s*$", title)
     if bracket:
         return Title(title[:bracket.start()].strip(), bracket.group(1).strip() or None)
-    units = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
-                                       *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
     head, _, tail = title.strip().rpartition("_")
-    if head and tail.lower() in units:
+    if head and tail.lower() in _UNITS:
         return Title(head, tail)
     return Title(title.strip(), None)
 
@@ -166,132 +166,52 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     Raises:
         InputError: no marker has all three coordinates.
     """
-    table = read_table(path)
-    stream = time_stream(table, rate_hz)
-    places: dict[str, dict[str, int]] = {}
-    ignored = []
-    for column, title in enumerate(stream.columns):
-        named = split_title(title)
-        match = re.fullmatch(r"(.*?)[\s_.:\-]*([xyz])", named.name, re.IGNORECASE)
-        if match is None or re.search(r"rot|quat|angle", named.name, re.IGNORECASE):
-            ignored.append(title)
-            continue
-        places.setdefault(match.group(1).strip() or "m0", {})[match.group(2).lower()] = column
+    stream = time_stream(read_table(path), rate_hz)
+    places = _places(stream.columns)
     whole = {label: at for label, at in places.items() if set(at) == set("xyz")}
-    ignored += [stream.columns[k] for label, at in places.items() if label not in whole
-                for k in at.values()]
     if not whole:
         raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
                          "No marker has an x, a y and a z column.",
                          "Name them LABEL_x_m, LABEL_y_m, LABEL_z_m.")
-    values = np.empty((len(stream), 3 * len(whole)))
-    for number, at in enumerate(whole.values()):
-        for axis, letter in enumerate("xyz"):
-            named = split_title(stream.columns[at[letter]])
-            scale = (LENGTH_UNITS_M[unit] if unit else
-                     scale_of(named, LENGTH_UNITS_M, "m", Path(path)))
-            values[:, 3 * number + axis] = stream.values[:, at[letter]] * scale
-    # Motion capture writes (0, 0, 0) for a marker that it does not see.
-    positions = values.reshape(len(values), -1, 3)
-    positions[np.all(positions == 0.0, axis=2)] = np.nan
+    used = [at[letter] for at in whole.values() for letter in "xyz"]
+    scales = [LENGTH_UNITS_M[unit] if unit else
+              scale_of(split_title(stream.columns[k]), LENGTH_UNITS_M, "m", Path(path))
+              for k in used]
+    halves = [k for label, at in places.items() if label not in whole for k in at.values()]
+    named = {k for at in places.values() for k in at.values()}
+    ignored = [title for k, title in enumerate(stream.columns) if k not in named]
+    ignored += [stream.columns[k] for k in halves]
     warnings = list(stream.warnings)
     if ignored:
         warnings.append(f"{Path(path).name}: columns not used: {', '.join(ignored)}.")
-    columns = tuple(f"m{k}_{axis}_m" for k in range(len(whole)) for axis in "xyz")
-    return Stream(stream.times, values, columns, tuple(warnings)), list(whole)
+    positions = (stream.values[:, used] * scales).reshape(len(stream), -1, 3)
+    return marker_tracks(stream.times, positions, warnings), list(whole)
 
 
-_POSE_ALIASES = {
-    "x_m": ("x", "px", "posx", "positionx", "tcpx", "actualtcppose0"),
-    "y_m": ("y", "py", "posy", "positiony", "tcpy", "actualtcppose1"),
-    "z_m": ("z", "pz", "posz", "positionz", "tcpz", "actualtcppose2"),
-    "rx_rad": ("rx", "rotx", "rotvecx", "tcprx", "actualtcppose3"),
-    "ry_rad": ("ry", "roty", "rotvecy", "tcpry", "actualtcppose4"),
-    "rz_rad": ("rz", "rotz", "rotvecz", "tcprz", "actualtcppose5"),
-    "fx_n": ("fx", "forcex", "tcpfx", "actualtcpforce0"),
-    "fy_n": ("fy", "forcey", "tcpfy", "actualtcpforce1"),
-    "fz_n": ("fz", "forcez", "tcpfz", "actualtcpforce2"),
-    "tx_nm": ("tx", "mx", "torquex", "actualtcpforce3"),
-    "ty_nm": ("ty", "my", "torquey", "actualtcpforce4"),
-    "tz_nm": ("tz", "mz", "torquez", "actualtcpforce5"),
-}
+def _places(titles: Sequence[str]) -> dict[str, dict[str, int]]:
+    """The columns of each marker's coordinates, by its label and by x, y and z."""
+    places: dict[str, dict[str, int]] = {}
+    for column, title in enumerate(titles):
+        name = split_title(title).name
+        match = re.fullmatch(r"(.*?)[\s_.:\-]*([xyz])", name, re.IGNORECASE)
+        if match and not re.search(r"rot|quat|angle", name, re.IGNORECASE):
+            places.setdefault(match.group(1).strip() or "m0", {})[match.group(2).lower()] = column
+    return places
 
 
-def robot_stream(path: str | Path, force_unit: str | None = None,
-                 rate_hz: float | None = None) -> Stream:
-    """Read a robot's table: columns x_m .. rz_rad, fx_n .. tz_nm as far as they are there.
-
-    Known are our own names, those of UR's RTDE (``actual_TCP_pose_0``, ...), and short ones with
-    a unit; a rotation may be a quaternion qx, qy, qz, qw.
+def marker_tracks(times: np.ndarray, positions: np.ndarray, warnings: Sequence[str] = (),
+                  ) -> Stream:
+    """Return tracks of markers as a stream: ``m0_x_m``, ``m0_y_m``, ``m0_z_m``, ``m1_x_m``, ...
 
     Args:
-        path: The file.
-        force_unit: Of the forces (torques: times metres); None takes the titles' own.
-        rate_hz: Samples a second where there is no column of times.
-
-    Raises:
-        InputError: the position of the gripper is missing.
+        times: [s], shape [n].
+        positions: [m], shape [n, m, 3]. Motion capture writes (0, 0, 0) for a marker that it does
+            not see, or NaN.
+        warnings: What was wrong with the file.
     """
-    table = read_table(path)
-    stream = time_stream(table, rate_hz)
-    titles = [split_title(title) for title in stream.columns]
-    values, warnings = {}, list(stream.warnings)
-    for name, aliases in _POSE_ALIASES.items():
-        at = next((k for k, title in enumerate(titles) if title.plain in aliases), None)
-        if at is not None:
-            values[name] = stream.values[:, at] * _robot_scale(name, titles[at], force_unit,
-                                                               Path(path))
-    missing = [name for name in POSE_COLUMNS[:3] if name not in values]
-    if missing:
-        raise InputError(f"{path} lacks {', '.join(missing)}.",
-                         "The gripper's pose in the branch's frame is needed.",
-                         f"Columns: t_s, {', '.join(POSE_COLUMNS + WRENCH_COLUMNS)}.")
-    _add_rotation(values, titles, stream, warnings)
-    names = tuple(name for name in _POSE_ALIASES if name in values)
-    return Stream(stream.times, np.column_stack([values[name] for name in names]), names,
-                  tuple(warnings))
-
-
-def is_robot_table(titles: list[Title]) -> bool:
-    """Return whether columns tell a gripper's position and force, as a robot's log does."""
-    plain = {title.plain for title in titles}
-    return all(plain & set(_POSE_ALIASES[name]) for name in (*POSE_COLUMNS[:3],
-                                                             *WRENCH_COLUMNS[:3]))
-
-
-def _robot_scale(name: str, title: Title, force_unit: str | None, path: Path) -> float:
-    if name.endswith("_rad"):
-        return scale_of(title, ANGLE_UNITS_RAD, "rad", path)
-    if name.endswith("_nm"):
-        if force_unit:
-            return FORCE_UNITS_N[force_unit]
-        return scale_of(title, TORQUE_UNITS_NM, "Nm", path)
-    if name.endswith("_n"):
-        if force_unit:
-            return FORCE_UNITS_N[force_unit]
-        return scale_of(title, FORCE_NAMES_N, "N", path)
-    return scale_of(title, LENGTH_UNITS_M, "m", path)
-
-
-def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: Stream,
-                  warnings: list[str]) -> None:
-    from scipy.spatial.transform import Rotation
-
-    if all(name in values for name in POSE_COLUMNS[3:]):
-        return
-    at = {title.plain: k for k, title in enumerate(titles)}
-    if all(name in at for name in ("qx", "qy", "qz", "qw")):
-        quaternion = stream.values[:, [at["qx"], at["qy"], at["qz"], at["qw"]]]
-        # One of length 0 is no turn.
-        length = np.linalg.norm(quaternion, axis=1)
-        known = np.isfinite(length) & (length > 1e-6)
-        turns = np.full((len(stream), 3), np.nan)
-        turns[known] = Rotation.from_quat(quaternion[known]).as_rotvec()
-    else:
-        warnings.append("The robot's table has no rotation: the gripper is taken not to turn. "
-                        "Right for a grasp that is pinned (--grasp-mode pinned).")
-        turns = np.zeros((len(stream), 3))
-    values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
+    seen = np.where(np.all(positions == 0.0, axis=2)[..., None], np.nan, positions)
+    columns = tuple(f"m{k}_{axis}_m" for k in range(positions.shape[1]) for axis in "xyz")
+    return Stream(times, seen.reshape(len(times), -1), columns, tuple(warnings))
 
 
 def same_label(one: str, other: str) -> bool:
@@ -386,10 +306,8 @@ def _is_named(row: list[str]) -> bool:
 
 
 def _units(row: list[str]) -> list[str] | None:
-    known = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
-                                       *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
     bare = [part.strip("()[] ") for part in row]
-    return bare if all(not part or part.lower() in known for part in bare) else None
+    return bare if all(not part or part.lower() in _UNITS for part in bare) else None
 
 
 def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool) -> np.ndarray:
@@ -426,11 +344,3 @@ def _suspicious_clock(path: Path, times: np.ndarray) -> list[str]:
         return []
     return [f"{path.name}: time names no unit and steps by {step:g}; it was taken in seconds. "
             "If it counts milliseconds, call the column t_ms."]
-
-
-def with_columns(stream: Stream, names: tuple[str, ...]) -> Stream:
-    """Return the stream with these columns in this order; absent ones are NaN."""
-    empty = np.full(len(stream), np.nan)
-    values = [stream.values[:, stream.columns.index(name)] if name in stream.columns else empty
-              for name in names]
-    return replace(stream, values=np.column_stack(values), columns=names)

@@ -96,14 +96,6 @@ class Registry(Generic[Kind]):
                                   f"({type(error).__name__}: {error}).", stacklevel=2)
         return iter(tuple(self.formats))
 
-    def suffixes(self) -> tuple[str, ...]:
-        """Return the suffixes that are read, sorted."""
-        return suffixes_of(self.readers())
-
-    def listed(self) -> str:
-        """Return the suffixes that are read and what they stand for, as a text for people."""
-        return listed(self.readers())
-
     def of(self, path: Path) -> Kind:
         """Return the format of a file by its suffix, else by its content.
 
@@ -113,16 +105,16 @@ class Registry(Generic[Kind]):
         return known_format(path, self.what, self.readers())
 
     def read(self, path: Path, **options: Any) -> Any:
-        """Return what a file holds.
-
-        Raises:
-            InputError: its format is not known, or it cannot be read. MissingDependencyError: its
-                format needs a package that is not installed.
-        """
+        """Return what a file holds; raises as :meth:`of` and :meth:`read_as`."""
         return self.read_as(self.of(path), path, **options)
 
     def read_as(self, chosen: Format, path: Path, **options: Any) -> Any:
-        """Return what a file holds that is of this format; see :meth:`read`."""
+        """Return what a file of this format holds.
+
+        Raises:
+            InputError: it cannot be read. MissingDependencyError: that needs a package that is not
+                installed.
+        """
         try:
             return self._read(chosen, path, options)
         except (LimberError, MemoryError):
@@ -159,21 +151,23 @@ class Registry(Generic[Kind]):
 
 
 def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
-    """Return the format of a path among these.
+    """Return the format of a path that shall hold ``what``, among these.
 
     The suffix says it. Where several have it, or none, the content does; of several, one that does
     not look at the content takes what no other recognises.
 
-    Args:
-        what: What the file holds, for messages.
-
     Raises:
         InputError: none is known.
     """
-    found = _format_of(path, formats)
-    if found is None:
+    named = [one for one in formats if path.suffix.lower() in one.suffixes]
+    plain = [one for one in named if one.recognises is None or len(named) == 1]
+    if len(named) != 1 and path.exists():
+        for one in named if plain else (*named, *formats):
+            if one.recognises is not None and loaded(one.recognises)(path):
+                return one
+    if not plain:
         raise unknown_suffix(path, formats, f"Export the {what} as one of these.")
-    return found
+    return plain[0]
 
 
 def unknown_suffix(path: Path, formats: Iterable[Format], fix: str) -> InputError:
@@ -194,18 +188,6 @@ def listed(formats: Iterable[Format]) -> str:
         told.setdefault(" ".join(one.suffixes), []).extend([one.about] if one.about else [])
     return "; ".join(f"{suffixes} ({', '.join(abouts)})" if suffixes and abouts
                      else suffixes or ", ".join(abouts) for suffixes, abouts in told.items())
-
-
-def _format_of(path: Path, known: Sequence[Kind]) -> Kind | None:
-    named = [one for one in known if path.suffix.lower() in one.suffixes]
-    if len(named) == 1:
-        return named[0]
-    plain = [one for one in named if one.recognises is None]
-    if path.exists():
-        for one in named if plain else (*named, *known):
-            if one.recognises is not None and loaded(one.recognises)(path):
-                return one
-    return plain[0] if plain else None
 
 
 def head_of(path: Path, count: int) -> bytes:

@@ -11,10 +11,10 @@ from limber.recordings.bags.bag_pull import pull_of_bag
 from limber.recordings.bags.bag_reader import LIMBER, Bag, read_bag
 from limber.recordings.importing.import_request import (
     ImportRequest,
+    of_known_robot,
     require_near,
     require_on_branch,
 )
-from limber.recordings.importing.robot_knowledge import of_known_robot
 from limber.recordings.recording import Observations, Pull, PullEntry, entry_of_text
 from limber.recordings.time_series import MAD_TO_SIGMA
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.recordings.tables import LENGTH_UNITS_M
+from limber.recordings.tables import LENGTH_UNITS_M, marker_tracks
 from limber.recordings.time_series import Stream
 
 
@@ -42,8 +42,5 @@ def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: objec
         raise InputError(f"{path} has {rate:g} frames a second, or places that are not finite.",
                          "Without times and places there is no motion.", "Export it again.")
     positions = np.moveaxis(points, 0, -1).transpose(1, 0, 2) * scale
-    # An unseen marker is written as (0, 0, 0) by many programs, as NaN by others.
-    positions[np.all(positions == 0.0, axis=2)] = np.nan
     times = np.arange(len(positions)) / rate
-    names = tuple(f"m{k}_{axis}_m" for k in range(positions.shape[1]) for axis in "xyz")
-    return Stream(times, positions.reshape(len(times), -1), names), labels[:positions.shape[1]]
+    return marker_tracks(times, positions), labels[:positions.shape[1]]

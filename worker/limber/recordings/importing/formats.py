@@ -1,6 +1,7 @@
 """The registry of formats of recordings; what reads them is imported when it is needed."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from limber.geometry.io.formats import Format, Registry
@@ -27,21 +28,21 @@ class RecordingFormat(Format):
 
 RECORDINGS = Registry("recording", "limber.recordings", [
     RecordingFormat("bag", (".mcap", ".db3", ".bag"), f"{_HERE}.bag_import:read_bag_pull",
-                    recognises=f"{_READERS}:is_bag_folder", holds="pull",
+                    recognises=lambda path: (path / "metadata.yaml").is_file(), holds="pull",
                     about="bag of ROS, also as a folder"),
-    RecordingFormat("pull", (), f"{_READERS}:read_folder", recognises=f"{_READERS}:is_pull",
-                    holds="pull", about="pull of Limber"),
-    RecordingFormat("rgbd", (), f"{_READERS}:read_rgbd", recognises=f"{_READERS}:has_depth",
-                    holds="depth", about="RGB-D folder"),
-    RecordingFormat("clouds", (), f"{_READERS}:read_clouds", recognises=f"{_READERS}:is_folder",
-                    holds="clouds", about="folder of clouds"),
+    RecordingFormat("pull", (), f"{_READERS}:read_folder", holds="pull", about="pull of Limber",
+                    recognises=lambda path: (path / "pull.toml").exists()),
+    RecordingFormat("rgbd", (), f"{_READERS}:read_rgbd", holds="depth", about="RGB-D folder",
+                    recognises=lambda path: (path / "depth").is_dir()),
+    RecordingFormat("clouds", (), f"{_READERS}:read_clouds", holds="clouds",
+                    recognises=Path.is_dir, about="folder of clouds"),
     RecordingFormat("c3d", (".c3d",), f"{_HERE}.c3d:c3d_arrays", isolated=True, about="markers"),
     RecordingFormat("force-displacement", _TABLES, f"{_READERS}:read_force_table",
                     recognises=f"{_READERS}:is_force_table", holds="force", about="force table"),
-    RecordingFormat("robot", _TABLES, f"{_READERS}:read_robot",
-                    recognises=f"{_READERS}:is_robot_log", holds="robot", about="RTDE log"),
-    RecordingFormat("markers", _TABLES, f"{_READERS}:read_markers",
-                    recognises=f"{_READERS}:is_file", about="markers"),
+    RecordingFormat("robot", _TABLES, f"{_READERS}:read_robot", holds="robot", about="RTDE log",
+                    recognises=f"{_READERS}:is_robot_log"),
+    RecordingFormat("markers", _TABLES, f"{_READERS}:read_markers", about="markers",
+                    recognises=Path.is_file),
 ], of_arrays=f"{_HERE}.c3d:markers_of_arrays")
 """Arrays that a format reads are markers, as :func:`.c3d.c3d_arrays` gives them."""
 

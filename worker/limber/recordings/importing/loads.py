@@ -45,8 +45,9 @@ def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
                          "the place of rest.")
 
 
-def import_load(stream: Stream, labels: list[str], request: ImportRequest) -> dict[str, Any]:
+def import_load(read: tuple[Stream, list[str]], request: ImportRequest) -> dict[str, Any]:
     """Make a pull of marker tracks of a branch under a load, and say what it comes to."""
+    stream, labels = read
     for message in stream.warnings:
         request.progress.warn(message)
     seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))

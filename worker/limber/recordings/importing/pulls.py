@@ -9,17 +9,14 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope
 from limber.recordings.importing.formats import RECORDINGS, RecordingFormat, recording_format
-from limber.recordings.importing.import_request import ImportRequest, require_on_branch
+from limber.recordings.importing.import_request import (
+    ImportRequest,
+    of_known_robot,
+    require_on_branch,
+)
 from limber.recordings.importing.loads import import_load, require_loadable
 from limber.recordings.importing.readers import read_robot
-from limber.recordings.importing.robot_knowledge import of_known_robot
-from limber.recordings.recording import (
-    Observations,
-    Pull,
-    PullEntry,
-    write_entry,
-    write_pull,
-)
+from limber.recordings.recording import Observations, Pull, PullEntry, write_entry, write_pull
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import estimate_offset
 from limber.recordings.time_series import Stream
@@ -43,10 +40,10 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
     request.progress(0.1, f"reading {kind}")
     chosen, settings = recording_format(kind), request.settings
     if chosen.holds == "force":
-        return _import_force(*_read(chosen, request), request)
+        return _import_force(_read(chosen, request), request)
     if settings.weight is not None or settings.load is not None:
         require_loadable(chosen, request)
-        return import_load(*_read(chosen, request), request)
+        return import_load(_read(chosen, request), request)
     return _import_motion(chosen, replace(request, progress=request.progress.part(0.1, 1.0)))
 
 
@@ -54,8 +51,9 @@ def _read(chosen: RecordingFormat, request: ImportRequest) -> Any:
     return RECORDINGS.read_as(chosen, request.source, request=request)
 
 
-def _import_force(displacement: np.ndarray, force: np.ndarray, warnings: list[str],
-                  request: ImportRequest) -> dict[str, Any]:
+def _import_force(read: tuple[np.ndarray, np.ndarray, tuple[str, ...]], request: ImportRequest,
+                  ) -> dict[str, Any]:
+    displacement, force, warnings = read
     found = force_slope(displacement, force, warnings=warnings)
     for message in found.warnings:
         request.progress.warn(message)
@@ -116,7 +114,7 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
     rest: np.ndarray | None = None
     messages: list[str] = []
     if chosen.holds == "markers":
-        observations, rest, messages = _seen(*found, request)
+        observations, rest, messages = _seen(found, request)
     elif chosen.holds != "robot":
         messages = found
     robot: Stream = found if chosen.holds == "robot" else _gripper(request)
@@ -139,9 +137,10 @@ def _gripper(request: ImportRequest) -> Stream:
     return read_robot(Path(request.settings.robot), request)
 
 
-def _seen(stream: Stream, labels: list[str], request: ImportRequest,
+def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
           ) -> tuple[Observations, np.ndarray | None, list[str]]:
     """Markers [m], their places at rest where those are given, and warnings."""
+    stream, labels = read
     seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
     placed = request.registered(seen.positions[0], labels)
     if placed is None:

@@ -13,26 +13,9 @@ from limber.recordings.force_slope import read_force_displacement
 from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, Pull, read_pull
-from limber.recordings.tables import (
-    Title,
-    is_robot_table,
-    marker_stream,
-    read_table,
-    robot_stream,
-    split_title,
-    with_columns,
-)
+from limber.recordings.robot_tables import is_robot_table, robot_stream, with_columns
+from limber.recordings.tables import Title, marker_stream, read_table, split_title
 from limber.recordings.time_series import Stream
-
-
-def is_bag_folder(path: Path) -> bool:
-    """Whether it is a folder of rosbag2."""
-    return (path / "metadata.yaml").is_file()
-
-
-def is_pull(path: Path) -> bool:
-    """Whether it is a folder in the pull format."""
-    return (path / "pull.toml").exists()
 
 
 def read_folder(path: Path, request: ImportRequest) -> Pull:
@@ -42,19 +25,9 @@ def read_folder(path: Path, request: ImportRequest) -> Pull:
     return read_pull(request.folder)
 
 
-def has_depth(path: Path) -> bool:
-    """Whether it is a folder of depth images."""
-    return (path / "depth").is_dir()
-
-
 def read_rgbd(path: Path, request: ImportRequest) -> list[str]:
     """Copy a folder of depth images; return warnings."""
     return copy_rgbd(path, request.folder, request.settings, request.progress)
-
-
-def is_folder(path: Path) -> bool:
-    """Whether it is a folder, which may hold clouds."""
-    return path.is_dir()
 
 
 def read_clouds(path: Path, request: ImportRequest) -> list[str]:
@@ -70,7 +43,7 @@ def is_force_table(path: Path) -> bool:
 
 
 def read_force_table(path: Path, request: ImportRequest,
-                     ) -> tuple[np.ndarray, np.ndarray, list[str]]:
+                     ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Return displacements [m], forces [N] and warnings."""
     return read_force_displacement(path, unit=request.settings.unit,
                                    force_unit=request.settings.force_unit)
@@ -90,11 +63,6 @@ def read_robot(path: Path, request: ImportRequest) -> Stream:
         return stream
     moved = moved_into(settings.frame_pose, stream.values[:, :6], stream.values[:, 6:])
     return Stream(stream.times, np.hstack(moved), stream.columns, stream.warnings)
-
-
-def is_file(path: Path) -> bool:
-    """Whether it is a file: a table, if it is nothing else."""
-    return path.is_file()
 
 
 def read_markers(path: Path, request: ImportRequest) -> tuple[Stream, list[str]]:

@@ -209,7 +209,8 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
     from limber.mechanics.dynamics.pose_table import PoseTable
     from limber.recordings.recording import POSE_COLUMNS
-    from limber.recordings.tables import read_table, robot_stream, time_column, with_columns
+    from limber.recordings.robot_tables import robot_stream, with_columns
+    from limber.recordings.tables import read_table, time_column
 
     table = read_table(path)
     timed = time_column(table) is not None

@@ -13,6 +13,7 @@ from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
+from limber.geometry.io.formats import listed
 from limber.recordings.importing.formats import RECORDINGS, recording_format
 from limber.recordings.settings import ImportSettings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, required
@@ -31,7 +32,7 @@ class ImportInputs(BranchInputs):
     groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",),
                                "simulation": ("swing",)}
 
-    source: Path = argument(f"A recording: {RECORDINGS.listed()}.")
+    source: Path = argument(f"A recording: {listed(RECORDINGS.readers())}.")
     name: str = required("Name of the pull.", "pull-1")
     swing: bool = Field(
         False, description="The branch is released without a robot. Markers with --weight or "

@@ -9,6 +9,7 @@ from pydantic import Field
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
+from limber.geometry.io.formats import listed
 from limber.geometry.io.skeletons import SKELETONS, write_cylinders
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.settings import MeshSurfaceSettings
@@ -23,9 +24,9 @@ class MeshInputs(Settings):
     groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
 
     surface: Path = argument(
-        f"A closed surface: {SURFACES.listed()}; a .csv of sections along an axis from the end "
-        "that is held: x, y, z, width, height, and perhaps mass_kg, what hangs there; or a "
-        f"cylinder model: {SKELETONS.listed()}.")
+        f"A closed surface: {listed(SURFACES.readers())}; a .csv of sections along an axis from "
+        "the end that is held: x, y, z, width, height, and perhaps mass_kg, what hangs there; or "
+        f"a cylinder model: {listed(SKELETONS.readers())}.")
     output: Path = Field(description="The branch folder to make.",
                          json_schema_extra={"short": "-o", "example": "{stem}.branch"})
 

@@ -17,6 +17,7 @@ from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.geometry.io.clouds import CLOUDS, read_points
+from limber.geometry.io.formats import listed, suffixes_of
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, write_cylinders
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.inputs import RunOptions, argument
@@ -47,14 +48,16 @@ class ReconstructInputs(Settings):
     common = ("camera",)
 
     cloud: Path = argument(
-        f"A point cloud file ({' '.join(CLOUDS.suffixes())}), or a folder of them: then each "
-        "becomes a branch folder in the output folder, and a bad one does not stop the others.")
+        f"A point cloud file ({' '.join(suffixes_of(CLOUDS.readers()))}), or a folder of them: "
+        "then each becomes a branch folder in the output folder, and a bad one does not stop the "
+        "others.")
     output: Path = Field(
         description="The branch folder to make. With a folder of scans: where to make the branch "
                     "folders.",
         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
     skeleton: Path | None = Field(
-        None, description=f"Your own skeleton in the cloud's coordinates: {SKELETONS.listed()}.")
+        None, description="Your own skeleton in the cloud's coordinates: "
+        f"{listed(SKELETONS.readers())}.")
     edits: Path | None = Field(
         None, description="Edits of the skeleton (JSON, see `limber skeleton`). They stay in the "
         "branch folder, and each reconstruct without --skeleton applies them again.")
@@ -174,7 +177,7 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
         InputError: there is no scan.
         WorkError: all of them failed.
     """
-    known = CLOUDS.suffixes()
+    known = suffixes_of(CLOUDS.readers())
     paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in known)
     if not paths:
         raise InputError(f"{clouds} has no point clouds.", f"Known are: {' '.join(known)}.",

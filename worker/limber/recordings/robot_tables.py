@@ -1,0 +1,110 @@
+"""Tables of robots: the gripper's pose and wrench, whatever the columns are called."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.core.constants import FORCE_UNITS_N
+from limber.core.errors import InputError
+from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
+from limber.recordings.tables import (
+    ANGLE_UNITS_RAD,
+    FORCE_NAMES_N,
+    LENGTH_UNITS_M,
+    TORQUE_UNITS_NM,
+    Title,
+    read_table,
+    scale_of,
+    split_title,
+    time_stream,
+)
+from limber.recordings.time_series import Stream
+
+_ALIASES = {
+    **{f"{a}_m": (a, f"p{a}", f"pos{a}", f"position{a}", f"tcp{a}", f"actualtcppose{k}")
+       for k, a in enumerate("xyz")},
+    **{f"r{a}_rad": (f"r{a}", f"rot{a}", f"rotvec{a}", f"tcpr{a}", f"actualtcppose{k}")
+       for k, a in enumerate("xyz", 3)},
+    **{f"f{a}_n": (f"f{a}", f"force{a}", f"tcpf{a}", f"actualtcpforce{k}")
+       for k, a in enumerate("xyz")},
+    **{f"t{a}_nm": (f"t{a}", f"m{a}", f"torque{a}", f"actualtcpforce{k}")
+       for k, a in enumerate("xyz", 3)}}
+_UNITS = {"m": (LENGTH_UNITS_M, "m"), "rad": (ANGLE_UNITS_RAD, "rad"),
+          "n": (FORCE_NAMES_N, "N"), "nm": (TORQUE_UNITS_NM, "Nm")}
+
+
+def robot_stream(path: str | Path, force_unit: str | None = None,
+                 rate_hz: float | None = None) -> Stream:
+    """Read a robot's table: columns x_m .. rz_rad, fx_n .. tz_nm as far as they are there.
+
+    Known are our own names, those of UR's RTDE (``actual_TCP_pose_0``, ...), and short ones with
+    a unit; a rotation may be a quaternion qx, qy, qz, qw.
+
+    Args:
+        path: The file.
+        force_unit: Of the forces (torques: times metres); None takes the titles' own.
+        rate_hz: Samples a second where there is no column of times.
+
+    Raises:
+        InputError: the position of the gripper is missing.
+    """
+    table = read_table(path)
+    stream = time_stream(table, rate_hz)
+    titles = [split_title(title) for title in stream.columns]
+    values, warnings = {}, list(stream.warnings)
+    for name, aliases in _ALIASES.items():
+        at = next((k for k, title in enumerate(titles) if title.plain in aliases), None)
+        if at is not None:
+            values[name] = stream.values[:, at] * _scale(name, titles[at], force_unit, Path(path))
+    missing = [name for name in POSE_COLUMNS[:3] if name not in values]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}.",
+                         "The gripper's pose in the branch's frame is needed.",
+                         f"Columns: t_s, {', '.join(POSE_COLUMNS + WRENCH_COLUMNS)}.")
+    _add_rotation(values, titles, stream, warnings)
+    names = tuple(name for name in _ALIASES if name in values)
+    return Stream(stream.times, np.column_stack([values[name] for name in names]), names,
+                  tuple(warnings))
+
+
+def is_robot_table(titles: list[Title]) -> bool:
+    """Return whether columns tell a gripper's position and force, as a robot's log does."""
+    plain = {title.plain for title in titles}
+    return all(plain & set(_ALIASES[name]) for name in (*POSE_COLUMNS[:3],
+                                                             *WRENCH_COLUMNS[:3]))
+
+
+def _scale(name: str, title: Title, force_unit: str | None, path: Path) -> float:
+    kind = name.rpartition("_")[2]
+    if force_unit and kind in ("n", "nm"):
+        return FORCE_UNITS_N[force_unit]
+    return scale_of(title, *_UNITS[kind], path)
+
+
+def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: Stream,
+                  warnings: list[str]) -> None:
+    if all(name in values for name in POSE_COLUMNS[3:]):
+        return
+    at = {title.plain: k for k, title in enumerate(titles)}
+    if all(name in at for name in ("qx", "qy", "qz", "qw")):
+        quaternion = stream.values[:, [at["qx"], at["qy"], at["qz"], at["qw"]]]
+        # One of length 0 is no turn.
+        length = np.linalg.norm(quaternion, axis=1)
+        known = np.isfinite(length) & (length > 1e-6)
+        turns = np.full((len(stream), 3), np.nan)
+        turns[known] = Rotation.from_quat(quaternion[known]).as_rotvec()
+    else:
+        warnings.append("The robot's table has no rotation: the gripper is taken not to turn. "
+                        "Right for a grasp that is pinned (--grasp-mode pinned).")
+        turns = np.zeros((len(stream), 3))
+    values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
+
+
+def with_columns(stream: Stream, names: tuple[str, ...]) -> Stream:
+    """Return the stream with these columns in this order; absent ones are NaN."""
+    empty = np.full(len(stream), np.nan)
+    values = [stream.values[:, stream.columns.index(name)] if name in stream.columns else empty
+              for name in names]
+    return replace(stream, values=np.column_stack(values), columns=names)
