@@ -47,8 +47,6 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
     Raises:
         InputError: fewer than two files, or names without times and no rate.
     """
-    from plyfile import PlyData, PlyElement
-
     files = sorted(source.glob("*.ply"))
     if len(files) < 2:
         raise InputError(f"{source} has {len(files)} PLY files.",
@@ -63,11 +61,7 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
             # A frame that was being written when the recorder stopped.
             broken.append(file.name)
             continue
-        points = np.zeros(len(read), [("x", "f4"), ("y", "f4"), ("z", "f4")])
-        for axis, values in zip("xyz", read.T, strict=True):
-            points[axis] = values * scale
-        target = folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply"
-        PlyData([PlyElement.describe(points, "vertex")], byte_order="<").write(str(target))
+        write_frame(folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply", read * scale)
     if len(files) - len(broken) < 2:
         raise InputError(f"{source}: {len(broken)} of {len(files)} PLY files cannot be read.",
                          "Two frames are needed.", "Record it again.")
@@ -75,6 +69,16 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
         write_camera(folder / "camera.toml", read_camera(source / "camera.toml"))
     return [f"{len(broken)} PLY file(s) cannot be read, the first {broken[0]}; left out."
             ] if broken else []
+
+
+def write_frame(path: Path, points: np.ndarray) -> None:
+    """Write points [m], shape [n, 3], as a binary PLY file in single precision."""
+    from plyfile import PlyData, PlyElement
+
+    rows = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    for axis, values in zip("xyz", points.T, strict=True):
+        rows[axis] = values
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
 
 
 def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
@@ -92,20 +96,7 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
     Raises:
         InputError: no frames, no intrinsics, or a camera that moves.
     """
-    listed = _listed(source, "depth", settings)
-    if len(listed) < 2:
-        raise InputError(f"{source} has {len(listed)} depth images.",
-                         "Two frames are needed.", "Copy the whole folder.")
-    present = [(stamp, file) for stamp, file in listed if file.is_file()]
-    warnings = []
-    if len(present) < len(listed):
-        lost = next(file for _, file in listed if not file.is_file())
-        if len(present) < 0.5 * len(listed):
-            raise InputError(f"{source / 'depth.txt'} names {lost.name}, which is not there.",
-                             f"{len(listed) - len(present)} of {len(listed)} depth images are "
-                             "missing: the recording is incomplete.", "Copy the whole folder.")
-        warnings.append(f"{len(listed) - len(present)} of {len(listed)} depth images are missing, "
-                        f"the first {lost.name}; left out.")
+    present, warnings = _depth_images(source, settings)
     camera = _camera(source, present[0][1])
     camera, told = _placed(camera, source, present[0][0], present[-1][0])
     warnings += told
@@ -124,6 +115,21 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
         warnings.append(f"{len(present) - given} of {len(present)} frames have no mask; the "
                         "branch is found there by depth alone.")
     return warnings
+
+
+def _depth_images(source: Path, settings: Any) -> tuple[list[tuple[float, Path]], list[str]]:
+    """Time stamps [s] and files of the depth images that are there, and warnings."""
+    listed = _listed(source, "depth", settings)
+    if len(listed) < 2:
+        raise InputError(f"{source} has {len(listed)} depth images.",
+                         "Two frames are needed.", "Copy the whole folder.")
+    present = [(stamp, file) for stamp, file in listed if file.is_file()]
+    missing = f"{len(listed) - len(present)} of {len(listed)} depth images are missing"
+    lost = next((file.name for _, file in listed if not file.is_file()), "")
+    if len(present) < 0.5 * len(listed):
+        raise InputError(f"{source / 'depth.txt'} names {lost}, which is not there.",
+                         f"{missing}: the recording is incomplete.", "Copy the whole folder.")
+    return present, [f"{missing}, the first {lost}; left out."] if lost else []
 
 
 def tum_list(path: Path) -> list[tuple[float, str]]:

@@ -5,6 +5,7 @@ All give coordinates as the file has them, as float64, and keep normals, colours
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -83,8 +84,8 @@ def _read_vertices(path: Path) -> Cloud:
 
     mesh = trimesh.load(path, process=False)
     if isinstance(mesh, trimesh.Scene):
-        parts = [g.vertices for g in mesh.geometry.values()]
-        points = np.vstack(parts).astype(np.float64) if parts else np.empty((0, 3))
+        parts: list[Any] = list(mesh.geometry.values())
+        points = np.vstack([part.vertices for part in parts] or [np.empty((0, 3))]).astype(float)
     else:
         points = np.asarray(mesh.vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:

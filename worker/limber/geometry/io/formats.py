@@ -75,11 +75,7 @@ class Registry(Generic[Kind]):
     _is_complete: bool = False
 
     def register(self, added: Kind) -> None:
-        """Add a format.
-
-        Raises:
-            ValueError: there is one of that name.
-        """
+        """Add a format; ValueError if there is one of that name."""
         if any(one.name == added.name for one in self.formats):
             raise ValueError(f"There is a format {added.name!r} of a {self.what}.")
         self.formats.insert(0, added)
@@ -97,11 +93,7 @@ class Registry(Generic[Kind]):
         return iter(tuple(self.formats))
 
     def of(self, path: Path) -> Kind:
-        """Return the format of a file by its suffix, else by its content.
-
-        Raises:
-            InputError: none is known.
-        """
+        """Return the format of a file; see :func:`known_format`."""
         return known_format(path, self.what, self.readers())
 
     def read(self, path: Path, **options: Any) -> Any:

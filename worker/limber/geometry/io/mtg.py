@@ -106,7 +106,7 @@ class _Reader:
         self.path, self.scales, self.columns, self.features = path, scales, columns, features
         self.radius_column = next(name for name in features if name in _RADII)
         self.last: dict[int, _Vertex] = {}
-        self.nodes: list[tuple[float, float, float]] = []
+        self.nodes: list[tuple[float, ...]] = []
         self.parent: list[int] = []
         self.radius: list[float] = []
 

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def read_pcd(path: Path) -> Cloud:
     return Cloud.from_columns(columns, titles)
 
 
-def _stream(path: Path) -> tuple[io.BytesIO, dict[str, str]]:
+def _stream(path: Path) -> tuple[Any, dict[str, str]]:
     """A PCD file as its package reads it, and what the file calls fields of other names.
 
     Versions before 0.7 lack entries of the header; some programs end lines with blanks, or have

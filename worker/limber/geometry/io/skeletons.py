@@ -115,12 +115,7 @@ def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
         raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
                          f"A cylinder model has: {', '.join(names)}.",
                          "Rename the columns of your export.")
-    try:
-        table = np.array([[float(row[name]) for name in names] for row in rows])
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path} has a field that is not a number ({error}).",
-                         "All nine columns are numbers.", "Correct the file.") from error
-    return _tree_of(path, table, scale, rows)
+    return _tree_of(path, _numbers(path, rows, names), scale, rows)
 
 
 def _of_arrays(path: Path, read: dict[str, np.ndarray], *, scale: float | None = None) -> Skeleton:
@@ -149,8 +144,10 @@ def _tree_of(path: Path, table: np.ndarray, scale: float | None,
                          "A branch has exactly one root.", "Keep one tree in the file.")
     root = roots[0]
     nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
-    first = _number(path, rows[root].get("start_radius") or rows[root]["radius"]
-                    ) if rows else (table[:, 8] if start_radius is None else start_radius)[root]
+    if rows and rows[root].get("start_radius"):
+        first = _numbers(path, rows[root:root + 1], ["start_radius"])[0, 0]
+    else:
+        first = (table[:, 8] if start_radius is None else start_radius)[root]
     radius = np.concatenate([[first], table[:, 8]]) * scale
     hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
     fitted = _fitted_columns(path, rows, scale) if rows else {}
@@ -201,25 +198,21 @@ def _require_whole(path: Path, numbers: np.ndarray) -> None:
                          "Ids name the nodes.", "Correct the file.")
 
 
-def _number(path: Path, text: str) -> float:
+def _numbers(path: Path, rows: Sequence[dict[str, str]], names: Sequence[str]) -> np.ndarray:
+    """Columns of a table, shape [n, names]."""
     try:
-        return float(text)
-    except ValueError as error:
+        return np.array([[float(row[name]) for name in names] for row in rows])
+    except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
-                         "Radii are numbers.", "Correct the file.") from error
+                         f"{', '.join(names)} are numbers.", "Correct the file.") from error
 
 
-def _fitted_columns(path: Path, rows: list[dict[str, str]], scale: float,
+def _fitted_columns(path: Path, rows: Sequence[dict[str, str]], scale: float,
                     ) -> dict[str, np.ndarray]:
     names = ("radius_sigma", "radius_state", "probability")
     if any(name not in rows[0] for name in names):
         return {}
-    try:
-        sigma, state, probability = (np.array([float(row[name]) for row in rows])
-                                     for name in names)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path} has a field that is not a number ({error}).",
-                         f"{', '.join(names)} are numbers.", "Correct the file.") from error
+    sigma, state, probability = np.ascontiguousarray(_numbers(path, rows, names).T)
     if not (((sigma >= 0) & np.isfinite(sigma)).all()
             and np.isin(state, list(STATES.values())).all()
             and ((probability >= 0) & (probability <= 1)).all()):

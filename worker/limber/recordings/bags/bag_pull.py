@@ -13,7 +13,7 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, write_camera
 from limber.recordings.bags.bag_reader import Bag, Topic
 from limber.recordings.bags.transforms import Frames, Motion
-from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into
+from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into, write_frame
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, Observations
 from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream
@@ -293,8 +293,6 @@ def _frame_of(topic: Topic, base: str, placed: tuple[np.ndarray, Rotation], fram
 
 def _write_clouds(topic: Topic, times: np.ndarray, where: tuple[np.ndarray, Rotation],
                   folder: Path, settings: ImportSettings, progress: Progress) -> None:
-    from plyfile import PlyData, PlyElement
-
     counts = topic.counts
     ends = np.cumsum(counts) if counts is not None else np.empty(0, int)
     with tempfile.TemporaryDirectory(prefix="limber-bag-") as place:
@@ -302,11 +300,7 @@ def _write_clouds(topic: Topic, times: np.ndarray, where: tuple[np.ndarray, Rota
             points = topic.values[number] if counts is None else topic.values[
                 ends[number] - counts[number]:ends[number]]
             points = where[0] + where[1].apply(points[np.isfinite(points).all(axis=1)])
-            rows = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4")])
-            for axis, column in zip("xyz", points.T, strict=True):
-                rows[axis] = column
-            PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(
-                str(Path(place, f"{time:.6f}.ply")))
+            write_frame(Path(place, f"{time:.6f}.ply"), points)
         copy_clouds(Path(place), folder, settings.model_copy(update={"unit": "m"}), progress)
 
 

@@ -109,6 +109,17 @@ class _Growing:
     logged: list[float] = field(default_factory=list)
     values: list[np.ndarray] = field(default_factory=list)
 
+    def arrays(self, name: str) -> dict[str, np.ndarray]:
+        found = {"names": np.array(_SEPARATOR.join(part.replace(_SEPARATOR, "/") for part in (
+                    name, self.kind, self.frame, *self.labels))),
+                 "stamps": np.array(self.stamps), "logged": np.array(self.logged)}
+        if len({values.shape for values in self.values}) == 1:
+            return found | {"values": np.stack(self.values)}
+        if self.kind != "points":
+            raise ValueError(f"messages of {name} differ in shape")
+        return found | {"counts": np.array([len(values) for values in self.values]),
+                        "values": np.concatenate(self.values)}
+
 
 def bag_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return what a bag holds as flat arrays, for :func:`read_bag` on the other side."""
@@ -144,18 +155,7 @@ def bag_arrays(path: Path) -> dict[str, np.ndarray]:
         "others": np.array(others, "U200"), "points": np.zeros((0, 3)),
         "pull_toml": np.array(_pull_toml(path))}
     for number, (name, topic) in enumerate(found.items()):
-        arrays[f"{number}_names"] = np.array(_SEPARATOR.join(
-            part.replace(_SEPARATOR, "/") for part in (name, topic.kind, topic.frame,
-                                                       *topic.labels)))
-        arrays[f"{number}_stamps"] = np.array(topic.stamps)
-        arrays[f"{number}_logged"] = np.array(topic.logged)
-        if len({values.shape for values in topic.values}) > 1:
-            if topic.kind != "points":
-                raise ValueError(f"messages of {name} differ in shape")
-            arrays[f"{number}_counts"] = np.array([len(values) for values in topic.values])
-            arrays[f"{number}_values"] = np.concatenate(topic.values)
-        else:
-            arrays[f"{number}_values"] = np.stack(topic.values)
+        arrays |= {f"{number}_{key}": array for key, array in topic.arrays(name).items()}
     return arrays
 
 
