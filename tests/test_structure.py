@@ -249,7 +249,7 @@ def test_no_file_imports_itself_in_a_circle():
 
 
 # Lines between processes of ours, and lines that a killed program may have left half written.
-OWN_LINES = {"robot", "session", "core.processes", "batch.records", "store.lock",
+OWN_LINES = {"robot", "session", "core.processes", "core.json_lines", "batch.records", "store.lock",
              "estimation.fitting.evaluations",
              "geometry.tets.tetwild_process"}
 
