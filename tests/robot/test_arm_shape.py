@@ -9,12 +9,10 @@ from scipy.spatial.transform import Rotation
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.planning.constraints.obstacles import Box
-from limber.robot.cell.arm_shape import rods_of
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward
 from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 
 
@@ -22,10 +20,10 @@ from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 def test_rods_are_one_chain_from_the_shoulder_to_the_flange(name):
     arm = ARMS[name]
     joints = np.random.default_rng(4).uniform(-np.pi, np.pi, (40, 6))
-    rods = rods_of(arm, joints)
+    rods = arm.rods(joints)
     assert rods.starts[:, 1:] == pytest.approx(rods.ends[:, :-1], abs=1e-12)
     assert rods.starts[:, 0] == pytest.approx(np.tile([0, 0, arm.d[0]], (40, 1)), abs=1e-12)
-    flange = forward(arm, joints)
+    flange = arm.forward(joints)
     last = rods.ends[:, -1] + rods.radii[-1] * flange[:, :3, 2]
     assert last == pytest.approx(flange[:, :3, 3], abs=1e-12)
     lengths = np.linalg.norm(rods.ends - rods.starts, axis=2)
@@ -41,7 +39,7 @@ def test_tubes_lie_where_the_urdf_of_others_has_them(recorded_data):
         link.find("inertial/origin").get("xyz").split(), float)
         for link in root.findall("link") if link.find("inertial/origin") is not None}
     joints = np.random.default_rng(5).uniform(-np.pi, np.pi, 6)
-    rods = rods_of(ARMS["ur5"], joints[None])
+    rods = ARMS["ur5"].rods(joints[None])
     frame = np.eye(4)
     for joint, angle, link, rod in (("shoulder_pan", joints[0], None, None),
                                     ("shoulder_lift", joints[1], "upper_arm_link", 1),
@@ -78,7 +76,7 @@ def test_a_link_in_a_box_is_named_and_another_way_is_taken(tmp_path):
     free = cell_with()
     best = carried(free)
     base = matrices(np.array(BASE))
-    rods = rods_of(free.arm, best.joints.joints)
+    rods = free.arm.rods(best.joints.joints)
     middle = base @ np.r_[0.5 * (rods.starts[-1, 3] + rods.ends[-1, 3]), 1.0]
     cell = cell_with({"kind": "box", "name": "lamp", "size_m": (0.02, 0.02, 0.02),
                       "pose": (*map(float, middle[:3]), 0, 0, 0)})
@@ -94,7 +92,7 @@ def test_a_link_in_a_box_is_named_and_another_way_is_taken(tmp_path):
     # That one hangs its elbow below what the arm stands on: told of the table it is not taken.
     table = Box("table", np.array([2.0, 2.0, 0.1]), np.array([0.55, 0.1, -0.1]), np.eye(3))
     both = blocked_by(cell, (*cell_obstacles(cell, tmp_path), table))
-    lowest = [rods_of(cell.arm, motion.joints.joints).ends[..., 2].min()
+    lowest = [cell.arm.rods(motion.joints.joints).ends[..., 2].min()
               for motion in (other, carried(cell, blocked=both))]
     assert lowest[0] < 0.06 < lowest[1]
 

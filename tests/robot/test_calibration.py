@@ -12,9 +12,7 @@ from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.base_calibration import fit_base, touched_place
 from limber.robot.cell.cell import Cell, read_cell, write_cell
-from limber.robot.ur.kinematics import forward
-from limber.robot.ur.samples import Sample
-from limber.robot.virtual.controller import HOME
+from limber.robot.interface import Sample
 
 GRASP = (0.01, 0.0, 0.15, 0.0, 0.0, 0.3)
 BASE = np.array([0.6, -0.2, 0.1, 0.3, -0.4, 1.2])
@@ -30,7 +28,7 @@ def sample_with(tool: tuple[float, ...], joints: np.ndarray, *, tells_it: bool =
     """What the controller of an arm says whose links are millimetres off their nominal measures."""
     arm = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}).arm
     true = replace(arm, a=tuple(np.array(arm.a) * 1.004), d=tuple(np.array(arm.d) * 1.01))
-    pose = pose_of(forward(true, joints) @ matrices(np.array(tool)))
+    pose = pose_of(true.forward(joints) @ matrices(np.array(tool)))
     nothing = np.zeros(6)
     return Sample(1.0, 1.0, joints, nothing, pose, nothing, nothing, 7, 1, 2, 1.0,
                   np.array(tool) if tells_it else None)
@@ -41,18 +39,18 @@ def sample_with(tool: tuple[float, ...], joints: np.ndarray, *, tells_it: bool =
 def test_a_touched_place_is_the_controllers_own(tool, tells_it):
     """Links 2 to 4 mm longer than nominal: not a micrometre of that is left."""
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"grasp_pose": GRASP})
-    joints = np.array(HOME) + 0.1
+    joints = np.array(cell.arm.home) + 0.1
     true = sample_with(GRASP, joints).pose[:3]
     sample = sample_with(tool, joints, tells_it=tells_it)
     assert touched_place(cell, sample) == pytest.approx(true, abs=1e-9)
-    nominal = (forward(cell.arm, joints) @ matrices(np.array(GRASP)))[:3, 3]
+    nominal = (cell.arm.forward(joints) @ matrices(np.array(GRASP)))[:3, 3]
     assert np.linalg.norm(nominal - true) > 2e-3
 
 
 def test_a_pose_of_another_tool_is_refused():
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"grasp_pose": GRASP})
     with pytest.raises(InputError, match=r"tool.grasp_pose is at \(10, 0, 150\) mm"):
-        touched_place(cell, sample_with((0.0, 0.0, 0.2, 0, 0, 0), np.array(HOME)))
+        touched_place(cell, sample_with((0.0, 0.0, 0.2, 0, 0, 0), np.array(cell.arm.home)))
 
 
 @pytest.mark.parametrize("on_branch, told", [

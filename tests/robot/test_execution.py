@@ -19,7 +19,6 @@ from limber.robot.cell.compatibility import check_plan
 from limber.robot.motion.execution import across, followed, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward, inverse
 from limber.stages.paths.execute import (
     ExecuteOptions,
     ExecuteSettings,
@@ -95,7 +94,7 @@ def test_the_robot_holds_the_piece_along_the_whole_path():
                        part * [0.1, 0.2, -0.05]])
     forces = part * np.array([4.0, 1.0, 0.0])
     motion = robot_motion(cell, predicted(poses, forces), np.array([0, 0, 1.0]), speed=0.03)
-    flange = forward(cell.arm, motion.joints.joints)
+    flange = cell.arm.forward(motion.joints.joints)
     grasp = cell.grasp_frames(flange)
     first = len(motion.approach.times) - 1
     grip = inverted(matrices(poses[0])) @ grasp[first]
@@ -396,7 +395,7 @@ def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, arm
 def by_another_branch(joints: np.ndarray) -> np.ndarray:
     """The joints as far from these as they can be with the gripper at the same pose."""
     arm = ARMS["ur5e"]
-    others = inverse(arm, forward(arm, joints))
+    others = arm.inverse(arm.forward(joints))
     return others[np.argmax(np.abs(others - joints).max(axis=1))]
 
 

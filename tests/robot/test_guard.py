@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from limber.core.errors import SafetyStop
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
 from limber.robot.driver.guard import Guard, GuardSettings, State, Verdict
+from limber.robot.interface import Sample
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.samples import Sample
 
 ARM = ARMS["ur5e"]
 JOINTS = np.array([0.1, -1.57, 1.57, -1.57, -1.57, 0.0])

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, NoPathError
+from limber.robot.known_arms import arm_named
 from limber.robot.motion.joint_path import follow, joint_path
-from limber.robot.ur.arms import ARMS, arm_named
-from limber.robot.ur.kinematics import forward, inverse, jacobian, singularity_distance
+from limber.robot.ur.arms import ARMS
 
 
 def random_joints(count: int, seed: int = 11) -> np.ndarray:
@@ -28,13 +28,13 @@ def test_forward_and_every_inverse_branch_as_an_independent_library(name):
     library = getattr(pytest.importorskip("ur_analytic_ik"), name)
     arm = ARMS[name]
     joints = random_joints(1430)
-    frames = forward(arm, joints)
+    frames = arm.forward(joints)
     theirs = np.array([library.forward_kinematics(*row) for row in joints])
     assert np.abs(frames - theirs).max() < 1e-12
 
-    solutions = inverse(arm, frames)
+    solutions = arm.inverse(frames)
     exist = np.isfinite(solutions).all(axis=-1)
-    again = forward(arm, np.nan_to_num(solutions))
+    again = arm.forward(np.nan_to_num(solutions))
     assert np.abs(again - frames[:, None])[exist].max() < 1e-9
     assert np.nanmin(turns_apart(solutions, joints[:, None]), axis=1).max() < 1e-7
     for row in range(0, len(joints), 10):
@@ -58,18 +58,18 @@ def test_forward_as_the_urdf_of_others(recorded_data):
                             * Rotation.from_rotvec([0, 0, angle])).as_matrix()
             frame = frame @ step
         # Rotations are written with nine digits there.
-        assert np.abs(frame - forward(ARMS["ur5"], joints)).max() < 1e-8
+        assert np.abs(frame - ARMS["ur5"].forward(joints)).max() < 1e-8
 
 
 @pytest.mark.parametrize("name", ["ur5", "ur10e"])
 def test_jacobian_is_the_slope_of_forward(name):
     arm = ARMS[name]
     for joints in random_joints(20):
-        slopes, step = jacobian(arm, joints), 1e-6
+        slopes, step = arm.jacobian(joints), 1e-6
         for k in range(6):
             moved = np.tile(joints, (2, 1))
             moved[:, k] += (-step, step)
-            low, high = forward(arm, moved)
+            low, high = arm.forward(moved)
             turn = Rotation.from_matrix(high[:3, :3] @ low[:3, :3].T).as_rotvec()
             by_difference = np.concatenate([high[:3, 3] - low[:3, 3], turn]) / (2 * step)
             assert slopes[:, k] == pytest.approx(by_difference, abs=1e-8)
@@ -80,8 +80,8 @@ def test_singularity_factors_multiply_to_the_determinant(name):
     """det J is the product of the three distances, times a constant of the arm."""
     arm = ARMS[name]
     joints = random_joints(50)
-    ratio = np.abs(np.linalg.det(jacobian(arm, joints))) / singularity_distance(
-        arm, joints).prod(axis=-1)
+    ratio = np.abs(np.linalg.det(arm.jacobian(joints))) / arm.singularity_distance(
+        joints).prod(axis=-1)
     assert ratio == pytest.approx(np.full(50, abs(arm.a[1] * arm.a[2]) * arm.reach), rel=1e-9)
 
 
@@ -92,22 +92,22 @@ def test_inverse_keeps_its_digits_near_the_wrist_singularity(near, side, seed):
     arm = ARMS["ur5e"]
     joints = random_joints(1, seed)[0]
     joints[4] = side + near
-    frame = forward(arm, joints)
-    solutions = inverse(arm, frame, joints)
+    frame = arm.forward(joints)
+    solutions = arm.inverse(frame, joints)
     exist = np.isfinite(solutions).all(axis=-1)
     assert exist.any()
-    assert np.abs(forward(arm, solutions[exist]) - frame).max() < 1e-8
-    assert np.abs(forward(arm, solutions[exist])[..., :3, 3] - frame[:3, 3]).max() < 1e-9
+    assert np.abs(arm.forward(solutions[exist]) - frame).max() < 1e-8
+    assert np.abs(arm.forward(solutions[exist])[..., :3, 3] - frame[:3, 3]).max() < 1e-9
 
 
 def test_out_of_reach_has_no_solution():
     frame = np.eye(4)
     frame[0, 3] = 3.0
-    assert np.isnan(inverse(ARMS["ur5"], frame)).all()
+    assert np.isnan(ARMS["ur5"].inverse(frame)).all()
 
 
 def straight_path(arm, joints: np.ndarray, way: np.ndarray, count: int = 60) -> np.ndarray:
-    frames = np.tile(forward(arm, joints), (count, 1, 1))
+    frames = np.tile(arm.forward(joints), (count, 1, 1))
     frames[:, :3, 3] += np.linspace(0, 1, count)[:, None] * way
     return frames
 
@@ -118,7 +118,7 @@ def test_a_followed_branch_is_continuous_and_on_the_path():
     paths, refusals = follow(arm, frames)
     assert len(paths) + len(refusals) == 8 and paths
     for path in paths:
-        assert np.abs(forward(arm, path.joints) - frames).max() < 1e-9
+        assert np.abs(arm.forward(path.joints) - frames).max() < 1e-9
         assert np.abs(np.diff(path.joints, axis=0)).max() < 0.1
         assert path.limit_margin >= 0.05 and path.singularity >= 0.05
     assert paths[0].singularity == max(path.singularity for path in paths)
@@ -144,7 +144,7 @@ def test_a_path_out_of_reach_says_where_it_ends():
 def test_a_jump_between_poses_is_not_followed():
     arm = ARMS["ur5e"]
     joints = np.array([0.1, -1.4, 1.6, -1.8, -1.5, 1.0])
-    frames = forward(arm, np.array([joints, joints + [1.0, 0, 0, 0, 0, 0]]))
+    frames = arm.forward(np.array([joints, joints + [1.0, 0, 0, 0, 0, 0]]))
     with pytest.raises(NoPathError, match="jumps"):
         joint_path(arm, frames)
 

@@ -23,7 +23,7 @@ from limber.robot.driver.force_sensors import (
     open_sensor,
     parsed_message,
 )
-from limber.robot.ur.samples import Sample
+from limber.robot.interface import Sample
 
 TOOL = (0.02, -0.01, 0.15, 0.3, 0.1, -0.2)
 BASE = (0.6, 0.1, 0.0, 0.2, 0.1, 1.2)

@@ -7,19 +7,17 @@ from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.cell import Cell
+from limber.robot.interface import Sample
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.retreat import WayBack
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward, inverse
-from limber.robot.ur.samples import Sample
-from limber.robot.virtual.controller import HOME
 from limber.stages.pulls.record_path import there_and_back
 
 ARM = ARMS["ur5e"]
-JOINTS = np.array(HOME)
-POSE = pose_of(forward(ARM, JOINTS))
+JOINTS = np.array(ARM.home)
+POSE = pose_of(ARM.forward(JOINTS))
 
 
 def sample_at(pose: np.ndarray, joints: np.ndarray = JOINTS) -> Sample:
@@ -28,14 +26,14 @@ def sample_at(pose: np.ndarray, joints: np.ndarray = JOINTS) -> Sample:
 
 
 def test_where_it_stands_is_where_it_begins():
-    require_start(POSE, JOINTS + 0.02, POSE + [0.004, 0, 0, 0.01, 0, 0], JOINTS)
-    require_start(POSE, JOINTS, POSE, None)
+    require_start(POSE, JOINTS + 0.02, POSE + [0.004, 0, 0, 0.01, 0, 0], JOINTS, ARM.joint_names)
+    require_start(POSE, JOINTS, POSE, None, ARM.joint_names)
     with pytest.raises(SafetyStop, match=r"starts 20\.0 mm"):
-        require_start(POSE, JOINTS, POSE + [0, 0, 0.02, 0, 0, 0], JOINTS)
+        require_start(POSE, JOINTS, POSE + [0, 0, 0.02, 0, 0, 0], JOINTS, ARM.joint_names)
 
 
 def other_branches() -> list[np.ndarray]:
-    found = inverse(ARM, forward(ARM, JOINTS))
+    found = ARM.inverse(ARM.forward(JOINTS))
     return [joints for joints in found if np.isfinite(joints).all()
             and np.abs(np.angle(np.exp(1j * (joints - JOINTS)))).max() > 0.1]
 
@@ -46,7 +44,7 @@ def test_every_other_branch_at_the_same_pose_is_refused_with_both_values():
     for joints in branches:
         worst = int(np.abs(joints - JOINTS).argmax())
         with pytest.raises(SafetyStop) as stop:
-            require_start(POSE, joints, POSE, JOINTS)
+            require_start(POSE, joints, POSE, JOINTS, ARM.joint_names)
         told = str(stop.value)
         assert f"joint {worst + 1} (" in told
         assert f"is at {np.degrees(joints[worst]):.1f} degrees" in told
@@ -59,15 +57,15 @@ def test_a_whole_turn_is_another_configuration(joint, name):
     joints = JOINTS.copy()
     joints[joint] += 2 * np.pi
     with pytest.raises(SafetyStop, match=rf"\({name}\).*whole turns apart"):
-        require_start(POSE, joints, POSE, JOINTS)
+        require_start(POSE, joints, POSE, JOINTS, ARM.joint_names)
 
 
 @pytest.mark.parametrize("start_joints", [JOINTS, None])
 def test_a_turned_wrist_is_refused_with_both_values(start_joints):
     joints = JOINTS + np.r_[np.zeros(5), np.radians(50)]
-    pose = pose_of(forward(ARM, joints))
+    pose = pose_of(ARM.forward(joints))
     with pytest.raises(SafetyStop, match=r"turned by 50\.0 degrees.*rotation vector is \("):
-        require_start(pose, joints, POSE, start_joints)
+        require_start(pose, joints, POSE, start_joints, ARM.joint_names)
 
 
 def test_a_recorded_pull_is_checked_for_the_joints_it_begins_with():
@@ -76,7 +74,7 @@ def test_a_recorded_pull_is_checked_for_the_joints_it_begins_with():
     frames = np.array([matrices(POSE), matrices(POSE + [0, 0.03, 0, 0, 0, 0])])
     pull = there_and_back(cell, frames, speed=0.02, cycles=2, pause=0.1, start=JOINTS)
     assert pull.joints[0] == pytest.approx(JOINTS) and pull.joints[-1] == pytest.approx(JOINTS)
-    assert forward(ARM, pull.joints) == pytest.approx(matrices(pull.poses), abs=1e-9)
+    assert ARM.forward(pull.joints) == pytest.approx(matrices(pull.poses), abs=1e-9)
     own = cell.model_copy(update={"robot": cell.robot.model_copy(update={
         "joint_limits_rad": tuple(zip(JOINTS - 1.0, JOINTS + 1.0, strict=True))})})
     wound = JOINTS + np.r_[2 * np.pi, np.zeros(5)]
@@ -100,7 +98,7 @@ def test_the_way_back_leads_straight_to_where_it_began():
     """Half as fast as it came; what was pulled out and let back before is not pulled again."""
     out = line(0.05)
     for poses in (out, np.vstack([out, out[::-1], out]), np.vstack([out, out[:20:-1]])):
-        way = WayBack()
+        way = WayBack(ARM.joint_names)
         way.begin(sample_at(POSE), Trajectory(along(poses, 0.03, 0.3), poses))
         here = led(way, poses)
         back = way.from_here(here, 0.3)
@@ -114,7 +112,7 @@ def test_a_way_of_a_fraction_of_a_millimetre_is_gone_back():
     """Against something stiff it is tens of newtons; where nothing moved there is no way."""
     for length in (0.0003, 0.0015, 0.003):
         out = line(length)
-        way = WayBack()
+        way = WayBack(ARM.joint_names)
         way.begin(sample_at(POSE), Trajectory(along(out, 0.005, 0.3), out))
         back = way.from_here(led(way, out), 0.3)
         assert back.poses[0] == pytest.approx(out[-1]) and back.poses[-1] == pytest.approx(POSE)
@@ -127,7 +125,7 @@ def test_legs_with_the_same_branch_held_are_one_way():
     """Stopped while the branch is let back, it goes on back; not out again."""
     out = line(0.05)
     path = Trajectory(along(out, 0.03, 0.3), out, ExpectedWrench.nothing(out))
-    way = WayBack()
+    way = WayBack(ARM.joint_names)
     way.begin(sample_at(POSE), path)
     here = led(way, out)
     way.begin(here, path.backwards())
@@ -136,7 +134,7 @@ def test_legs_with_the_same_branch_held_are_one_way():
 
 
 def test_an_arm_that_left_its_way_does_not_go_back():
-    way = WayBack()
+    way = WayBack(ARM.joint_names)
     with pytest.raises(SafetyStop, match="Nothing has been followed"):
         way.from_here(sample_at(POSE), 0.3)
     out = line(0.05)

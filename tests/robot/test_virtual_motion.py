@@ -5,7 +5,8 @@ import pytest
 from tests.robot.conftest import Registers
 
 from limber.core.numerics.rigid import matrices
-from limber.robot.virtual.controller import HOME, Controller, RuntimeState, SafetyMode
+from limber.robot.ur.arms import ARMS
+from limber.robot.virtual.controller import Controller, RuntimeState, SafetyMode
 from limber.robot.virtual.force_sensor import E_SERIES, ForceSensor
 
 MOVE_JOINTS, MOVE_LINE, ZERO, SPEED, SERVO_JOINTS, SERVO_STOP = 1, 3, 8, 10, 11, 16
@@ -30,7 +31,7 @@ def test_a_line_is_straight_and_keeps_speed_and_acceleration(registers):
 
 def test_a_joint_move_is_led_by_one_joint(registers):
     """1 rad at 1 rad/s and 2 rad/s^2 take 1.5 s, all joints in step."""
-    target = np.array(HOME) + [1.0, 0.5, 0, 0, 0, -0.25]
+    target = np.array(ARMS["ur5e"].home) + [1.0, 0.5, 0, 0, 0, -0.25]
     poses = registers.run(MOVE_JOINTS, *target, 1.0, 2.0)
     assert registers.controller.joints == pytest.approx(target)
     assert len(poses) * registers.controller.seconds == pytest.approx(1.5, abs=0.02)
@@ -82,7 +83,7 @@ def test_a_stop_takes_the_way_that_its_deceleration_needs(registers):
 def test_servo_follows_its_target_a_lookahead_behind(registers, lookahead):
     controller = registers.controller
     for k in range(600):
-        target = np.array(HOME) + [0.05 * k * controller.seconds, 0, 0, 0, 0, 0]
+        target = np.array(ARMS["ur5e"].home) + [0.05 * k * controller.seconds, 0, 0, 0, 0, 0]
         registers.write(SERVO_JOINTS, *target, 0, 0, 0.002, lookahead, 300)
         controller.write_inputs({"input_int_register_0": 0})
         controller.step()

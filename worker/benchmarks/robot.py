@@ -33,7 +33,6 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.ur.arms import ARMS
-from limber.robot.ur.kinematics import forward, inverse
 from limber.robot.virtual.launch import VirtualRobot
 
 _ADDRESS = "127.0.0.71"
@@ -64,10 +63,10 @@ def _kinematics(setting: Setting) -> list[Row]:
     worst, missing, count = 0.0, 0, 10_000 // len(ARMS) + 1
     for arm in ARMS.values():
         joints = rng.uniform(-np.pi, np.pi, (count, 6))
-        frames = forward(arm, joints)
-        solutions = inverse(arm, frames)
+        frames = arm.forward(joints)
+        solutions = arm.inverse(frames)
         exist = np.isfinite(solutions).all(axis=-1)
-        again = forward(arm, np.nan_to_num(solutions))
+        again = arm.forward(np.nan_to_num(solutions))
         worst = max(worst, float(np.linalg.norm(
             (again - frames[:, None])[..., :3, 3], axis=-1)[exist].max()))
         apart = np.abs((solutions - joints[:, None] + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
@@ -84,10 +83,10 @@ def _kinematics(setting: Setting) -> list[Row]:
     for name, arm in ARMS.items():
         library = getattr(ur_analytic_ik, name)
         joints = rng.uniform(-np.pi, np.pi, (count, 6))
-        frames = forward(arm, joints)
+        frames = arm.forward(joints)
         theirs = np.array([library.forward_kinematics(*row) for row in joints])
         off = max(off, float(np.abs(frames - theirs)[:, :3, 3].max()))
-        ours = np.isfinite(inverse(arm, frames)).all(axis=-1).sum(axis=1)
+        ours = np.isfinite(arm.inverse(frames)).all(axis=-1).sum(axis=1)
         lacking += sum(len(library.inverse_kinematics(frame)) != number
                        for frame, number in zip(frames, ours, strict=True))
     return [*found, Row(*_KINEMATICS[2], f"{off:.1e} m", off < 1e-9, total),

@@ -8,11 +8,9 @@ import numpy as np
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.robot.cell.cell import Cell, write_cell
+from limber.robot.known_arms import arm_named
 from limber.robot.motion.execution import across
-from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import forward
 from limber.robot.virtual.branch_solver import BranchSetting
-from limber.robot.virtual.controller import HOME
 from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.pulls.virtual_pull import load_truth
 from limber.store import Branch
@@ -32,7 +30,8 @@ def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: 
     axis = point - skeleton.point_at(fraction - 0.05)
     gripper = matrices(np.r_[point, across(axis)[0]])
     gripper[:3, 3] -= back * gripper[:3, 2]
-    tool = forward(arm_named(model), np.array(HOME)) @ matrices(np.array(GRASP_POSE))
+    arm = arm_named(model)
+    tool = arm.forward(arm.home) @ matrices(np.array(GRASP_POSE))
     base = pose_vectors(gripper @ inverted(tool))
     return Cell(
         branch=branch.uuid, base={"pose": tuple(map(float, base)), "position_sigma_m": 1e-3,
@@ -40,7 +39,7 @@ def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: 
         robot={"model": model, "address": address},
         tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output", "mass_kg": 0.0,
               "grip_seconds": grip_seconds},
-        sensor={"kind": "controller" if model.endswith("e") else "ft300"},
+        sensor={"kind": "controller" if arm.measures_force else "ft300"},
         limits={"soft_force_n": 30.0, "hard_force_n": 40.0, "hard_torque_nm": 8.0, **limits})
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from limber.core.errors import LimberError
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import RobotLink
+from limber.robot.known_arms import arm_named
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
@@ -79,7 +80,7 @@ def _another_program(address: str) -> None:
 
 def cell_for(address: str, model: str = "ur5e") -> Cell:
     """Return a cell of a virtual robot whose base is the branch's frame."""
-    kind = "controller" if model.endswith("e") else "ft300"
+    kind = "controller" if arm_named(model).measures_force else "ft300"
     return Cell(robot={"model": model, "address": address}, base={"pose": (0.0,) * 6},
                 sensor={"kind": kind})
 
@@ -167,5 +168,6 @@ def restored(robot: VirtualRobot) -> None:
 
 def new_robot(address: str, model: str, seed: int) -> VirtualRobot:
     """Return a virtual robot; a CB3 has an FT300."""
-    options = ["--seed", str(seed)] + ([] if model.endswith("e") else ["--ft300"])
+    options = ["--seed", str(seed)] + (
+        [] if arm_named(model).measures_force else ["--ft300"])
     return VirtualRobot(model, address, options)

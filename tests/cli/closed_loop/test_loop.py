@@ -25,8 +25,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.problem import UNPROVEN
 from limber.robot.cell.base_calibration import fit_base
 from limber.robot.cell.cell import Cell
-from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import forward
+from limber.robot.known_arms import arm_named
 
 TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 
@@ -49,7 +48,7 @@ def test_the_arm_stands_beside_the_branch_and_its_gripper_on_it():
     assert base[3:5] == pytest.approx([0, 0]), "it stands upright"
     cell = Cell(robot={"model": "ur5e"}, base={"pose": tuple(base)}, tool={"grasp_pose": TOOL})
     joints, rotation = gripper_at(cell, point, axis)
-    grasp = cell.grasp_frames(forward(arm, joints))
+    grasp = cell.grasp_frames(arm.forward(joints))
     assert grasp == pytest.approx(matrices(np.r_[point, rotation]), abs=1e-9)
     away = cell.model_copy(update={"base": cell.base.model_copy(
         update={"pose": (3.0, 0, 0, 0, 0, 0)})})

@@ -428,9 +428,8 @@ def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
 def _preview(joints, base, arm):
     """A dry run's table for these joints; its poses are those of the flange."""
     from limber.core.numerics.rigid import matrices, pose_vectors
-    from limber.robot.ur.kinematics import forward
 
-    poses = pose_vectors(matrices(np.array(base)) @ forward(arm, joints))
+    poses = pose_vectors(matrices(np.array(base)) @ arm.forward(joints))
     columns = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
                *(f"q{n}_rad" for n in range(1, 7)), "fx_n", "fy_n", "fz_n"]
     rows = np.column_stack([np.arange(len(poses)), poses, joints, np.zeros((len(poses), 3))])
@@ -442,7 +441,7 @@ def _preview(joints, base, arm):
 def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away):
     """In each frame: base, six origins with the arm's own distances, grasp at the branch's; an
     arm that is elsewhere than the grasp is not shown."""
-    from limber.robot.ur.arms import arm_named
+    from limber.robot.known_arms import arm_named
 
     arm = arm_named("ur5e")
     steps = np.linspace(0, 1, 41)[:, None]

@@ -9,10 +9,10 @@ from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.robot.cell.cell import Cell
+from limber.robot.interface import Arm
 from limber.robot.motion.execution import across
 from limber.robot.motion.joint_path import JointPath, follow
 from limber.robot.motion.trajectory import densely
-from limber.robot.ur.arms import Arm
 
 GRASP_FRACTION = 0.85
 """Where on its main path the branch is held."""

@@ -38,7 +38,7 @@ from limber.geometry.generated import read_truth
 from limber.geometry.io.skeletons import read_swc
 from limber.planning.problem import UNPROVEN
 from limber.robot.cell.cell import Cell, read_cell, write_cell
-from limber.robot.ur.arms import arm_named
+from limber.robot.known_arms import arm_named
 from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import MARKER_PORT

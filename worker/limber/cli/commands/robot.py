@@ -48,9 +48,8 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
                           "wake late, which stops the robot.")
     pose = np.array(facts["pose"])
     from limber.core.numerics.rigid import matrices
-    from limber.robot.ur.kinematics import forward
 
-    nominal = forward(cell.arm, np.array(facts["joints"])) @ matrices(np.array(
+    nominal = cell.arm.forward(np.array(facts["joints"])) @ matrices(np.array(
         cell.tool.grasp_pose))
     return facts | {
         "arm": cell.arm.name, "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,

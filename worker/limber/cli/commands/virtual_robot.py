@@ -15,7 +15,8 @@ from limber.cli.main import Run, stage_command
 @click.option("--cell", "cell_file", type=click.Path(path_type=Path),
               help="Cell file with model, address and base. Required with a branch.")
 @click.option("--model", default="ur5e", show_default=True,
-              help="ur3, ur5, ur10 (125 Hz), ur3e, ur5e, ur10e, ur16e (500 Hz).")
+              help="ur3, ur5, ur10 (125 Hz), ur3e, ur5e, ur10e, ur16e (500 Hz); or the URDF file "
+                   "of another arm with six joints (500 Hz).")
 @click.option("--address", default="127.0.0.1", show_default=True, help="Loopback address.")
 @click.option("--young", help="True Young's moduli of the branch [Pa], A,B,C,D.")
 @click.option("--joints", type=float, nargs=6, help="Initial joint angles [rad].")
@@ -32,6 +33,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
     """
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
+    from limber.robot.known_arms import arm_named
     from limber.robot.virtual.controller import Controller
     from limber.robot.virtual.gripped_branch import HeldBranch
     from limber.robot.virtual.launch import serve
@@ -48,7 +50,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
             model, joints=np.array(joints) if joints else None, seed=seed, load=load,
             mass=(tool.mass_kg or 0.0) if tool else 0.0,
             centre=tool.centre_of_mass_m if tool else (0.0, 0.0, 0.0),
-            ft300=cell.sensor.kind == "ft300" if cell else not model.endswith("e"))
+            ft300=cell.sensor.kind == "ft300" if cell else not arm_named(model).measures_force)
         controller.gripper_output = tool.close_output if tool else 0
         real_time = claim_real_time(VIRTUAL_ROBOT_PRIORITY)
         server = serve(controller, address, seconds=seconds, say=run.say)

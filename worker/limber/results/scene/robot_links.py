@@ -2,19 +2,16 @@
 
 import numpy as np
 
+from limber.core.errors import InputError
 from limber.core.files.reading import read_columns
 from limber.core.numerics.rigid import matrices
 from limber.results.scene.arrays import SceneData
-from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import link_frames
+from limber.robot.known_arms import arm_named
 from limber.store import Branch
 
 _FARTHEST_M = 0.02
 """A frame whose grasp is farther from every pose of the dry run is of another motion."""
-_THICKNESS = 0.05
-"""Radius of the drawn links in reaches of the arm; the real ones are about that thick."""
 _POSE = ("x_m", "y_m", "z_m")
-_JOINTS = tuple(f"q{number}_rad" for number in range(1, 7))
 
 
 def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
@@ -31,18 +28,23 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
         return
     if (data.info.get("frames") or {}).get("name") != plan:
         return
-    table = read_columns(branch.path(name), (*_POSE, *_JOINTS), "the table of a dry run")
+    try:
+        arm = arm_named(entry.result["model"])
+    except InputError:
+        # The arm's file, or the package that has the arm, is on another computer.
+        return
+    names = tuple(f"q{number + 1}_rad" for number in range(len(arm.joint_names)))
+    table = read_columns(branch.path(name), (*_POSE, *names), "the table of a dry run")
     places, joints = (np.column_stack([table[column] for column in columns])
-                      for columns in (_POSE, _JOINTS))
+                      for columns in (_POSE, names))
     rows = _rows(places, grasps)
     if rows is None:
         return
-    arm = arm_named(entry.result["model"])
     base = matrices(np.asarray(entry.result["base_pose"], float))
-    links = (base @ link_frames(arm, joints[rows]))[..., :3, 3]
+    links = (base @ arm.link_frames(joints[rows]))[..., :3, 3]
     start = np.broadcast_to(base[:3, 3], (len(rows), 1, 3))
     data.arrays["robot_links"] = np.concatenate([start, links, places[rows][:, None]], axis=1)
-    data.arrays["robot_radius"] = np.array([_THICKNESS * np.abs(arm.a).sum()])
+    data.arrays["robot_radius"] = np.array([arm.link_radius])
     data.info["robot"] = arm.name
 
 

@@ -9,8 +9,7 @@ from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rigid_fit, spreads
 from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.cell.cell import Cell
-from limber.robot.ur.kinematics import forward
-from limber.robot.ur.samples import Sample
+from limber.robot.interface import Sample
 
 _FEWEST = 4
 _LEAST_SPREAD = 0.02  # m, of the second principal direction
@@ -110,7 +109,7 @@ def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
     grasp = np.array(cell.tool.grasp_pose)
     if sample.tool is not None:
         return _carried(sample.pose, sample.tool, grasp)
-    seen = pose_vectors(inverted(forward(cell.arm, sample.joints)) @ matrices(sample.pose))
+    seen = pose_vectors(inverted(cell.arm.forward(sample.joints)) @ matrices(sample.pose))
     for tool in (grasp, np.zeros(6)):
         if (length(seen[:3] - tool[:3]) <= _TOOL_M
                 and length(turn_between(tool, seen)) <= _TOOL_RAD):

@@ -5,7 +5,7 @@ angles in radians, masses in kilograms. The branch's frame is that of its folder
 """
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomlkit
@@ -16,7 +16,9 @@ from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
 from limber.core.json_values import plain
 from limber.core.numerics.rigid import inverted, matrices
-from limber.robot.ur.arms import ARMS, Arm, arm_named
+from limber.robot.interface import Arm
+from limber.robot.known_arms import arm_named
+from limber.robot.urdf.chain_arm import ENDING
 
 Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]
@@ -35,7 +37,7 @@ def _known_model(value: str) -> str:
     try:
         return arm_named(value).name
     except InputError as error:
-        raise ValueError(f"is none of {', '.join(ARMS)}") from error
+        raise ValueError(error.seen.removeprefix(f"Robot {value!r} ")) from error
 
 
 class _Entry(BaseModel):
@@ -45,7 +47,8 @@ class _Entry(BaseModel):
 class RobotEntry(_Entry):
     """Which robot, and at which address."""
 
-    model: str = Field(description="ur3, ur5, ur10, ur3e, ur5e, ur10e or ur16e.")
+    model: str = Field(description="ur3, ur5, ur10, ur3e, ur5e, ur10e or "
+                       "ur16e; the URDF file of another arm, beside the cell file.")
     address: str = Field("127.0.0.1", min_length=1, description="Address of the controller.")
     version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
                                 description="Controller version that was seen when calibrating.")
@@ -54,8 +57,8 @@ class RobotEntry(_Entry):
     pose_sigma_rad: float = Field(3e-4, ge=0, le=0.1, description="Repeatability of the arm's "
                                                                   "rotation [rad].")
     joint_limits_rad: tuple[tuple[float, float], ...] | None = Field(
-        None, min_length=6, max_length=6,
-        description="Narrower limits of the joints, as set in the controller's safety.")
+        None, description="Narrower limits of the joints, as set in the "
+        "controller's safety.")
 
     _known = field_validator("model")(_known_model)
 
@@ -251,13 +254,21 @@ class Cell(_Entry):
                              f"carries {self.arm.payload:g}")
         return self
 
+    @model_validator(mode="after")
+    def _limits_each_joint(self) -> "Cell":
+        limits, count = self.robot.joint_limits_rad, len(self.arm.joint_names)
+        if limits is not None and len(limits) != count:
+            raise ValueError(f"robot.joint_limits_rad has {len(limits)} rows, and a "
+                             f"{self.arm.name} {count} joints")
+        return self
+
     @property
     def arm(self) -> Arm:
         return arm_named(self.robot.model)
 
     @property
     def joint_limits(self) -> np.ndarray:
-        """The cell's limits of the joints [rad] within the arm's, shape [6, 2]."""
+        """The cell's limits of the joints [rad] within the arm's, shape [joints, 2]."""
         limits = self.arm.joint_limits
         if self.robot.joint_limits_rad is None:
             return limits
@@ -293,6 +304,10 @@ def read_cell(path: str | Path) -> Cell:
     path = Path(path)
     content = read_toml(path, "the description of a robot's cell (TOML; `limber "
                               "robot calibrate` makes one)", finite=False)
+    for entry in (content.get("robot"), content.get("second_arm")):
+        # An arm's file lies beside the cell file, as those of obstacles do.
+        if isinstance(entry, dict) and str(entry.get("model", "")).lower().endswith(ENDING):
+            entry["model"] = str(path.absolute().parent / entry["model"])
     try:
         return Cell.model_validate(content)
     except ValidationError as error:
@@ -304,7 +319,12 @@ def read_cell(path: str | Path) -> Cell:
 
 def write_cell(path: str | Path, cell: Cell) -> None:
     """Write a cell file; entries that are None are left out."""
-    write_atomically(Path(path), tomlkit.dumps(_without_none(plain(cell))))
+    content = _without_none(plain(cell))
+    for name in ("robot", "second_arm"):
+        model = Path(content.get(name, {}).get("model", ""))
+        if model.is_relative_to(Path(path).absolute().parent):
+            content[name]["model"] = model.relative_to(Path(path).absolute().parent).as_posix()
+    write_atomically(Path(path), tomlkit.dumps(content))
 
 
 def _told(path: Path, item: dict) -> str:
@@ -331,7 +351,7 @@ def _line_of(path: Path, location: tuple) -> int | None:
     return found
 
 
-def _without_none(value: object) -> object:
+def _without_none(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_none(item) for key, item in value.items() if item is not None}
     if isinstance(value, list | tuple):

@@ -20,7 +20,7 @@ import numpy as np
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, inverse_of, turned_wrench, weight_wrench
 from limber.robot.cell.cell import Cell
-from limber.robot.ur.samples import Sample
+from limber.robot.interface import Sample
 
 FT300_PORT = 63351
 INDEPENDENT_READINGS = 2
@@ -183,7 +183,7 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
                          "Set sensor.kind to ft300 or controller.")
     if cell.sensor.kind == "ft300":
         return Ft300Sensor(cell)
-    if cell.arm.series == "cb3":
+    if not cell.arm.measures_force:
         raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
                          "A CB3 estimates it from motor currents, with drifting errors of several "
                          "newtons.",

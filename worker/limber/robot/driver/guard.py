@@ -16,9 +16,7 @@ import numpy as np
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
-from limber.robot.ur.arms import Arm
-from limber.robot.ur.kinematics import singularity_distance
-from limber.robot.ur.samples import Sample
+from limber.robot.interface import Arm, Sample
 
 _RUNNING, _NORMAL, PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
@@ -408,7 +406,7 @@ class Guard:
         if self._is_over(f"joint {joint}", 0.5 * limits.joint_margin_rad - float(margin[joint]),
                          _PLACE_SLACK):
             return self._stop(f"joint {joint + 1} at its limit")
-        distance = float(singularity_distance(self._arm, sample.joints).min())
+        distance = float(self._arm.singularity_distance(sample.joints).min())
         if self.state == State.MOVING and self._is_over(
                 "singularity", 0.5 * limits.singularity - distance, _PLACE_SLACK):
             return self._stop("singularity", distance, 0.5 * limits.singularity)

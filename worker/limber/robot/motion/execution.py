@@ -17,7 +17,7 @@ _TURNS = 12  # directions about the branch from which the gripper may come
 _MOST_TRIED = 24  # ways of taking the path that are held against obstacles
 
 Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
-"""What is in the way of flange frames [n, 4, 4] at joint angles [n, 6]; None: nothing."""
+"""What is in the way of flange frames [n, 4, 4] at joint angles [n, joints]; None: nothing."""
 
 
 @dataclass(frozen=True)

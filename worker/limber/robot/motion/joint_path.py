@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError, NoPathError
-from limber.robot.ur.arms import Arm
-from limber.robot.ur.kinematics import BRANCH_COUNT, inverse, singularity_distance
+from limber.robot.interface import Arm
 
 # Between neighbouring poses of a path a joint turns little; more is a jump to another solution.
 _LARGEST_STEP = 0.35  # rad
-_NAMES = ("wrist", "elbow", "shoulder")
 _OUT_OF_REACH = "out of the arm's reach"
 
 
@@ -20,8 +18,8 @@ class JointPath:
     """Joint angles along a path.
 
     Attributes:
-        branch: Number of the inverse kinematics' branch, 0 to 7.
-        joints: Angles [rad], continuous, shape [n, 6].
+        branch: Number of the arm's configuration.
+        joints: Angles [rad], continuous, shape [n, joints].
         singularity: Least distance from a singularity along the path, dimensionless.
         limit_margin: Least distance of a joint from its limit [rad].
     """
@@ -56,9 +54,9 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
 
     Args:
         frames: Frames of the flange in the base's, in order and close together, shape [n, 4, 4].
-        singularity_margin: Least allowed :func:`singularity_distance`.
+        singularity_margin: Least allowed :meth:`.Arm.singularity_distance`.
         joint_margin: Least allowed distance from a joint limit [rad].
-        joint_limits: Least and greatest angles [rad], shape [6, 2]; the arm's own where absent.
+        joint_limits: Least and greatest angles [rad], shape [joints, 2]; else the arm's own.
 
     Returns:
         The paths, and for every other branch why it was refused.
@@ -68,11 +66,9 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
         raise InputError(f"Frames of shape {frames.shape}, or not finite.",
                          "A path consists of finite 4 x 4 transforms.", "Check the poses.")
     limits = arm.joint_limits if joint_limits is None else np.asarray(joint_limits, float)
-    solutions = inverse(arm, frames)
     paths, refusals = [], []
-    for branch in range(BRANCH_COUNT):
-        found = _one_branch(arm, branch, solutions[:, branch], limits, singularity_margin,
-                            joint_margin)
+    for branch, joints in enumerate(arm.configurations(frames)):
+        found = _one_branch(arm, branch, joints, limits, singularity_margin, joint_margin)
         (paths if isinstance(found, JointPath) else refusals).append(found)
     return sorted(paths, key=lambda path: -path.singularity), refusals
 
@@ -82,7 +78,7 @@ def joint_path(arm: Arm, frames: np.ndarray, *, start: np.ndarray | None = None,
     """Return the joint path to take along ``frames`` [n, 4, 4].
 
     Args:
-        start: Joint angles [rad] where the robot is, shape [6]: the branch nearest to them is
+        start: Joint angles [rad] where the robot is, shape [joints]: the branch nearest to them is
             taken, so that a path begins without a turn of the arm. Absent: the branch farthest
             from singularities.
         margins, joint_limits: As :func:`follow` takes them.
@@ -107,12 +103,12 @@ def _one_branch(arm: Arm, branch: int, joints: np.ndarray, limits: np.ndarray,
     if missing.any():
         return Refusal(branch, int(missing.argmax()), _OUT_OF_REACH)
     joints = np.unwrap(joints, axis=0)
-    distance = singularity_distance(arm, joints)
+    distance = arm.singularity_distance(joints)
     close = distance.min(axis=1) < singularity_margin
     if close.any():
         index = int(close.argmax())
         return Refusal(branch, index, f"within {distance[index].min():.3f} of the "
-                       f"{_NAMES[int(distance[index].argmin())]} singularity")
+                       f"{arm.singularity_names[int(distance[index].argmin())]} singularity")
     steps = np.abs(np.diff(joints, axis=0)).max(axis=1, initial=0.0)
     if (steps > _LARGEST_STEP).any():
         index = int(steps.argmax())
@@ -126,7 +122,7 @@ def _one_branch(arm: Arm, branch: int, joints: np.ndarray, limits: np.ndarray,
 
 
 def _whole_turns(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Turns [6] that bring the middle of each joint's range nearest to the middle of its limits."""
+    """Turns [joints] that bring the middle of each range nearest to the middle of its limits."""
     middle = 0.5 * (joints.max(axis=0) + joints.min(axis=0))
     bounded = np.isfinite(limits).all(axis=1)
     wanted = np.where(bounded, 0.5 * np.where(bounded[:, None], limits, 0.0).sum(axis=1), 0.0)

@@ -1,12 +1,14 @@
 """The way that an arm has come, as it was measured, for a retreat along it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.robot.interface import Sample
 from limber.robot.motion.start_check import POSITION_M, ROTATION_RAD, different_joints
 from limber.robot.motion.trajectory import Trajectory, along
-from limber.robot.ur.samples import Sample
 
 _APART_M, _APART_RAD = 1e-3, 0.005  # between the places that are kept
 _SAME = 0.3  # of what is bridged at a start: so near, two places of the way are one
@@ -16,9 +18,14 @@ _LEAST_SPEEDS = np.array([1e-3, 1e-2])  # m/s, rad/s
 
 
 class WayBack:
-    """Where an arm was since the gripper closed, or since the motion began."""
+    """Where an arm was since the gripper closed, or since the motion began.
 
-    def __init__(self) -> None:
+    Args:
+        names: Of the arm's joints.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
         self._poses: list[np.ndarray] = []
         self._joints: list[np.ndarray] = []
         self._speeds = _LEAST_SPEEDS
@@ -75,7 +82,8 @@ class WayBack:
             raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees away from "
                              "its path.", "Something has moved it.",
                              "Free the branch by hand.")
-        if told := different_joints(sample.joints, self._joints[nearest]):
+        if told := different_joints(sample.joints, self._joints[nearest],
+                                         self._names):
             raise SafetyStop("The arm is not in the configuration in which it came: "
                              f"{'; '.join(told)}.",
                              "Something has moved it.", "Free the branch by hand.")

@@ -1,10 +1,12 @@
 """Whether an arm stands where a motion begins, in the configuration that it was checked for.
 
-Up to eight joint poses bring the gripper to the same place, and each of them again with joints a
+Several joint poses bring the gripper to the same place, and each of them again with joints a
 whole turn on. Reach, limits, singularities and obstacles were checked for one of them, so every
 motion compares position, rotation and joints. A whole turn counts as a difference: the joint is
 nearer to its limit, and the cables are wound up otherwise.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,18 +18,18 @@ ROTATION_RAD = np.radians(2.0)
 # Arms differ from their nominal measures by some milliradians. Half of what two configurations
 # differ by at the usual distance from a singularity (limits.singularity).
 JOINT_RAD = 0.05
-_JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 
 
 def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
-                  start_joints: np.ndarray | None) -> None:
+                  start_joints: np.ndarray | None, names: Sequence[str]) -> None:
     """Refuse a motion that begins elsewhere than the arm stands, or in another configuration.
 
     Args:
         pose: Measured, base frame [m, rad], shape [6].
-        joints: Measured [rad], shape [6].
+        joints: Measured [rad], shape [n].
         start: Pose with which the motion begins, shape [6].
-        start_joints: Joint angles for which it was checked [rad], shape [6]; None: it was not.
+        start_joints: Joint angles for which it was checked [rad], shape [n]; None: it was not.
+        names: Of the joints.
 
     Raises:
         SafetyStop: names what differs, with both values.
@@ -43,7 +45,7 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
         told.append(f"the gripper is turned by {np.degrees(turn):.1f} degrees against the path's "
                     f"start: its rotation vector is {in_degrees(pose[3:])} degrees, and "
                     f"{in_degrees(start[3:])} was expected")
-    told += [] if start_joints is None else different_joints(joints, start_joints)
+    told += [] if start_joints is None else different_joints(joints, start_joints, names)
     if told:
         raise SafetyStop(
             "The arm is not in the configuration that the path was checked for: "
@@ -54,15 +56,15 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
             "execute` states them as start_joints_rad.")
 
 
-def different_joints(joints: np.ndarray, wanted: np.ndarray) -> list[str]:
-    """Say which joints [rad, 6] are not as ``wanted``, with both angles in degrees."""
+def different_joints(joints: np.ndarray, wanted: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Say which joints [rad, n] are not as ``wanted``, with both angles in degrees."""
     told = []
     for number in np.flatnonzero(~(np.abs(joints - wanted) <= JOINT_RAD)):
         turns = (joints[number] - wanted[number]) / (2 * np.pi)
         whole = round(turns) != 0 and abs(turns - round(turns)) * 2 * np.pi <= JOINT_RAD
-        told.append(f"joint {number + 1} ({_JOINTS[number]}) is at "
-                    f"{np.degrees(joints[number]):.1f} degrees instead of "
-                    f"{np.degrees(wanted[number]):.1f}"
+        told.append(f"joint {number + 1} ({names[number]}) is at "
+                    f"{np.degrees(joints[number]):.1f} degrees, and "
+                    f"{np.degrees(wanted[number]):.1f} was expected"
                     + (" (whole turns apart)" if whole else ""))
     return told
 

@@ -21,7 +21,7 @@ class Trajectory:
         expected: What the gripper will feel of the branch at each pose, or None where nothing is
             predicted.
         joints: Joint angles for which reach, limits and obstacles were checked at each pose [rad],
-            shape [n, 6]; None where nothing was checked.
+            shape [n, joints]; None where nothing was checked.
     """
 
     times: np.ndarray
@@ -42,10 +42,11 @@ class Trajectory:
                     self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
             raise InputError("The expected wrenches do not match the poses.",
                              "Each pose needs a wrench of six numbers.", "Check the plan.")
-        if self.joints is not None and (self.joints.shape != self.poses.shape
+        if self.joints is not None and (self.joints.shape[:-1] != self.times.shape
                                         or not np.isfinite(self.joints).all()):
             raise InputError(f"Joint angles of shape {self.joints.shape} for {len(self.poses)} "
-                             "poses, or not finite.", "Each pose needs six.", "Check the path.")
+                             "poses, or not finite.", "Each pose has one a joint.",
+                             "Check the path.")
 
     @property
     def duration(self) -> float:

@@ -1,4 +1,7 @@
-"""The arms of Universal Robots: Denavit-Hartenberg tables, speeds, payloads.
+"""The arms of Universal Robots: Denavit-Hartenberg tables, speeds, payloads, kinematics.
+
+Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
+is turned by 180 degrees about z) and the flange.
 
 Lengths are the maker's nominal ones ("DH Parameters for calculations of kinematics and dynamics").
 A real arm is calibrated in the factory and its controller uses corrected tables: its poses differ
@@ -13,7 +16,9 @@ from typing import Literal
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.numerics.compiled import for_kernels
+from limber.robot.interface import Rods
+from limber.robot.ur import kinematics
 
 Series = Literal["cb3", "e"]
 
@@ -22,10 +27,12 @@ _TWIST = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 _QUICK, _SLOW, _WRIST = math.pi, 2 * math.pi / 3, 2 * math.pi
 # Housings of the joints: three sizes of arm.
 _SMALL, _MIDDLE, _LARGE = (0.055, 0.045, 0.035), (0.06, 0.06, 0.045), (0.075, 0.06, 0.055)
+_UPPER_TUBE, _FORE_TUBE = 0.9, 0.75  # radii of the two long tubes in those of their housings
+_DRAWN = 0.05  # radius of the drawn links in lengths of the two tubes
 
 
 @dataclass(frozen=True)
-class Arm:
+class UrArm:
     """A six-joint arm with three parallel axes and a wrist, as all Universal Robots have.
 
     Attributes:
@@ -51,6 +58,24 @@ class Arm:
     housing: tuple[float, float, float]
     endless_wrist: bool = False
 
+    controller = "ur"
+    joint_names = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+    home = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
+    singularity_names = ("wrist", "elbow", "shoulder")
+
+    @property
+    def measures_force(self) -> bool:
+        """A CB3 estimates the force from its motors' currents, wrong by newtons that wander."""
+        return self.series == "e"
+
+    @property
+    def shoulder(self) -> np.ndarray:
+        return np.array([0.0, 0.0, self.d[0]])
+
+    @property
+    def link_radius(self) -> float:
+        return _DRAWN * float(np.abs(self.a).sum())
+
     @cached_property
     def table(self) -> np.ndarray:
         """The Denavit-Hartenberg table: d [m], a [m] and twist [rad] a joint, shape [6, 3]."""
@@ -74,18 +99,98 @@ class Arm:
         """Steps a second of the controller [Hz]."""
         return 125.0 if self.series == "cb3" else 500.0
 
+    def forward(self, joints: np.ndarray) -> np.ndarray:
+        joints = np.asarray(joints, float)
+        frames = kinematics.forward(self.table, for_kernels(joints.reshape(-1, 6)))
+        return frames.reshape(*joints.shape[:-1], 4, 4)
+
+    def link_frames(self, joints: np.ndarray) -> np.ndarray:
+        """Return the frames of all six links in the base's, the last of them the flange's,
+        shape [..., 6, 4, 4]."""
+        joints = np.asarray(joints, float)
+        frames = kinematics.link_frames(self.table, for_kernels(joints.reshape(-1, 6)))
+        return frames.reshape(*joints.shape[:-1], 6, 4, 4)
+
+    def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """Return every joint pose that brings the flange to ``frames``, angles within half a turn.
+
+        The order is fixed, so that one row followed along a path is one continuous branch: bit 2
+        of its number is the shoulder's side, bit 1 the wrist's, bit 0 the elbow's.
+
+        Args:
+            frames: Frames of the flange in the base's, shape [..., 4, 4].
+            near: Angles [..., 6] whose last joint is kept where the wrist is singular and only the
+                sum of two joints is determined; zero where absent.
+
+        Returns:
+            Joint angles [rad], shape [..., 8, 6].
+        """
+        frames = np.asarray(frames, float)
+        flat = for_kernels(frames.reshape(-1, 4, 4))
+        last = np.zeros(len(flat)) if near is None else np.broadcast_to(
+            np.asarray(near, float)[..., 5], frames.shape[:-2]).reshape(-1)
+        solutions = kinematics.inverse(self.table, flat, for_kernels(last))
+        return solutions.reshape(*frames.shape[:-2], 8, 6)
+
+    def configurations(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        return np.moveaxis(self.inverse(frames, near), -2, 0)
+
+    def jacobian(self, joints: np.ndarray) -> np.ndarray:
+        joints = np.asarray(joints, float)
+        slopes = kinematics.jacobian(self.table, for_kernels(joints.reshape(-1, 6)))
+        return slopes.reshape(*joints.shape[:-1], 6, 6)
+
+    def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
+        """Return how far each joint pose is from each singularity, shape [..., 3].
+
+        The Jacobian's determinant is a product of three factors, each of which vanishes at one
+        singularity: the wrist's (axes of joints 4 and 6 parallel), the elbow's (arm stretched or
+        folded) and the shoulder's (wrist over the base's axis). Each is scaled to at most about 1.
+        """
+        joints = np.asarray(joints, float)
+        distances = kinematics.singularity_distance(
+            self.table, self.reach, for_kernels(joints.reshape(-1, 6)))
+        return distances.reshape(*joints.shape[:-1], 3)
+
+    def rods(self, joints: np.ndarray) -> Rods:
+        """Return the links at joint angles [rad], shape [n, 6].
+
+        The tubes lie beside the lines of the Denavit-Hartenberg table, by the offsets of shoulder
+        and elbow. The base's foot is left out: it stands where it is mounted, and touches that.
+        """
+        frames = self.link_frames(joints)
+        places, axis = frames[:, :, :3, 3], frames[:, 0, :3, 2]
+        at_shoulder, at_forearm = self.lateral
+        shoulder = places[:, 0] + at_shoulder * axis
+        elbow = places[:, 1] + at_shoulder * axis
+        inner = places[:, 1] + at_forearm * axis
+        wrist = places[:, 2] + at_forearm * axis
+        thick, middle, thin = self.housing
+        # The last rod's round end stops at the flange.
+        last = places[:, 5] - min(thin, self.d[5]) * frames[:, 5, :3, 2]
+        links = (
+            ("shoulder", places[:, 0], shoulder, thick),
+            ("upper arm", shoulder, elbow, _UPPER_TUBE * thick),
+            ("elbow", elbow, inner, middle),
+            ("forearm", inner, wrist, _FORE_TUBE * middle),
+            ("wrist 1", wrist, places[:, 3], thin),
+            ("wrist 2", places[:, 3], places[:, 4], thin),
+            ("wrist 3", places[:, 4], last, thin))
+        names, starts, ends, radii = zip(*links, strict=True)
+        return Rods(names, np.stack(starts, axis=1), np.stack(ends, axis=1), np.array(radii))
+
 
 def _arm(name: str, d: tuple[float, float, float, float], a: tuple[float, float],
          speeds: tuple[float, float], payload: float, lateral: tuple[float, float],
          housing: tuple[float, float, float], *, elbow: float = _QUICK,
-         endless: bool = False) -> Arm:
+         endless: bool = False) -> UrArm:
     shoulder, wrist = speeds
-    return Arm(name, "e" if name.endswith("e") else "cb3", (d[0], 0.0, 0.0, *d[1:]),
+    return UrArm(name, "e" if name.endswith("e") else "cb3", (d[0], 0.0, 0.0, *d[1:]),
                (0.0, a[0], a[1], 0.0, 0.0, 0.0), (shoulder,) * 2 + (elbow,) + (wrist,) * 3,
                payload, lateral, housing, endless)
 
 
-ARMS: dict[str, Arm] = {arm.name: arm for arm in (
+ARMS: dict[str, UrArm] = {arm.name: arm for arm in (
     _arm("ur3", (0.1519, 0.11235, 0.08535, 0.0819), (-0.24365, -0.21325), (_QUICK, _WRIST), 3.0,
          (0.1198, 0.0275), _SMALL, endless=True),
     _arm("ur5", (0.089159, 0.10915, 0.09465, 0.0823), (-0.425, -0.39225), (_QUICK, _QUICK), 5.0,
@@ -101,16 +206,3 @@ ARMS: dict[str, Arm] = {arm.name: arm for arm in (
     _arm("ur16e", (0.1807, 0.17415, 0.11985, 0.11655), (-0.4784, -0.36), (_SLOW, _QUICK), 16.0,
          (0.176, 0.04), _LARGE),
 )}
-
-
-def arm_named(name: str) -> Arm:
-    """Return the arm called ``name``, in any case and with or without a hyphen.
-
-    Raises:
-        InputError: it is none of the known ones.
-    """
-    arm = ARMS.get(name.lower().replace("-", "").replace(" ", ""))
-    if arm is None:
-        raise InputError(f"Robot {name!r} is unknown.", "Its link lengths are needed.",
-                         f"Known robots: {', '.join(ARMS)}.")
-    return arm

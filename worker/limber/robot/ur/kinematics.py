@@ -1,106 +1,16 @@
-"""Forward and inverse kinematics of an arm, its Jacobian, and how far it is from a singularity.
+"""Kernels of the kinematics of an arm of Universal Robots, by its Denavit-Hartenberg table.
 
 Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
-is turned by 180 degrees about z) and the flange. All functions are vectorised over poses. Poses
-here are homogeneous matrices; :mod:`limber.core.numerics.rigid` goes between them and the
-``(x, y, z, rotation vector)`` of the rest of Limber.
+is turned by 180 degrees about z) and the flange, as homogeneous matrices. All kernels take many
+poses; :class:`limber.robot.ur.arms.UrArm` calls them.
 """
 
 import math
 
 import numpy as np
 
-from limber.core.numerics.compiled import compiled, for_kernels
+from limber.core.numerics.compiled import compiled
 from limber.core.numerics.rigid_kernels import inverse_of
-from limber.robot.ur.arms import Arm
-
-BRANCH_COUNT = 8
-"""Inverse solutions a pose has at most, whole turns apart."""
-
-
-def forward(arm: Arm, joints: np.ndarray) -> np.ndarray:
-    """Return the flange's frames in the base's.
-
-    Args:
-        joints: Joint angles [rad], shape [..., 6].
-
-    Returns:
-        Homogeneous matrices, shape [..., 4, 4].
-    """
-    joints = np.asarray(joints, float)
-    frames = _forward(arm.table, for_kernels(joints.reshape(-1, 6)))
-    return frames.reshape(*joints.shape[:-1], 4, 4)
-
-
-def link_frames(arm: Arm, joints: np.ndarray) -> np.ndarray:
-    """Return the frames of all six links in the base's, the last of them the flange's.
-
-    Args:
-        joints: Joint angles [rad], shape [..., 6].
-
-    Returns:
-        Homogeneous matrices, shape [..., 6, 4, 4].
-    """
-    joints = np.asarray(joints, float)
-    frames = _link_frames(arm.table, for_kernels(joints.reshape(-1, 6)))
-    return frames.reshape(*joints.shape[:-1], 6, 4, 4)
-
-
-def inverse(arm: Arm, frames: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
-    """Return every joint pose that brings the flange to ``frames``, angles within half a turn.
-
-    The order is fixed, so that one row followed along a path is one continuous branch: bit 2 of
-    its number is the shoulder's side, bit 1 the wrist's, bit 0 the elbow's. Rows that do not exist
-    are NaN.
-
-    Args:
-        frames: Frames of the flange in the base's, shape [..., 4, 4].
-        reference: Angles [..., 6] whose last joint is kept where the wrist is singular and only
-            the sum of two joints is determined; zero where absent.
-
-    Returns:
-        Joint angles [rad], shape [..., 8, 6].
-    """
-    frames = np.asarray(frames, float)
-    flat = for_kernels(frames.reshape(-1, 4, 4))
-    last = np.zeros(len(flat)) if reference is None else np.broadcast_to(
-        np.asarray(reference, float)[..., 5], frames.shape[:-2]).reshape(-1)
-    solutions = _inverse(arm.table, flat, for_kernels(last))
-    return solutions.reshape(*frames.shape[:-2], BRANCH_COUNT, 6)
-
-
-def jacobian(arm: Arm, joints: np.ndarray) -> np.ndarray:
-    """Return the geometric Jacobian of the flange in the base's frame.
-
-    Args:
-        joints: Joint angles [rad], shape [..., 6].
-
-    Returns:
-        Shape [..., 6, 6]: velocity [m/s] over angular velocity [rad/s], a unit joint speed a
-        column.
-    """
-    joints = np.asarray(joints, float)
-    slopes = _jacobian(arm.table, for_kernels(joints.reshape(-1, 6)))
-    return slopes.reshape(*joints.shape[:-1], 6, 6)
-
-
-def singularity_distance(arm: Arm, joints: np.ndarray) -> np.ndarray:
-    """Return how far each joint pose is from the nearest singularity, dimensionless.
-
-    The Jacobian's determinant is a product of three factors, each of which vanishes at one
-    singularity: the wrist's (axes of joints 4 and 6 parallel), the elbow's (arm stretched or
-    folded) and the shoulder's (wrist over the base's axis). The least of them, each scaled to at
-    most about 1.
-
-    Args:
-        joints: Joint angles [rad], shape [..., 6].
-
-    Returns:
-        Shape [..., 3]: wrist, elbow, shoulder.
-    """
-    joints = np.asarray(joints, float)
-    distances = _singularity_distance(arm.table, arm.reach, for_kernels(joints.reshape(-1, 6)))
-    return distances.reshape(*joints.shape[:-1], 3)
 
 
 @compiled
@@ -113,12 +23,12 @@ def _link(table: np.ndarray, joint: int, angle: float) -> np.ndarray:
 
 
 @compiled
-def _forward(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(_link_frames(table, joints)[:, 5])
+def forward(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(link_frames(table, joints)[:, 5])
 
 
 @compiled
-def _link_frames(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+def link_frames(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
     frames = np.empty((len(joints), 6, 4, 4))
     for n in range(len(joints)):
         frames[n, 0] = _link(table, 0, joints[n, 0])
@@ -138,7 +48,7 @@ def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def _jacobian(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+def jacobian(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
     slopes = np.empty((len(joints), 6, 6))
     frames = np.empty((7, 4, 4))
     for n in range(len(joints)):
@@ -156,7 +66,7 @@ def _jacobian(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def _singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) -> np.ndarray:
+def singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) -> np.ndarray:
     distances = np.empty((len(joints), 3))
     a2, a3, d5 = table[1, 1], table[2, 1], table[4, 0]
     for n in range(len(joints)):
@@ -168,7 +78,7 @@ def _singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) -
 
 
 @compiled
-def _inverse(table: np.ndarray, frames: np.ndarray, last: np.ndarray) -> np.ndarray:
+def inverse(table: np.ndarray, frames: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Analytic solution after Hawkins, "Analytic inverse kinematics for the UR-5/UR-10 arms".
 
     Angles come from arc tangents throughout, also where the paper has arc cosines: those lose

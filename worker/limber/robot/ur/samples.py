@@ -10,11 +10,11 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from limber.core.errors import WorkError
+from limber.robot.interface import Sample
 from limber.robot.ur import rtde
 
 RTDE_PORT, DASHBOARD_PORT = 30004, 29999
@@ -23,37 +23,6 @@ _NAMES = ("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_s
           "actual_TCP_force", "robot_mode", "safety_mode", "runtime_state",
           "target_speed_fraction")
 _TOOL = "tcp_offset"
-
-
-@dataclass(frozen=True)
-class Sample:
-    """The robot at one step of its controller.
-
-    Attributes:
-        clock: The controller's time [s].
-        arrived: When it came, on this computer's monotonic clock [s].
-        joints, joint_speeds: [rad], [rad/s], shape [6].
-        pose, speed: Of the tool's centre in the base's frame [m, rad], [m/s, rad/s], shape [6].
-        wrench: Of the surroundings on the tool as the controller reports it: the base's axes,
-            about the tool's centre [N, N m], shape [6].
-        robot_mode, safety_mode, runtime_state: The controller's numbers (7, 1 and 2 are well).
-        slider: Speed slider, 0 to 1.
-        tool: Tool that is set in the controller, the flange's frame [m, rad], shape [6]; None where
-            its version does not tell it.
-    """
-
-    clock: float
-    arrived: float
-    joints: np.ndarray
-    joint_speeds: np.ndarray
-    pose: np.ndarray
-    speed: np.ndarray
-    wrench: np.ndarray
-    robot_mode: int
-    safety_mode: int
-    runtime_state: int
-    slider: float
-    tool: np.ndarray | None = None
 
 
 class SampleStream:

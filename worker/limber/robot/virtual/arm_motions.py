@@ -12,8 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from limber.core.numerics.rigid import angle_between, inverted, matrices, pose_between
-from limber.robot.ur.arms import Arm
-from limber.robot.ur.kinematics import forward, inverse, jacobian
+from limber.robot.interface import Arm
 from limber.robot.virtual.step_kernels import servo_step
 
 JOINT_ACCELERATION = 40.0
@@ -211,13 +210,13 @@ def line_move(arm: Arm, start: np.ndarray, start_pose: np.ndarray, waypoints: li
     """
     corners = [start_pose, *(np.asarray(waypoint.target, float) for waypoint in waypoints)]
     curve = _rounded(np.array(corners), waypoints, _pose_distance, pose_between)
-    solutions = inverse(arm, matrices(curve.points) @ inverted(tool), start)
-    offset = np.abs((solutions[0] - start + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
-    offset[np.isnan(solutions).any(axis=(0, 2))] = np.inf
+    solutions = arm.configurations(matrices(curve.points) @ inverted(tool), start)
+    offset = np.abs((solutions[:, 0] - start + np.pi) % (2 * np.pi) - np.pi).max(axis=1)
+    offset[np.isnan(solutions).any(axis=(1, 2))] = np.inf
     branch = int(offset.argmin())
     if not offset[branch] < 0.05:
         raise Unreachable("a pose on the path is out of reach")
-    joints = np.unwrap(np.vstack([start, solutions[:, branch]]), axis=0)[1:]
+    joints = np.unwrap(np.vstack([start, solutions[branch]]), axis=0)[1:]
     if len(joints) > 1 and np.abs(np.diff(joints, axis=0)).max() > 0.5:
         raise Unreachable("the path passes a singularity")
     return _timed(arm, joints, curve, curve.points[:, :3], waypoints)
@@ -229,7 +228,7 @@ def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarra
     Raises:
         Unreachable: there are none.
     """
-    solutions = inverse(arm, matrices(pose) @ inverted(tool), near)
+    solutions = arm.inverse(matrices(pose) @ inverted(tool), near)
     solutions = solutions[np.isfinite(solutions).all(axis=1)]
     if len(solutions) == 0:
         raise Unreachable("no inverse kinematics")
@@ -326,7 +325,7 @@ def _pose_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _tool_jacobian(arm: Arm, joints: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    slopes = jacobian(arm, joints)
-    lever = forward(arm, joints)[:3, :3] @ tool[:3, 3]
+    slopes = arm.jacobian(joints)
+    lever = arm.forward(joints)[:3, :3] @ tool[:3, 3]
     slopes[:3] -= np.cross(lever, slopes[3:].T).T
     return slopes

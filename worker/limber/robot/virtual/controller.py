@@ -14,14 +14,15 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid_kernels import crossed, frame_of, weight_wrench
-from limber.robot.ur.arms import Arm, arm_named
+from limber.robot.interface import Arm
+from limber.robot.known_arms import arm_named
 from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
 from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
 from limber.robot.virtual.program import ControlProgram
 from limber.robot.virtual.step_kernels import tool_state
 
 _TRACKER_SIGMA_M = 1e-3
-HOME = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
+_SLOW_HZ = 125.0  # the rate of a CB3
 
 
 class SafetyMode(IntEnum):
@@ -146,7 +147,7 @@ class Controller:
 
     Args:
         model: Name of the arm.
-        joints: Where it stands [rad], shape [6].
+        joints: Where it stands [rad], shape [6]; at the arm's home where absent.
         mass, centre: Of what really hangs at the flange [kg], [m].
         seed: Of the sensors' noise.
         load: What the gripper holds.
@@ -156,19 +157,16 @@ class Controller:
                  centre: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0,
                  load: Load | None = None, ft300: bool = False):
         self.arm: Arm = arm_named(model)
-        self.version = (3, 15, 8, 106339) if self.arm.series == "cb3" else (5, 11, 6, 1010327)
+        self.version = (3, 15, 8, 106339) if self.arm.rate == _SLOW_HZ else (5, 11, 6, 1010327)
         self.seconds = 1.0 / self.arm.rate
-        self.joints = np.array(HOME if joints is None else joints, float)
-        if self.joints.shape != (6,) or not np.isfinite(self.joints).all():
-            raise InputError(f"Joint angles {joints}.", "Six finite numbers [rad] are needed.",
-                             "Give one angle a joint.")
+        self.joints = _six(self.arm.home if joints is None else joints)
         self.speeds = np.zeros(6)
         self.tool = np.eye(4)
         self.tool_offset = np.zeros(6)
         self.mass, self.centre = mass, np.asarray(centre, float)
         self.payload, self.payload_centre = 0.0, np.zeros(3)
         rng = np.random.default_rng(seed)
-        self.sensor = ForceSensor(CB3_ESTIMATE if self.arm.series == "cb3" else E_SERIES, rng)
+        self.sensor = ForceSensor(E_SERIES if self.arm.measures_force else CB3_ESTIMATE, rng)
         self.ft300 = ForceSensor(FT300, rng) if ft300 else None
         self.ft300_reading = np.zeros(6)
         self.tracker_off = _TRACKER_SIGMA_M * rng.standard_normal(3)
@@ -233,8 +231,9 @@ class Controller:
         self._update_tool()
 
     def _update_tool(self) -> None:
-        self.pose, self.tool_speed, self.flange = tool_state(
-            self.arm.table, self.joints, self.speeds, self.tool)
+        self.flange = self.arm.forward(self.joints)
+        self.pose, self.tool_speed = tool_state(
+            self.flange, self.arm.jacobian(self.joints), self.speeds, self.tool)
 
     def _feel(self) -> None:
         rotation = self.flange[:3, :3]
@@ -284,12 +283,10 @@ class Controller:
         """Turn the button back and switch the arm on again."""
         self.safety_mode, self.robot_mode, self.motion = SafetyMode.NORMAL, RobotMode.RUNNING, None
 
-    def stand(self, joints: Sequence[float] = HOME) -> None:
-        """Stand with joints [rad] at once, without a way there, as if guided by hand."""
-        wanted = np.array(joints, float)
-        if wanted.shape != (6,) or not np.isfinite(wanted).all():
-            raise InputError(f"Joint angles {joints}.", "Six finite numbers [rad] are needed.",
-                             "Give one angle a joint.")
+    def stand(self, joints: Sequence[float] | None = None) -> None:
+        """Stand with joints [rad] at once, without a way there, as if guided by hand; at the arm's
+        home where absent."""
+        wanted = _six(self.arm.home if joints is None else joints)
         self.stop_program("set to a pose")
         self.load.release()
         self.joints, self.speeds, self.motion = wanted, np.zeros(6), None
@@ -427,6 +424,20 @@ class Controller:
         return values
 
     accelerations = np.zeros(6)
+
+
+def _six(joints: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return joint angles as an array, if they are those of an arm that RTDE can tell of.
+
+    Raises:
+        InputError: they are not six finite numbers.
+    """
+    angles = np.array(joints, float)
+    if angles.shape != (6,) or not np.isfinite(angles).all():
+        raise InputError(f"Joint angles {joints}.", "Six finite numbers [rad] are needed: the "
+                         "virtual controller is one of Universal Robots, for arms of six joints.",
+                         "Give one angle a joint.")
+    return angles
 
 
 def _steady() -> dict[str, Any]:

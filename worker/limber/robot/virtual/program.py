@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.ur.kinematics import forward
 from limber.robot.virtual.arm_motions import (
     Braking,
     Motion,
@@ -152,7 +151,7 @@ class ControlProgram:
         def pose_of(waypoint: Waypoint) -> np.ndarray:
             if waypoint.is_pose:
                 return waypoint.target
-            return pose_vectors(forward(controller.arm, waypoint.target) @ controller.tool)
+            return pose_vectors(controller.arm.forward(waypoint.target) @ controller.tool)
         poses = [Waypoint("line", pose_of(w), True, w.speed, w.acceleration, w.blend)
                  for w in waypoints]
         return line_move(controller.arm, controller.joints, controller.pose, poses,
@@ -245,7 +244,7 @@ class ControlProgram:
             return
         tool = matrices(self._vector(controller, 6))
         self._answer(controller, pose_vectors(
-            forward(controller.arm, self._vector(controller)) @ tool))
+            controller.arm.forward(self._vector(controller)) @ tool))
 
     def _within_limits(self, controller: "Controller", is_pose: bool) -> None:
         joints = self._vector(controller)

@@ -1,4 +1,4 @@
-"""What the virtual robot computes at every step, compiled: flange pose and speed, servo, and the
+"""What the virtual robot computes at every step, compiled: tool pose and speed, servo, and the
 wrench of the branch in its gripper.
 """
 
@@ -6,24 +6,21 @@ import numpy as np
 
 from limber.core.numerics.compiled import compiled
 from limber.core.numerics.rigid_kernels import inverse_of, rotation_vector
-from limber.robot.ur.kinematics import _forward, _jacobian
 
 _FARTHEST = 0.03  # m over which a change of the tangent is led on
 
 
 @compiled
-def tool_state(table: np.ndarray, joints: np.ndarray, speeds: np.ndarray, tool: np.ndarray,
-               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the tool's pose [6], its speed [6] (base frame) and the flange's frame [4, 4].
+def tool_state(flange: np.ndarray, slopes: np.ndarray, speeds: np.ndarray, tool: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tool's pose [6] and its speed [6] in the base's frame.
 
     Args:
-        table: Denavit-Hartenberg table, shape [6, 3].
-        joints, speeds: [rad], [rad/s], shape [6].
+        flange: Its frame, shape [4, 4].
+        slopes: The arm's Jacobian, shape [6, n].
+        speeds: Of the joints [rad/s], shape [n].
         tool: Frame of the tool in the flange's, shape [4, 4].
     """
-    row = joints.reshape(1, 6)
-    flange = _forward(table, row)[0]
-    slopes = _jacobian(table, row)[0]
     tip = flange @ tool
     motion = slopes @ speeds
     lever = tip[:3, 3] - flange[:3, 3]
@@ -33,7 +30,7 @@ def tool_state(table: np.ndarray, joints: np.ndarray, speeds: np.ndarray, tool: 
     pose = np.empty(6)
     pose[:3] = tip[:3, 3]
     pose[3:] = rotation_vector(tip)
-    return pose, motion, flange
+    return pose, motion
 
 
 @compiled
@@ -46,13 +43,13 @@ def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain:
     lookahead with a high gain overshoots.
 
     Returns:
-        New joints [6] and speeds [6]; accelerations stay within ``largest`` [rad/s^2].
+        New joints [n] and speeds [n]; accelerations stay within ``largest`` [rad/s^2].
     """
-    new_speeds = np.empty(6)
-    new_joints = np.empty(6)
+    new_speeds = np.empty_like(joints)
+    new_joints = np.empty_like(joints)
     # Implicit in the speed, so that any gain is stable at 125 Hz as well.
     damping = 1.0 + step * gain * lookahead + step * step * gain
-    for k in range(6):
+    for k in range(len(joints)):
         wanted = (speeds[k] + step * gain * (target[k] - joints[k])) / damping
         change = min(max(wanted - speeds[k], -largest * step), largest * step)
         new_speeds[k] = speeds[k] + change

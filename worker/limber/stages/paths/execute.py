@@ -327,9 +327,10 @@ def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: C
         rows.append(np.column_stack([begin + trajectory.times, poses, joints,
                                      trajectory.expected.wrenches[:, :3]]))
         begin += trajectory.duration + 0.5
-    header = ("t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,"
-              "fx_n,fy_n,fz_n")
-    lines = [header, *(",".join(f"{x:.7g}" for x in row) for row in np.vstack(rows))]
+    header = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
+              *(f"q{number + 1}_rad" for number in range(motion.joints.joints.shape[1])),
+              "fx_n", "fy_n", "fz_n"]
+    lines = [",".join(header), *(",".join(f"{x:.7g}" for x in row) for row in np.vstack(rows))]
     with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
         stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
                                                                encoding="utf-8")

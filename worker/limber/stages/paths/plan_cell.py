@@ -18,13 +18,11 @@ from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import CellPlace
 from limber.planning.goals.regions import Ball
 from limber.planning.plan_file import Way
-from limber.robot.cell.arm_shape import rods_of
 from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
+from limber.robot.known_arms import arm_named
 from limber.robot.motion.execution import Blocked, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.ur.arms import arm_named
-from limber.robot.ur.kinematics import inverse
 from limber.store import Branch
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -78,7 +76,7 @@ def places_in(cell: Cell) -> dict[str, CellPlace]:
         found["in_view"] = CellPlace(view)
     if cell.second_arm is not None:
         arm = arm_named(cell.second_arm.model)
-        shoulder = matrices(np.array(cell.second_arm.base_pose)) @ [0.0, 0.0, arm.d[0], 1.0]
+        shoulder = matrices(np.array(cell.second_arm.base_pose)) @ np.r_[arm.shoulder, 1.0]
         x, y, z = map(float, shoulder[:3])
         found["second_arm"] = CellPlace(Ball((x, y, z), arm.reach),
                                         partial(require_taken, cell.second_arm))
@@ -93,7 +91,7 @@ def require_taken(entry: SecondArmEntry, place: np.ndarray) -> None:
     frames[:, :3, :3], frames[:, :3, 3] = turns, place
     flange = inverted(matrices(np.array(entry.base_pose))) @ frames @ inverted(
         matrices(np.array(entry.grasp_pose)))
-    if np.isnan(inverse(arm, flange)).any(axis=-1).all():
+    if np.isnan(arm.inverse(flange)).any(axis=-1).all():
         where = ", ".join(f"{x:.3f}" for x in place)
         raise NoPathError(f"The second arm ({arm.name}) cannot reach the target at ({where}) m.",
                           f"The inverse kinematics has no solution for any of {_TURNS} "
@@ -156,10 +154,10 @@ def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
 
     Args:
         flange: Frames in the robot's base, shape [n, 4, 4].
-        joints: The same by angles [rad], shape [n, 6].
+        joints: The same by angles [rad], shape [n, joints].
     """
     base = matrices(np.array(cell.base.pose))
-    arm = rods_of(cell.arm, joints)
+    arm = cell.arm.rods(joints)
     parts = [(f"The arm's {name}", arm.starts[:, k], arm.ends[:, k], float(arm.radii[k]))
              for k, name in enumerate(arm.names)]
     parts += [("The gripper", *(flange[:, :3, :3] @ np.array(end) + flange[:, :3, 3]

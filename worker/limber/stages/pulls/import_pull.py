@@ -88,7 +88,6 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     from limber.recordings.importing.import_request import RobotKnown
     from limber.robot.cell.cell import read_cell
     from limber.robot.recorder import known_errors, known_noise
-    from limber.robot.ur.kinematics import forward
 
     cell = read_cell(Path(settings.cell))
     tool = matrices(np.array(cell.tool.grasp_pose))
@@ -100,7 +99,7 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
             raise InputError(f"The joints are named {', '.join(names)}.",
                              f"A UR arm's joints are {', '.join(_JOINTS)}.",
                              "Record poses or TF, or rename the joints.")
-        return pose_vectors(forward(cell.arm, angles[:, [found[0] for found in order]]) @ tool)
+        return pose_vectors(cell.arm.forward(angles[:, [found[0] for found in order]]) @ tool)
 
     if settings.frame_pose is None:
         settings = settings.model_copy(update={"frame_pose": cell.base.pose})

@@ -147,7 +147,8 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
     taken = joint_path(cell.arm, flange, start=start, joint_limits=cell.joint_limits,
                        singularity_margin=cell.limits.singularity,
                        joint_margin=cell.limits.joint_margin_rad)
-    if start is not None and (told := different_joints(start, taken.joints[0])):
+    told = [] if start is None else different_joints(start, taken.joints[0], cell.arm.joint_names)
+    if told:
         raise SafetyStop("The arm cannot follow this path from its configuration: "
                          f"{'; '.join(told)}.",
                          "In this configuration it would reach a joint limit or a singularity.",

@@ -1,0 +1,307 @@
+"""The loop that moves a robot, paced by the controller's own samples.
+
+Each sample is read, judged by the guard, and answered by the next target within the same step.
+Nothing here waits for a motion.
+"""
+
+import queue
+import select
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.controls import control_of
+from limber.robot.driver.deadline import CONNECT_SECONDS, RenewedDeadline, set_deadline
+from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain, open_sensor
+from limber.robot.driver.guard import PLAYING, Guard, GuardSettings, State
+from limber.robot.driver.hold_ups import HoldUps
+from limber.robot.driver.messages import Words
+from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
+from limber.robot.driver.senses import Senses
+from limber.robot.driver.under_way import Following, UnderWay
+from limber.robot.interface import ArmControl, Sample
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.start_check import require_start
+from limber.robot.motion.trajectory import Trajectory
+
+PARENT_SECONDS = 1.0
+"""The parent says something at least this often, or the robot stops."""
+
+_PROGRAM_SECONDS = 1.5
+_GONE_SECONDS = 1.0  # of silence; from the first of them on the arm is being stopped
+_LOOP_PRIORITY = 22
+
+Orders = queue.SimpleQueue[dict[str, Any] | None]
+"""What the parent orders; None: it is gone."""
+
+
+class Driver:
+    """One robot, its sensor and its guard.
+
+    Args:
+        cell: Robot, tool, sensor and limits.
+        words: What it says goes through them.
+
+    Raises:
+        LimberError: the robot does not answer, or is not in a state to be moved.
+    """
+
+    def __init__(self, cell: Cell, words: Words):
+        self.cell, self.tell = cell, words.tell
+        self._control = control_of(cell)
+        sensor = open_sensor(cell)
+        self.guard = _guard_of(cell, self._control)
+        _warm_up(cell, self._control, sensor)
+        # Now: where it has just compiled this takes longer than the watchdog would wait.
+        self.facts = self._control.facts | {"kept_in_memory": spare_what_is_loaded(),
+                                            "kept_awake": keep_awake()}
+        set_deadline(CONNECT_SECONDS)
+        self._control.connect()
+        self._deadline = RenewedDeadline()
+        self._deadline.renew()
+        # Before the control's own threads, which have what was claimed before they began.
+        claim_real_time(_LOOP_PRIORITY)
+        self._quiet = 2.0 / self._control.rate + 0.005
+        self._hold_ups = HoldUps(self._quiet, self.tell)
+        self._under_way = UnderWay(self._control, self.guard, self.tell)
+        self._senses = Senses(cell, self._control, sensor, self.guard, self._under_way,
+                              self._hold_ups, self.tell)
+        self._command = np.zeros(6)
+        self._last: Sample | None = None
+        self._heard = time.monotonic()
+        self.ended = False
+
+    def run(self, orders: Orders) -> None:
+        """Serve orders until they end."""
+        self._control.skip()
+        while not self.ended:
+            self._deadline.renew()
+            try:
+                samples = self._control.read(self._quiet, self._senses.connections)
+            except ConnectionError as error:
+                self._lose(str(error))
+                return
+            self._hold_ups.note(None if self._last is None else self._last.arrived,
+                                moving=self._under_way.following is not None)
+            if samples:
+                self._look(samples)
+            elif self._last is not None and not self._bears_silence(self._last):
+                return
+            self._take(orders)
+            if samples and not self.ended:
+                self._move(len(samples) / self._control.rate)
+            self._senses.send_batch()
+
+    def _look(self, samples: list[Sample]) -> None:
+        for sample in samples:
+            self._senses.look(sample)
+        self._last = samples[-1]
+        # What came while they were judged need not wait for the next target as well.
+        beside = self._senses.connections
+        if beside and select.select(beside, [], [], 0.0)[0]:
+            self._senses.feel(self._last)
+
+    def _bears_silence(self, last: Sample) -> bool:
+        """Judge that no sample came since ``last``; returns whether the robot may still be there.
+        """
+        age = time.monotonic() - last.arrived
+        if not self._hold_ups.has_just_woken:
+            self._under_way.judge(self.guard.silence(age), at_once=True)
+            if age > _GONE_SECONDS:
+                self._lose(f"no data arrived from the robot for {age:.1f} s")
+                return False
+        self._senses.feel(last)
+        return True
+
+    def _lose(self, reason: str) -> None:
+        self._under_way.lose(reason)
+        self.ended = True
+
+    # Orders
+
+    def _take(self, orders: Orders) -> None:
+        while True:
+            try:
+                order = orders.get_nowait()
+            except queue.Empty:
+                break
+            if order is None:
+                self._under_way.judge(
+                    self.guard.event("the program that drives the robot has ended"))
+                self.ended = True
+                return
+            self._heard = time.monotonic()
+            try:
+                self._obey(order)
+            except LimberError as error:
+                self.tell(event="refused", order=order.get("order"), reason=str(error))
+        is_silent = time.monotonic() - self._heard > PARENT_SECONDS
+        if is_silent and self._under_way.following is not None:
+            self._under_way.judge(
+                self.guard.event("the program that drives the robot does not answer"))
+
+    def _obey(self, order: dict[str, Any]) -> None:
+        name = order.get("order")
+        if name == "alive":
+            return
+        if name == "tare":
+            self._senses.begin_tare(self._require_sample(), float(order.get("seconds", 0.5)))
+        elif name == "follow":
+            self._begin(_ordered(order), None if order.get("start_joints") is None
+                        else np.array(order["start_joints"], float))
+        elif name == "stop":
+            self._under_way.judge(self.guard.event("asked to stop"))
+        elif name == "resume":
+            self.guard.resume()
+            self.tell(event="resumed")
+        elif name == "acknowledge":
+            self.guard.acknowledge()
+            self.tell(event="acknowledged")
+        elif name == "retreat":
+            self._retreat()
+        elif name == "gripper":
+            close = bool(order["close"])
+            self._control.grip(close)
+            self.tell(event="gripper", closed=close)
+        else:
+            raise InputError(f"Order {name!r} is unknown.")
+
+    # Motion
+
+    def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
+        sample = self._require_sample()
+        require_start(sample.pose, sample.joints, trajectory.poses[0], start_joints,
+                      self.cell.arm.joint_names)
+        self._require_program(sample)
+        self.guard.begin()
+        self._senses.begin(sample, trajectory)
+        self._set_off(trajectory)
+
+    def _retreat(self) -> None:
+        sample = self._require_sample()
+        way = self._senses.way_back.from_here(sample, self.cell.limits.acceleration_m_s2)
+        self._require_program(sample)
+        self.guard.begin_retreat(self._senses.smooth)
+        self._set_off(way)
+
+    def _set_off(self, trajectory: Trajectory) -> None:
+        self._under_way.begin(trajectory)
+        self._command = self._require_sample().pose.copy()
+        self._hold_ups.set_off()
+        self.tell(event="started", seconds=trajectory.duration)
+
+    def _require_program(self, sample: Sample) -> None:
+        if sample.slider <= 0.0:
+            raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
+                             "Raise it on the pendant.")
+        if not self._control.program_runs():
+            self._start_program()
+
+    def _start_program(self) -> None:
+        """Start the control program once more, and see that it runs."""
+        started = self._control.start_program()
+        self._deadline.renew()
+        given_up = time.monotonic() + _PROGRAM_SECONDS
+        while not (self._control.program_runs()
+                   and self._require_sample().runtime_state == PLAYING):
+            if not started or time.monotonic() > given_up:
+                raise WorkError("The control program does not run.", "", "See the pendant.")
+            self._deadline.renew()
+            for sample in self._control.read(1.0 / self._control.rate):
+                self._senses.look(sample)
+                self._last = sample
+        # Each program begins without one.
+        self._control.watch()
+
+    def _move(self, step: float) -> None:
+        """Send the next target, ``step`` [s] of the controller's time after the last one."""
+        following = self._under_way.following
+        if following is None or self._last is None:
+            self._under_way.stand(self._last)
+            return
+        end = following.trajectory.duration
+        if self.guard.state == State.MOVING:
+            # Time along the path starts softly, also after a pause.
+            following.rate = min(following.rate + step / 0.2, 1.0)
+            following.time = min(following.time + following.rate * step,
+                                 end + self._control.lookahead)
+            target = following.trajectory.pose(following.time)
+            self._command = self.guard.permit(self._command, target, 1.2 * step)
+        else:
+            following.rate = 0.0
+        if not self._control.servo(self._command):
+            self._under_way.judge(self.guard.event(
+                "the control program took no target: it ends when it hears nothing for "
+                f"{self._control.silence:.2g} s, as where this computer is too busy"))
+            return
+        over = following.time >= end + 0.5 * self._control.lookahead
+        still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
+        if over and still:
+            self._finish(following)
+
+    def _finish(self, following: Following) -> None:
+        self._under_way.finish()
+        error = float(np.linalg.norm(
+            self._require_sample().pose[:3] - following.trajectory.poses[-1, :3]))
+        self.tell(event="reached", error_m=error)
+
+    def _require_sample(self) -> Sample:
+        if self._last is None:
+            raise WorkError("No data of the robot yet.")
+        return self._last
+
+    def close(self) -> None:
+        """Stop what moves and let go of the robot."""
+        set_deadline()
+        self._under_way.give_up()
+        self._senses.close()
+        self._control.close()
+
+
+def _ordered(order: dict[str, Any]) -> Trajectory:
+    """The trajectory of an order to follow one."""
+    expected = order.get("expected")
+    return Trajectory(
+        np.array(order["times"], float), np.array(order["poses"], float),
+        None if expected is None else ExpectedWrench(**{
+            part: np.array(value, float) for part, value in expected.items()}))
+
+
+def _guard_of(cell: Cell, control: ArmControl) -> Guard:
+    return Guard(cell.arm, GuardSettings(cell.limits, cell.joint_limits, cell.workspace),
+                 control.rate)
+
+
+def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None:
+    """Go through what the loop does once: compiling on the way would starve the watchdog."""
+    samples: list[Sample] = []
+    while len(samples) < 3:
+        samples += control.read(1.0)
+    guard, chain = _guard_of(cell, control), WrenchChain(cell)
+    base = frame_of(np.array(cell.base.pose))
+    guard.tared()
+    guard.begin()
+    for sample in samples:
+        reading = sensor.read(sample)
+        now, _ = chain.wrench(sample, reading)
+        guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]),
+                   expected=now, doubt=np.eye(6), grasp=sample.pose[:3])
+        turn_between(sample.pose, sample.pose)
+        guard.state = State.MOVING
+        guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
+        pose_of(base @ frame_of(sample.pose))
+    _walk_back(samples[0], WayBack(cell.arm.joint_names))
+
+
+def _walk_back(sample: Sample, way: WayBack) -> None:
+    """Go a millimetre and the way back in thought, so that all that it takes is loaded."""
+    there = replace(sample, pose=sample.pose + np.r_[0.002, np.zeros(5)])
+    way.begin(sample, Trajectory(np.array([0.0, 1.0]), np.array([sample.pose, there.pose])))
+    way.note(there)
+    way.from_here(there, 0.1)

@@ -1,0 +1,157 @@
+"""What the driver feels: each sample's wrench, judged by the guard and sent to the parent."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from limber.core.errors import SafetyStop, WorkError
+from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain
+from limber.robot.driver.guard import Guard, Verdict
+from limber.robot.driver.hold_ups import HoldUps
+from limber.robot.driver.under_way import UnderWay
+from limber.robot.interface import ArmControl, Sample
+from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.trajectory import Trajectory
+
+_BATCH_SECONDS = 0.02
+_OLDEST_READING_SECONDS = 0.05
+_NOTHING = np.full(6, np.nan)
+_UPPER = np.triu_indices(3)
+
+
+class Senses:
+    """The force sensor, its tare, and what is expected of the branch.
+
+    Attributes:
+        smooth: Wrench that was smoothed last, branch frame [N, N m], shape [6].
+        way_back: Where the arm has come.
+    """
+
+    def __init__(self, cell: Cell, control: ArmControl, sensor: ForceTorqueSensor, guard: Guard,
+                 under_way: UnderWay, hold_ups: HoldUps, tell: Callable[..., None]):
+        self._base = frame_of(np.array(cell.base.pose))
+        self._rate, self._lookahead = control.rate, control.lookahead
+        self._sensor, self._guard = sensor, guard
+        self._chain = WrenchChain(cell, count=5 if control.rate > 200 else 3)
+        self._under_way, self._hold_ups, self._tell = under_way, hold_ups, tell
+        self.way_back = WayBack(cell.arm.joint_names)
+        self.smooth = _NOTHING
+        self._held_for: np.ndarray | None = None
+        self._held_at = np.zeros(6)
+        self._tare_until: float | None = None
+        self._batch: list[np.ndarray] = []
+        self._batch_since = time.monotonic()
+
+    @property
+    def connections(self) -> tuple:
+        """What the sensor's readings come through, where they do so beside the samples."""
+        return self._sensor.connections
+
+    def begin(self, sample: Sample, trajectory: Trajectory) -> None:
+        """A trajectory is followed from ``sample`` on."""
+        self.way_back.begin(sample, trajectory)
+        rest = None if trajectory.expected is None else trajectory.expected.rest_pose
+        if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
+            # Here the gripper closed on the resting branch: ways are measured from here.
+            self._held_for, self._held_at = rest, sample.pose.copy()
+
+    def look(self, sample: Sample) -> None:
+        """Judge a sample and keep it for the next batch."""
+        try:
+            reading = self._sensor.read(sample)
+        except ConnectionError as error:
+            self._under_way.judge(self._guard.event(str(error)))
+            return
+        now, self.smooth = self._chain.wrench(sample, reading)
+        # First what must not wait for the rest.
+        self._under_way.judge(self._guard.feel(now), sample)
+        following = self._under_way.following
+        expected = doubt = sent = None
+        if following is not None:
+            self.way_back.note(sample)
+            # The arm is where its target was a look-ahead ago.
+            behind = max(following.time - self._lookahead * following.rate, 0.0)
+            planned = following.trajectory.pose(behind)
+            sent = planned[:3]
+            expected, doubt = self._expected(following.trajectory, behind, planned, sample.pose)
+        grasp = self._base @ frame_of(sample.pose)
+        decision = self._guard.look(
+            sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
+            doubt=doubt, grasp=grasp[:3, 3], sent=sent)
+        if (reading.age > _OLDEST_READING_SECONDS and decision.verdict != Verdict.STOP
+                and not self._hold_ups.has_just_woken):
+            decision = self._guard.event(f"the force sensor is silent for {reading.age:.3f} s")
+        self._under_way.judge(decision, sample)
+        self._batch.append(np.concatenate((
+            (sample.clock,), pose_of(grasp), now, self.smooth, sample.joints,
+            _NOTHING if expected is None else expected,
+            _NOTHING if doubt is None else doubt[:3, :3][_UPPER])))
+        if self._tare_until is not None and sample.clock >= self._tare_until:
+            self._end_tare()
+
+    def feel(self, sample: Sample) -> None:
+        """A force that came between two samples need not wait for the next: hard limits stop."""
+        if not self._sensor.connections:
+            return
+        try:
+            reading = self._sensor.read(sample)
+        except ConnectionError as error:
+            # A closed connection always has something to read: it would never let us wait again.
+            self._sensor.connections = ()
+            self._under_way.judge(self._guard.event(str(error)))
+            return
+        self._under_way.judge(self._guard.feel(self._chain.between(sample, reading)),
+                              at_once=True)
+
+    def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
+                  pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """What the branch is felt as where the gripper is, which is not quite where it was sent."""
+        felt = trajectory.felt(time)
+        if felt is None or trajectory.expected is None:
+            return None, None
+        wrench, slopes, covariance = felt
+        rest = trajectory.expected.rest_pose
+        off = np.concatenate((pose[:3] - planned[:3] - self._held_at[:3] + rest[:3],
+                              turn_between(planned, pose) - turn_between(rest, self._held_at)))
+        turn = self._base[:3, :3]
+        return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
+
+    def begin_tare(self, sample: Sample, seconds: float) -> None:
+        """Take the force of the next ``seconds`` [s] as nothing.
+
+        Raises:
+            SafetyStop: the robot moves.
+        """
+        if self._under_way.following is not None:
+            raise SafetyStop("The sensor cannot be tared while the robot "
+                             "moves.", "", "Wait until the robot is at "
+                                                                  "rest.")
+        self._chain.start_tare()
+        self._tare_until = sample.clock + seconds
+
+    def _end_tare(self) -> None:
+        self._tare_until = None
+        try:
+            sigma = self._chain.end_tare()
+        except WorkError as error:
+            self._tell(event="refused", order="tare", reason=str(error))
+            return
+        self._guard.tared()
+        self._tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
+                   delay_s=self._chain.delay(self._rate))
+
+    def send_batch(self) -> None:
+        """Send the samples of the last hundredths of a second."""
+        now = time.monotonic()
+        if self._batch and now - self._batch_since >= _BATCH_SECONDS:
+            rows = np.round(np.array(self._batch), 7).astype(object)
+            rows[~np.isfinite(np.array(self._batch))] = None
+            self._tell(samples=rows.tolist())
+            self._batch, self._batch_since = [], now
+
+    def close(self) -> None:
+        """Let go of the sensor."""
+        self._sensor.close()

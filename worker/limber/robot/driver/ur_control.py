@@ -1,0 +1,167 @@
+"""A controller of Universal Robots as the driver's loop moves an arm: RTDE, ur-rtde, dashboard."""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError, SafetyStop, WorkError
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.real_time import claim_real_time
+from limber.robot.interface import Sample
+from limber.robot.ur.samples import Dashboard, SampleStream
+
+_WATCHDOG_HZ = 10.0
+_GAIN = 900.0
+_STOP_DECELERATION = 8.0  # rad/s^2 of the joints
+
+
+class UrControl(SampleStream):
+    """One controller: its samples, the program that moves its arm, and its dashboard.
+
+    See :class:`limber.robot.interface.ArmControl`.
+
+    Args:
+        cell: Robot, tool and gripper.
+
+    Raises:
+        InputError: it is another robot. SafetyStop: nobody may move it now. WorkError: no data.
+    """
+
+    lookahead = 0.06
+    silence = 1.0 / _WATCHDOG_HZ
+
+    def __init__(self, cell: Cell):
+        super().__init__(cell.robot.address)
+        self._cell = cell
+        self._dashboard = Dashboard(cell.robot.address)
+        self._control: Any = None
+        self._outputs: Any = None
+        self.facts = self._identified()
+        self.facts |= _ready(self)
+        # Loaded now, to be kept in memory with the rest.
+        import_module("rtde_control")
+
+    def _identified(self) -> dict[str, Any]:
+        """What the controller says of itself, once it is the cell's."""
+        version = ".".join(map(str, self.version[:3]))
+        arm, calibrated = self._cell.arm, self._cell.robot.version
+        if self.rate != arm.rate:
+            raise InputError(f"The controller has version {version}, but the cell states "
+                             f"{arm.name}.",
+                             "They belong to different series of arms.",
+                             "Correct robot.model in the cell file.")
+        if calibrated and calibrated.split(".")[:2] != version.split(".")[:2]:
+            raise InputError(f"The controller has version {version}, but the cell was calibrated "
+                             "with "
+                             f"{calibrated}.", "Another version may have other settings of tool, "
+                             "kinematics and safety.", "Calibrate again, or compare the settings "
+                             "and correct robot.version in the cell file.")
+        ask = self._dashboard.ask
+        model = ask("get robot model")
+        facts = {"address": self.address, "version": version, "model": model,
+                 "serial": ask("get serial number"), "remote": ask("is in remote control"),
+                 "rate_hz": self.rate, "real_time": claim_real_time()}
+        known = model.lower()
+        if known.startswith("ur") and known != arm.name.rstrip("e"):
+            raise InputError(f"The robot says that it is a {model}, the cell {arm.name}.",
+                             "Reach and limits would be those of another arm.",
+                             "Correct robot.model in the cell file.")
+        if facts["remote"] == "false":
+            raise SafetyStop("The robot is not in remote control.",
+                             "It would not accept a program.",
+                             "Switch it to remote control on the pendant.")
+        return facts
+
+    def connect(self) -> None:
+        """Connect with ur-rtde, set tool, payload and watchdog.
+
+        Raises:
+            WorkError: the robot does not take its settings. RuntimeError: ur-rtde's own.
+        """
+        from rtde_control import RTDEControlInterface
+
+        tool = self._cell.tool
+        self._control = RTDEControlInterface(self.address, self.rate)
+        if tool.gripper == "digital_output":
+            from rtde_io import RTDEIOInterface
+
+            # Made now: later the watchdog would not wait for it.
+            self._outputs = RTDEIOInterface(self.address)
+        _require(self._control.setTcp(list(tool.grasp_pose)), "set its tool")
+        _require(self._control.setPayload(tool.mass_kg or 0.0, list(tool.centre_of_mass_m)),
+                 "set its payload")
+        self.watch()
+
+    def watch(self) -> None:
+        """Let the controller end its program when it hears nothing for :attr:`silence`."""
+        _require(self._control.setWatchdog(_WATCHDOG_HZ), "start its watchdog")
+
+    def program_runs(self) -> bool:
+        """Whether there is a program that takes targets."""
+        return self._control.isProgramRunning()
+
+    def start_program(self) -> bool:
+        """Upload the control program once more; ur-rtde does not wait until it runs."""
+        return self._control.reuploadScript()
+
+    def servo(self, pose: np.ndarray) -> bool:
+        """Send the next target of the tool's centre [m, rad], shape [6]."""
+        return self._control.servoL(list(pose), 0.1, 0.1, 1.0 / self.rate, self.lookahead, _GAIN)
+
+    def end_motion(self) -> bool:
+        """Brake the arm: the control program's own stop."""
+        return bool(self._control.servoStop(_STOP_DECELERATION))
+
+    def stop_at_once(self) -> None:
+        """Stop by the dashboard: it waits for no step of the controller, nor for the program."""
+        self._dashboard.stop()
+
+    def keep_alive(self) -> bool:
+        """Tell the controller that this process lives."""
+        return self._control.kickWatchdog()
+
+    def grip(self, close: bool) -> None:
+        """Close or open the gripper.
+
+        Raises:
+            InputError: it is not driven from here. WorkError: the robot does not.
+        """
+        tool = self._cell.tool
+        if self._outputs is None:
+            raise InputError("Limber does not drive the cell's gripper.",
+                             f"tool.gripper is {tool.gripper}.", "Close and open it by hand.")
+        _require(self._outputs.setStandardDigitalOut(tool.close_output, close),
+                 "drive its gripper")
+
+    def close(self) -> None:
+        """Let go of the robot."""
+        for interface in (self._outputs, self._control):
+            if interface is not None:
+                interface.disconnect()
+        super().close()
+        self._dashboard.close()
+
+
+def _ready(stream: SampleStream) -> dict[str, Any]:
+    """Where the arm stands, once it may be moved."""
+    samples: list[Sample] = stream.read(1.0)
+    if not samples:
+        raise WorkError("The robot sends no data.", "", "Restart its controller.")
+    sample = samples[-1]
+    if sample.safety_mode != 1 or sample.robot_mode != 7:
+        raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot "
+                         f"mode {sample.robot_mode}.", "Limber does not release stops or switch "
+                         "an arm on.", "Check the robot, then do it on the pendant.")
+    if sample.slider <= 0.0:
+        raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
+                         "Raise it on the pendant.")
+    return {"pose": sample.pose.tolist(), "joints": sample.joints.tolist(),
+            "slider": sample.slider}
+
+
+def _require(done: bool, what: str) -> None:
+    """Raise a WorkError where an order of ur-rtde returned no success."""
+    if not done:
+        raise WorkError(f"The robot did not {what}.", "It returned no success.",
+                        "See the controller's log, and restart the program.")

@@ -1,0 +1,55 @@
+"""Which arms there are: those of Universal Robots, any URDF file, and what is registered."""
+
+import functools
+from importlib.metadata import entry_points
+
+from limber.core.errors import InputError
+from limber.robot.interface import Arm
+from limber.robot.ur.arms import ARMS
+from limber.robot.urdf.chain_arm import ENDING, arm_of_file
+
+_ARMS: dict[str, Arm] = dict(ARMS)
+
+
+def register_arm(arm: Arm) -> None:
+    """Let cell files name ``arm``.
+
+    Limber works in several processes. A package that has an arm names its module as an entry point
+    of the group ``limber.arms``; the module registers the arm, and its driver, when it is imported.
+
+    Raises:
+        InputError: another arm has that name.
+    """
+    if _ARMS.setdefault(_plain(arm.name), arm) is not arm:
+        raise InputError(f"There is an arm {arm.name!r} already.",
+                         "A cell file would name both.", "Give it another name.")
+
+
+def arm_named(name: str) -> Arm:
+    """Return the arm called ``name``, in any case and with or without a hyphen, or a URDF file's.
+
+    Raises:
+        InputError: it is none of the known ones, or the file describes no arm.
+    """
+    if name.lower().endswith(ENDING):
+        return arm_of_file(name)
+    if _plain(name) not in _ARMS:
+        _import_packages()
+    arm = _ARMS.get(_plain(name))
+    if arm is None:
+        known = ", ".join(arm.name for arm in _ARMS.values())
+        raise InputError(f"Robot {name!r} is none of {known}.",
+                         "Its link lengths are needed.",
+                         "Known are these, and any arm by its URDF file.")
+    return arm
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("-", "").replace(" ", "")
+
+
+@functools.cache
+def _import_packages() -> None:
+    """Import what installed packages name as arms."""
+    for entry in entry_points(group="limber.arms"):
+        entry.load()

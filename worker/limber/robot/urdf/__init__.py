@@ -1,0 +1,1 @@
+"""Arms that a URDF file describes: any chain of six or more turning joints."""

@@ -1,0 +1,234 @@
+"""URDF files: the chain of turning joints from an arm's base to its flange, and its links' shapes.
+
+Read with the standard library: of a URDF only links, joints and simple shapes count here, and
+Limber needs no parser of robots for that. A document type is refused, and with it every entity.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.files.reading import read_text
+from limber.core.numerics.rigid_kernels import inverse_of
+
+_BASE = "base"
+_FLANGES = ("tool0", "flange")
+"""Links as ROS-Industrial names them (REP 199): the controller's base frame and its flange."""
+_FEWEST = 6
+Element = ElementTree.Element
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A turning joint.
+
+    Attributes:
+        name: As in the file.
+        origin: Its frame at angle 0 in that of the joint before, shape [4, 4].
+        axis: About which it turns, its frame, unit length, shape [3].
+        limits: Least and greatest angle [rad], infinite where it turns without end.
+        speed: Greatest [rad/s].
+    """
+
+    name: str
+    origin: np.ndarray
+    axis: np.ndarray
+    limits: tuple[float, float]
+    speed: float
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A link's simple shape within a rod with round ends, in the frame of joint number ``joint``
+    [m]."""
+
+    joint: int
+    name: str
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+
+@dataclass(frozen=True)
+class Chain:
+    """An arm as its file describes it.
+
+    Attributes:
+        joints: From the base on.
+        flange: Its frame in the last joint's, shape [4, 4].
+        rods: Shapes of the moving links, as far as the file has cylinders, spheres and boxes.
+    """
+
+    joints: tuple[Joint, ...]
+    flange: np.ndarray
+    rods: tuple[Rod, ...]
+
+
+class _WithoutDoctype(ElementTree.TreeBuilder):
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ElementTree.ParseError("it has a document type, in which entities could hide")
+
+
+def read_chain(path: Path) -> Chain:
+    """Read the arm of a URDF file.
+
+    It goes from the link ``base`` (else the root) to ``tool0``, ``flange``, or else the end of the
+    only chain with six or more joints.
+
+    Raises:
+        InputError: the file cannot be read, or is no arm of six or more turning joints.
+    """
+    try:
+        root = ElementTree.XML(read_text(path, "the description of an arm (URDF)"),
+                               ElementTree.XMLParser(target=_WithoutDoctype()))
+        return _Robot(root).chain()
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"Robot {str(path)!r} is no arm: {error}.",
+                         "Limber moves arms of six or more turning joints in a row.",
+                         "Correct the URDF file; run xacro first if it is one.") from error
+
+
+class _Robot:
+    """The tree of a URDF file. Its methods raise ValueError where it makes no arm."""
+
+    def __init__(self, root: Element):
+        if root.tag != "robot":
+            raise ValueError(f"its root is <{root.tag}>, not <robot>")
+        self._links = {_said(link, "name"): link for link in root.findall("link")}
+        self._above = {_said(_part(joint, "child"), "link"): joint
+                       for joint in root.findall("joint")}
+
+    def chain(self) -> Chain:
+        """The joints from the base to the flange."""
+        base = self._joints_to(_BASE) if _BASE in self._links else []
+        if any(_turns(joint) for joint in base):
+            raise ValueError(f"its link {_BASE!r} moves")
+        frame = np.eye(4)
+        for joint in base:
+            frame = frame @ _origin(joint)
+        frame = inverse_of(frame)
+        joints: list[Joint] = []
+        rods: list[Rod] = []
+        for element in self._joints_to(self._flange()):
+            frame = frame @ _origin(element)
+            if _turns(element):
+                joints.append(_joint(element, frame))
+                frame = np.eye(4)
+            if joints:
+                link = _said(_part(element, "child"), "link")
+                rods += _rods(self._links[link], link, frame, len(joints) - 1)
+        if len(joints) < _FEWEST:
+            raise ValueError(f"it has {len(joints)} turning joints up to its flange")
+        return Chain(tuple(joints), frame, tuple(rods))
+
+    def _flange(self) -> str:
+        for name in _FLANGES:
+            if name in self._links:
+                return name
+        parents = {_said(_part(joint, "parent"), "link") for joint in self._above.values()}
+        ends = [name for name in self._links if name not in parents
+                and sum(map(_turns, self._joints_to(name))) >= _FEWEST]
+        if len(ends) != 1:
+            raise ValueError(f"it has no link {' or '.join(map(repr, _FLANGES))}, and "
+                             f"{len(ends)} chains of {_FEWEST} or more turning joints")
+        return ends[0]
+
+    def _joints_to(self, link: str) -> list[Element]:
+        """The joints from the root to a link."""
+        found: list[Element] = []
+        while link in self._above:
+            found.append(self._above[link])
+            link = _said(_part(found[-1], "parent"), "link")
+            if len(found) > len(self._above):
+                raise ValueError(f"its links go in a circle at {link!r}")
+        if link not in self._links:
+            raise ValueError(f"a joint hangs on the link {link!r}, which is not there")
+        return found[::-1]
+
+
+def _turns(joint: Element) -> bool:
+    kind = _said(joint, "type")
+    if kind == "fixed":
+        return False
+    if kind not in ("revolute", "continuous") or joint.find("mimic") is not None:
+        raise ValueError(f"its joint {joint.get('name')!r} is {kind} or goes with another one")
+    return True
+
+
+def _joint(element: Element, origin: np.ndarray) -> Joint:
+    name, limit = _said(element, "name"), element.find("limit")
+    speed = None if limit is None else limit.get("velocity")
+    if limit is None or speed is None or not float(speed) > 0.0:
+        raise ValueError(f"its joint {name!r} states no limit of its velocity")
+    limits = (-np.inf, np.inf)
+    if _said(element, "type") == "revolute":
+        limits = float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
+        if not limits[0] < limits[1]:
+            raise ValueError(f"its joint {name!r} has no range between lower and upper")
+    given = element.find("axis")
+    axis = _vector((1.0, 0.0, 0.0) if given is None else _said(given, "xyz").split())
+    if not np.linalg.norm(axis) > 0.0:
+        raise ValueError(f"its joint {name!r} has an axis without direction")
+    return Joint(name, origin, axis / np.linalg.norm(axis), limits, float(speed))
+
+
+def _rods(link: Element, name: str, frame: np.ndarray, joint: int) -> list[Rod]:
+    """The simple shapes of a link, each within a rod; meshes are left out."""
+    found = []
+    for collision in link.findall("collision"):
+        shape = _part(_part(collision, "geometry"), "*")
+        along, radius = _axis_and_radius(shape)
+        if radius > 0.0:
+            place = frame @ _origin(collision)
+            half = place[:3, :3] @ (0.5 * along)
+            found.append(Rod(joint, name, place[:3, 3] - half, place[:3, 3] + half, radius))
+    return found
+
+
+def _axis_and_radius(shape: Element) -> tuple[np.ndarray, float]:
+    """A shape's longest axis [m, 3] and how far it reaches beside it [m]; 0 for a mesh."""
+    if shape.tag == "sphere":
+        return np.zeros(3), float(_said(shape, "radius"))
+    if shape.tag == "cylinder":
+        return np.array([0.0, 0.0, float(_said(shape, "length"))]), float(_said(shape, "radius"))
+    if shape.tag == "box":
+        size = _vector(_said(shape, "size").split())
+        longest = np.eye(3)[int(size.argmax())]
+        return size * longest, 0.5 * float(np.linalg.norm(size * (1.0 - longest)))
+    return np.zeros(3), 0.0
+
+
+def _origin(element: Element) -> np.ndarray:
+    """The frame of an element in its parent's: roll, pitch and yaw about fixed axes."""
+    from scipy.spatial.transform import Rotation
+
+    frame, origin = np.eye(4), element.find("origin")
+    if origin is not None:
+        frame[:3, :3] = Rotation.from_euler(
+            "xyz", _vector(origin.get("rpy", "0 0 0").split())).as_matrix()
+        frame[:3, 3] = _vector(origin.get("xyz", "0 0 0").split())
+    return frame
+
+
+def _vector(parts: object) -> np.ndarray:
+    vector = np.array(parts, float)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{parts} are not three finite numbers")
+    return vector
+
+
+def _part(element: Element, tag: str) -> Element:
+    part = element.find(tag)
+    if part is None:
+        raise ValueError(f"its <{element.tag}> {element.get('name', '')!r} has no <{tag}>")
+    return part
+
+
+def _said(element: Element, key: str) -> str:
+    value = element.get(key)
+    if value is None:
+        raise ValueError(f"one of its <{element.tag}> has no {key}")
+    return value
