@@ -1,5 +1,6 @@
 """A virtual controller stepped by hand, and one in a process with the real client on it."""
 
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -8,8 +9,14 @@ import numpy as np
 import pytest
 
 from benchmarks.held_up import HELD_UP_SECONDS, Witness
+from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
+from limber.mechanics.status import Status
 from limber.robot.virtual.controller import Controller
+from limber.store import Branch
+from limber.store.loading import load_grasp_model, load_skeleton
+
+FRACTION = 0.92  # of the main path, where the small branch is planned to be held
 
 
 class Registers:
@@ -65,6 +72,56 @@ def robots(worker_address):
                    for beside, model, seed in ((20, "ur5", 3), (40, "ur5e", 5))]
         yield {robot.model: stack.enter_context(robot) for robot in
                (each.result() for each in started)}
+
+
+def planned_in(folder, force: float = 1.5) -> None:
+    """Write the way on which a growing sideways force takes the branch: it stretches nothing."""
+    from limber.mechanics import solve_static
+
+    branch = Branch.open(folder)
+    model = load_grasp_model(branch, gravity=True)
+    direction = sideways(branch, FRACTION)
+    state, positions = model.rest, []
+    for part in np.linspace(0, force, 9):
+        state = solve_static(model.model, grasp=model.grasp, grasp_force=part * direction,
+                             start=state)
+        assert state.converged
+        positions.append(model.pose(state.displacement)[:3])
+    results = model.follow(np.array(positions), model.rest.displacement)
+    assert all(result.status == Status.converged for result in results)
+    rows = [np.r_[k, model.pose(result.displacement), 0, np.linalg.norm(result.reaction_force), 0]
+            for k, result in enumerate(results)]
+    with branch.stage("plan:path") as stage:
+        lines = ["s_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,energy_j,force_n,strain"]
+        lines += [",".join(f"{x:.9g}" for x in row) for row in rows]
+        stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture(scope="package")
+def planned_template(branch_template, tmp_path_factory):
+    """The small branch with its true moduli in the mesh, and a plan."""
+    from limber.estimation.simulated_pull import VirtualPullSettings
+    from limber.mechanics.materials.young_field import young_weights
+    from limber.stages.pulls.virtual_pull import load_truth
+    from limber.store.loading import load_mesh
+
+    folder = shutil.copytree(branch_template, tmp_path_factory.mktemp("plans") / "planned.branch")
+    branch = Branch.open(folder)
+    truth = load_truth(branch, VirtualPullSettings())
+    mesh = load_mesh(branch)
+    young = young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float)
+    held = np.linalg.norm(mesh.nodes - load_skeleton(branch).point_at(FRACTION), axis=1) < 0.012
+    with branch.stage("estimate") as stage:
+        mesh.with_data(cell_data={**mesh.cell_data, "young": young},
+                       point_data={**mesh.point_data, "grasp": held.astype(int)},
+                       ).write(stage.path("mesh.vtu"))
+    planned_in(folder)
+    return folder
+
+
+@pytest.fixture
+def planned_folder(planned_template, tmp_path):
+    return shutil.copytree(planned_template, tmp_path / "planned.branch")
 
 
 @pytest.fixture

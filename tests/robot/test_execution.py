@@ -1,18 +1,16 @@
 """A path as motion of a robot, and `limber execute` on the virtual robot that holds the branch."""
 
-import shutil
 import time
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from benchmarks.robot_cells import cell_file, robot_holding, standing_at
 from benchmarks.robot_faults import restored
 from limber.core.errors import InputError, NoPathError, SafetyStop
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
-from limber.mechanics.status import Status
 from limber.robot.cell.base_calibration import fit_base
 from limber.robot.cell.cell import ApproachEntry, Cell
 from limber.robot.cell.compatibility import check_plan
@@ -27,7 +25,7 @@ from limber.stages.paths.execute import (
     execute,
 )
 from limber.store import Branch
-from limber.store.loading import load_grasp_model, load_skeleton
+from limber.store.loading import load_skeleton
 
 FRACTION = 0.92
 
@@ -146,56 +144,6 @@ def test_what_was_followed_is_measured():
     for sigma, share in ((0.02, 0.0), (0.04, 1.0)):
         samples[:, 31:37] = np.array([1, 0, 0, 1, 0, 1]) * sigma**2
         assert followed(samples, np.array([[0, 0, 0], [0.1, 0, 0.0]])).force_within == share
-
-
-def planned_in(folder, force: float = 1.5) -> None:
-    """Write the way on which a growing sideways force takes the branch: it stretches nothing."""
-    from limber.mechanics import solve_static
-
-    branch = Branch.open(folder)
-    model = load_grasp_model(branch, gravity=True)
-    direction = sideways(branch, FRACTION)
-    state, positions = model.rest, []
-    for part in np.linspace(0, force, 9):
-        state = solve_static(model.model, grasp=model.grasp, grasp_force=part * direction,
-                             start=state)
-        assert state.converged
-        positions.append(model.pose(state.displacement)[:3])
-    results = model.follow(np.array(positions), model.rest.displacement)
-    assert all(result.status == Status.converged for result in results)
-    rows = [np.r_[k, model.pose(result.displacement), 0, np.linalg.norm(result.reaction_force), 0]
-            for k, result in enumerate(results)]
-    with branch.stage("plan:path") as stage:
-        lines = ["s_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,energy_j,force_n,strain"]
-        lines += [",".join(f"{x:.9g}" for x in row) for row in rows]
-        stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-@pytest.fixture(scope="module")
-def planned_template(branch_template, tmp_path_factory):
-    """The small branch with its true moduli in the mesh, and a plan."""
-    from limber.estimation.simulated_pull import VirtualPullSettings
-    from limber.mechanics.materials.young_field import young_weights
-    from limber.stages.pulls.virtual_pull import load_truth
-    from limber.store.loading import load_mesh
-
-    folder = shutil.copytree(branch_template, tmp_path_factory.mktemp("plans") / "planned.branch")
-    branch = Branch.open(folder)
-    truth = load_truth(branch, VirtualPullSettings())
-    mesh = load_mesh(branch)
-    young = young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float)
-    held = np.linalg.norm(mesh.nodes - load_skeleton(branch).point_at(FRACTION), axis=1) < 0.012
-    with branch.stage("estimate") as stage:
-        mesh.with_data(cell_data={**mesh.cell_data, "young": young},
-                       point_data={**mesh.point_data, "grasp": held.astype(int)},
-                       ).write(stage.path("mesh.vtu"))
-    planned_in(folder)
-    return folder
-
-
-@pytest.fixture
-def planned_folder(planned_template, tmp_path):
-    return shutil.copytree(planned_template, tmp_path / "planned.branch")
 
 
 @pytest.mark.slow

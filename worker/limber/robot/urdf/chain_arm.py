@@ -152,7 +152,7 @@ class UrdfArm:
 
     @cached_property
     def _best_condition(self) -> float:
-        return float(self._conditions(self.home))
+        return float(self._conditions(self.home)[0])
 
     @cached_property
     def _origins(self) -> np.ndarray:

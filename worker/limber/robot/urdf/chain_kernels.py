@@ -63,6 +63,13 @@ def _slopes(axes: np.ndarray, frames: np.ndarray, slopes: np.ndarray) -> None:
 
 
 @compiled
+def _off(frame: np.ndarray, flange: np.ndarray, off: np.ndarray) -> None:
+    """Fill the way [m] and the turn [rad] from the flange to where it is wanted, shape [6]."""
+    off[:3] = frame[:3, 3] - flange[:3, 3]
+    off[3:] = rotation_vector(frame @ inverse_of(flange))
+
+
+@compiled
 def chain_frames(origins: np.ndarray, axes: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Return the frames of the joints and the flange in the base's, shape [poses, n + 1, 4, 4]."""
     frames = np.empty((len(joints), len(origins), 4, 4))
@@ -97,17 +104,14 @@ def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np
     chain, tried = np.empty((count + 1, 4, 4)), np.empty((count + 1, 4, 4))
     slopes, off, off_tried = np.empty((6, count)), np.empty(6), np.empty(6)
     for number in range(len(frames)):
-        if is_path and number > 0:
-            if np.isnan(found[number - 1, 0]):
-                break
-            there = found[number - 1].copy()
-        else:
-            there = starts[number].copy()
+        is_later = is_path and number > 0
+        there = found[number - 1].copy() if is_later else starts[number].copy()
+        if np.isnan(there[0]):
+            continue
         joints, damping, least = there, 1e-3, np.inf
         for _ in range(_MOST_STEPS):
             _chained(origins, axes, there, tried)
-            off_tried[:3] = frames[number, :3, 3] - tried[count, :3, 3]
-            off_tried[3:] = rotation_vector(frames[number] @ inverse_of(tried[count]))
+            _off(frames[number], tried[count], off_tried)
             square = (off_tried * off_tried).sum()
             if square < least:
                 joints, least = there, square
