@@ -4,6 +4,9 @@ Six joints: base about z, shoulder and elbow about y, and a wrist whose three ax
 in a point. Its links, inverse kinematics and controller have nothing of a UR's.
 """
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,6 +129,31 @@ def test_it_is_known_by_its_name_and_no_other_arm_is():
     assert arm_named("Pieper 6") is ARM
     with pytest.raises(InputError, match="There is an arm 'pieper-6' already"):
         register_arm(PieperArm())
+
+
+_PLUGGED = """
+from dataclasses import replace
+from limber.robot.known_arms import register_arm
+from limber.robot.ur.arms import ARMS
+register_arm(replace(ARMS["ur5"], name="plugged-6"))
+"""
+_ASKED = "from limber.robot.known_arms import arm_named; print(arm_named('plugged 6').name)"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module, told", [("plugged", "plugged-6"),
+                                          ("gone", "The arm 'six' of gone cannot be imported")])
+def test_an_installed_package_has_its_arm_known_in_every_process(tmp_path, module, told):
+    (tmp_path / "plugged.py").write_text(_PLUGGED, encoding="utf-8")
+    (tmp_path / "plugged-1.0.dist-info").mkdir()
+    (tmp_path / "plugged-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: plugged\nVersion: 1.0\n", encoding="utf-8")
+    (tmp_path / "plugged-1.0.dist-info" / "entry_points.txt").write_text(
+        f"[limber.arms]\nsix = {module}\n", encoding="utf-8")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    asked = subprocess.run([sys.executable, "-c", _ASKED], capture_output=True, text=True,
+                           check=False, env={**os.environ, "PYTHONPATH": path})
+    assert told in asked.stdout + asked.stderr
 
 
 def test_its_kinematics_agree_with_each_other():

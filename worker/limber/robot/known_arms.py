@@ -29,7 +29,8 @@ def arm_named(name: str) -> Arm:
     """Return the arm called ``name``, in any case and with or without a hyphen, or a URDF file's.
 
     Raises:
-        InputError: it is none of the known ones, or the file describes no arm.
+        InputError: it is none of the known ones, the file describes no arm, or an installed
+            package of arms is not whole.
     """
     if name.lower().endswith(ENDING):
         return arm_of_file(name)
@@ -50,6 +51,15 @@ def _plain(name: str) -> str:
 
 @functools.cache
 def _import_packages() -> None:
-    """Import what installed packages name as arms."""
+    """Import what installed packages name as arms.
+
+    Raises:
+        InputError: one cannot be imported.
+    """
     for entry in entry_points(group="limber.arms"):
-        entry.load()
+        try:
+            entry.load()
+        except ImportError as error:
+            raise InputError(f"The arm {entry.name!r} of {entry.value} cannot be imported "
+                             f"({error}).", "Its package is not whole.",
+                             "Install it again, or remove it.") from error

@@ -99,7 +99,7 @@ class UnderWay:
         try:
             stopped = self._control.end_motion()
         except RuntimeError as error:
-            self._tell(event="warning", text=f"servoStop: {error}")
+            self._tell(event="warning", text=f"stop of the control program: {error}")
         if not stopped and not self._was_stopped_at_once:
             self._stop_at_once("the control program did not confirm the stop")
 
@@ -109,8 +109,8 @@ class UnderWay:
             self._was_stopped_at_once = True
             self._tell(event="second_channel", reason=why)
         except OSError as error:
-            self._tell(event="warning", text=f"dashboard stop: {error}; the controller's watchdog "
-                       f"ends its program in {self._control.silence:.2f} s")
+            self._tell(event="warning", text=f"stop past the control program: {error}; the "
+                       f"controller's watchdog ends its program in {self._control.silence:.2f} s")
 
     def lose(self, reason: str) -> None:
         """The data connection is gone: nothing is known, so everything that stops is used."""
