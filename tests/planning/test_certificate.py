@@ -10,7 +10,7 @@ from limber.core.progress import Progress
 from limber.planning.certificate import lower_bound
 from limber.planning.certificate.lower_bound import certify
 from limber.planning.cost import CostWeights, resample
-from limber.planning.field.energy_field import among_obstacles
+from limber.planning.field.energy_field import knowing
 from limber.planning.field.trust import TrustRegion
 from limber.planning.goals.grasp import GraspGoal
 from limber.planning.goals.regions import Ball
@@ -147,7 +147,7 @@ def test_a_path_is_led_around_an_obstacle(ridge_field, across):
     def closeness(points):
         return np.exp((0.05**2 - ((points - centre)**2).sum(axis=1)) / 0.01)
 
-    field = among_obstacles(ridge_field, closeness(ridge_field.samples.positions))
+    field = knowing(ridge_field, {"closeness": closeness(ridge_field.samples.positions)})
     assert np.abs(field.load(free.points, "closeness") - closeness(free.points)).max() < 0.2
     found = plan_gentle(problem_on(field, closeness=0.9), enough=0.1)
     fine = resample(found.points, 0.001)

@@ -12,7 +12,7 @@ from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.motion_check import MotionCheck, check_motion
-from limber.planning.constraints.obstacles import Box
+from limber.planning.constraints.obstacles import Box, Obstacles
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
@@ -91,8 +91,8 @@ def test_an_obstacle_is_met_in_motion(small_model, bent):
     tip = bent.solved.tips[-1]
     for place, met in ((tip, True), (tip + [0.0, 0.1, 0.0], False)):
         post = Box("the post", np.full(3, 0.01), place, np.eye(3))
-        found = check_motion(small_model, bent, Limits(obstacles=(post,)), Pace(0.1, 1.0),
-                             slowings=0, workers=1)
+        limits = Limits(constraints=(Obstacles((post,)),))
+        found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=0, workers=1)
         assert any("inside the post" in words for words in found.broken) == met
 
 

@@ -20,7 +20,7 @@ from limber.planning.constraints.full_model_check import broken_on_full_model, f
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.motion_check import MotionCheck, check_motion
 from limber.planning.cost import STEP, resample
-from limber.planning.field.energy_field import EnergyField, among_obstacles, refit
+from limber.planning.field.energy_field import EnergyField, knowing, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import displacements_at
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
@@ -92,8 +92,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
                                cell or {}))
     start = start_of(field, goal, settings)
     limits = limits or Limits.of(settings)
-    if limits.obstacles:
-        field = _among(field, grasp_model, limits, workers, progress)
+    if limits.constraints:
+        field = _knowing(field, grasp_model, limits, workers, progress)
     rounds = _Rounds(grasp_model, settings, limits, goal, start, doubt, workers, field, goal,
                      limits, pace or Pace(settings.speed, settings.acceleration), progress)
     for number in range(settings.replans + 1):
@@ -253,21 +253,22 @@ class _Rounds:
                              pair.certificate.to_go)
 
 
-def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, workers: int | None,
-           progress: Progress) -> EnergyField:
-    """Return the field that knows how close the branch is to obstacles.
+def _knowing(field: EnergyField, grasp_model: GraspModel, limits: Limits, workers: int | None,
+             progress: Progress) -> EnergyField:
+    """Return the field that knows what the constraints are on.
 
     Raises:
-        NoPathError: it meets one where it hangs.
+        NoPathError: one is broken where the branch hangs.
     """
-    nodes = grasp_model.mesh.nodes
-    at_rest = limits.closeness_of(nodes, grasp_model.rest.displacement[None])[0]
-    if at_rest > 1.0:
-        raise NoPathError("The branch meets an obstacle where it hangs.",
-                          "No path begins there.", "Correct the obstacles in the cell file.")
-    displacements = displacements_at(grasp_model, field.samples.positions, workers=workers,
+    nodes, rest = grasp_model.mesh.nodes, grasp_model.rest.displacement
+    if met := limits.met(field.rest[None], nodes + rest[None]):
+        raise NoPathError(f"The branch cannot start where it hangs: {'; '.join(met)}.",
+                          "No path begins there.",
+                          "Correct the obstacles in the cell file, or the limit.")
+    grasps = field.samples.positions
+    displacements = displacements_at(grasp_model, grasps, workers=workers,
                                      progress=progress.part(0.0, 0.1))
-    return among_obstacles(field, limits.closeness_of(nodes, displacements))
+    return knowing(field, limits.values(grasps, nodes + displacements))
 
 
 def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:

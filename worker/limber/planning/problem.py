@@ -6,7 +6,8 @@ import numpy as np
 
 from limber.core.errors import NoPathError
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
-from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.limited import limited
 from limber.planning.goals.goal import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
@@ -47,8 +48,8 @@ class GentleProblem:
         """The limits ``beyond`` which a pose surely is not allowed; infinite where unknown."""
         if self.beyond is not None:
             return self.beyond
-        return self.limits._replace(max_energy=np.inf, max_force=np.inf, max_loads=np.full(
-            len(LOADS), np.inf))
+        return self.limits._replace(max_energy=np.inf, max_force=np.inf,
+                                    max_loads=np.full_like(self.limits.max_loads, np.inf))
 
     def cost(self, path: np.ndarray) -> float:
         """Return the cost of a polyline [n, 3]; infinite if it breaks a limit, is too long or
@@ -67,24 +68,22 @@ class GentleProblem:
 
     def limits_in_words(self) -> str:
         """Return the limits that there are, or an empty string."""
-        return _in_words(self.limits)
+        return _in_words(self, self.limits)
 
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
         return float(self.goal.distance(self.energy_field, point[None])[0]) - self.goal.tolerance
 
 
-def _in_words(limits: FieldArrays) -> str:
-    kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
-        ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
-        *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
-             ("", "Pa", "N", "Nm", "(1: it touches)"), strict=True)) if value < np.inf]
+def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:
+    kept = [f"{one.words} {one.with_unit(one.limit)}"
+            for one in limited(problem.energy_field, limits)]
     return (" at most " + " and ".join(kept)) if kept else ""
 
 
 def no_way(problem: GentleProblem, proof: str) -> NoWayError:
     """Return what is said where no path exists, and how that is proven."""
-    counted = _in_words(problem.sure_limits)
+    counted = _in_words(problem, problem.sure_limits)
     if counted:
         proof += (" The largest error of the energy field on samples left out is counted: none "
                   f"leads there with{counted} on the field either.")

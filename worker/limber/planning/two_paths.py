@@ -8,9 +8,10 @@ import numpy as np
 from limber.core.errors import InputError, NoPathError
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.lower_bound import Certificate
-from limber.planning.constraints.limits import UNITS, Limits
+from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.limited import UNITS
 from limber.planning.goals.allowed_poses import (
     GoalOverLimitsError,
     allowed_points,
@@ -126,7 +127,7 @@ def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goa
 
 def _told(margins: dict[str, float]) -> str:
     return ", ".join(f"{name.replace('_', ' ')} " + (
-        f"{value:.2g} {UNITS[name]}".rstrip() if value < np.inf else "not known")
+        f"{value:.2g} {UNITS.get(name, '')}".rstrip() if value < np.inf else "not known")
         for name, value in margins.items() if value)
 
 

@@ -6,10 +6,11 @@ import numpy as np
 
 from limber.core.progress import SILENT, Progress
 from limber.planning.constraints.full_model_check import learnt
-from limber.planning.constraints.limits import UNITS, Limits, sizes
+from limber.planning.constraints.limits import Limits, sizes
 from limber.planning.cost import STEP, resample
 from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.limited import UNITS
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp import near
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
 from limber.planning.field.chart import Chart
-from limber.planning.field.energy_field import LOADS, FieldArrays
+from limber.planning.field.energy_field import FieldArrays
 from limber.planning.field.trust import nearest_of
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.problem import GentleProblem
@@ -247,7 +247,7 @@ def _limited(problem: GentleProblem, limits: FieldArrays, positions: np.ndarray,
     if limits.max_energy < np.inf:
         yield (field.energy(positions), field.force(positions),
                limits.max_energy + problem.field_error)
-    for name, limit in zip(LOADS, limits.max_loads, strict=True):
+    for name, limit in zip(field.load_names, limits.max_loads, strict=True):
         if limit < np.inf:
             load = field.load(positions, name)
             yield load**2, 2.0 * load[:, None] * field.load_gradient(positions, name), limit**2

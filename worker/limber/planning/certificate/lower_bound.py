@@ -33,7 +33,6 @@ from limber.planning.certificate.subsolution import (
     terrain,
     widened,
 )
-from limber.planning.field.energy_field import LOADS
 from limber.planning.problem import GentleProblem, NoWayError, no_way, not_found
 from limber.planning.search_files import CostToGo
 
@@ -251,7 +250,7 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: 
     if limits.max_energy < np.inf:
         over |= least_between(energy, grid.along_edges(force), cells) > (
             limits.max_energy + problem.field_error)
-    for name, limit in zip(LOADS, limits.max_loads, strict=True):
+    for name, limit in zip(field.load_names, limits.max_loads, strict=True):
         if limit < np.inf:
             nodes = np.argwhere(widened(corners_of(cells)))
             points = grid.points(nodes)

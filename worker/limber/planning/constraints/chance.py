@@ -190,8 +190,8 @@ class YoungDoubt:
         Raises:
             ConvergenceError: the branch with other moduli cannot be solved at a pose.
         """
-        # How close the branch comes to obstacles hardly depends on its modulus.
-        asked = {name: limit for name, limit in limits.asked().items() if name != "closeness"}
+        # Where the branch is with its grasp at a place hardly depends on its modulus.
+        asked = limits.asked_loads()
         whole = path.approach.joined(path.solved)
         chosen = whole.take(_chosen(whole, asked))
         axes = _axes(self.covariance)

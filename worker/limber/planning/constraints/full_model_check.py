@@ -20,8 +20,8 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
                          ) -> list[str]:
     """Return what is wrong with a motion, each with its place; nothing if it may be used.
 
-    Every pose of approach and path must have an acceptable solution within the limits, clear of
-    obstacles, and its end must be in the goal region. The way back takes the same states.
+    Every pose of approach and path must have an acceptable solution within the limits, keep the
+    constraints, and its end must be in the goal region. The way back takes the same states.
 
     Args:
         path: Solved on the full model.
@@ -40,9 +40,7 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
         off = goal.missed_by(path.solved)
         if off > goal.tolerance * _SLACK:
             told.append(f"{goal.what} ends {1e3 * off:.1f} mm outside its goal")
-    if met := limits.met(whole, nodes):
-        told.append(met)
-    return told
+    return told + limits.met(whole.poses[:, :3], nodes + whole.displacements)
 
 
 def field_error(field: EnergyField, states: SolvedPoses) -> float:
@@ -60,10 +58,9 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
     and where the field is off most; and poses that have no solution as rejected ones."""
     whole = path.approach.joined(path.solved)
     off = np.abs(field.energy(whole.poses[:, :3]) - whole.energies)
-    close = None
-    if limits.obstacles:
-        close = limits.closeness_of(grasp_model.mesh.nodes, whole.displacements)
-    broken = np.flatnonzero(~limits.kept(whole) | (False if close is None else close > 1.0))
+    added = limits.values(whole.poses[:, :3], grasp_model.mesh.nodes + whole.displacements)
+    over = [added[each.name] > each.limit for each in limits.constraints]
+    broken = np.flatnonzero(np.logical_or.reduce([~limits.kept(whole), *over]))
     order = np.concatenate([[len(off) - 1], broken[:: max(1, 2 * len(broken) // _MOST_LEARNT)],
                             np.argsort(-off)])
     chosen: list[int] = []
@@ -76,7 +73,7 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
             chosen.append(int(index))
     found = _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved,
                         field.samples)
-    return found if close is None else replace(found, closeness=close[chosen])
+    return replace(found, added={name: values[chosen] for name, values in added.items()})
 
 
 def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarray,

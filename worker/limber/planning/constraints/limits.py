@@ -5,20 +5,19 @@ are tighter by a margin: what 95 % of the samples near the limit, each left out 
 are missed by at most. Whether a limit is kept is decided on the full model alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from limber.core.errors import InputError
 from limber.mechanics.materials.species import strain_limit
-from limber.planning.constraints.obstacles import Obstacle, closeness, closest
-from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays, GraspSamples
+from limber.planning.constraints.constraint import Broken, Constraint
+from limber.planning.constraints.obstacles import Obstacle, Obstacles
+from limber.planning.field.energy_field import EnergyField, FieldArrays, GraspSamples
+from limber.planning.field.limited import UNITS
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
-
-UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
-         "torque": "Nm", "closeness": ""}
-"""Of the limits, by the names that they have in :class:`Limits`."""
 
 _COVERED = 0.95  # of the samples near a limit
 _NEAR = (0.5, 1.3)  # times the limit
@@ -26,24 +25,8 @@ _FEWEST = 12  # samples near it; else all are asked
 _MOST = 0.3  # of the limit: where the field is worse, the check on the full model has to tell
 
 
-@dataclass(frozen=True)
-class Broken:
-    """A limit that a state of the full model does not keep.
-
-    Attributes:
-        name: Which, with its unit.
-        value, limit: The state's and what was asked.
-        position: Of the grasp there [m], shape [3].
-    """
-
-    name: str
-    value: float
-    limit: float
-    position: np.ndarray
-
-    def __str__(self) -> str:
-        place = ", ".join(f"{x:.3f}" for x in self.position)
-        return f"{self.name} {self.value:.4g} where {self.limit:.4g} is allowed, at ({place}) m"
+CONSTRAINTS: list[Callable[[PlanSettings], Constraint | None]] = []
+"""What makes constraints from outside from a plan's settings, or None where none is asked for."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +39,8 @@ class Limits:
         strain, stress: Largest principal anywhere in the branch, stress in Pa.
         axial_force: Of the gripper along the branch, pulling or pushing [N].
         torque: Of the gripper [Nm].
-        closeness: Of the branch to the obstacles (:func:`~.obstacles.closeness`).
         low, high: Box that the grasp stays in [m], shape [3].
-        obstacles: Bodies that the branch must not meet.
+        constraints: What is forbidden besides.
     """
 
     energy: float = np.inf
@@ -67,10 +49,9 @@ class Limits:
     stress: float = np.inf
     axial_force: float = np.inf
     torque: float = np.inf
-    closeness: float = np.inf
     low: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
-    obstacles: tuple[Obstacle, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
 
     def with_cell(self, low: np.ndarray | None, high: np.ndarray | None, force: float,
                   obstacles: tuple[Obstacle, ...]) -> "Limits":
@@ -79,8 +60,9 @@ class Limits:
         Raises:
             InputError: the workspaces have nothing in common.
         """
-        both = replace(self, force=min(self.force, force), obstacles=obstacles,
-                       closeness=1.0 if obstacles else np.inf,
+        more = (Obstacles(obstacles),) if obstacles else ()
+        both = replace(self, force=min(self.force, force),
+                       constraints=(*more, *self.constraints),
                        low=self.low if low is None else np.maximum(self.low, low),
                        high=self.high if high is None else np.minimum(self.high, high))
         if not (both.low < both.high).all():
@@ -89,20 +71,14 @@ class Limits:
                              "Correct --workspace-low and --workspace-high, or the cell file.")
         return both
 
-    def closeness_of(self, nodes: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-        """Return how close the branch is to obstacles in states [k, n, 3], shape [k]."""
-        return np.array([closeness(self.obstacles, nodes + moved) for moved in displacements])
+    def values(self, grasps: np.ndarray, nodes: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what the constraints are on in states with the grasp at ``grasps`` [k, 3] and the
+        nodes at ``nodes`` [k, n, 3], by name, shape [k] each."""
+        return {each.name: each.values(grasps, nodes) for each in self.constraints}
 
-    def met(self, states: SolvedPoses, nodes: np.ndarray) -> str | None:
-        """Return in words where the branch, with ``nodes`` [n, 3] at rest, meets an obstacle."""
-        if not self.obstacles:
-            return None
-        places = (nodes + states.displacements).reshape(-1, 3)
-        if (hit := closest(self.obstacles, places)) is None:
-            return None
-        name, depth, where = hit
-        place = ", ".join(f"{x:.3f}" for x in where)
-        return f"the branch is {1e3 * depth:.1f} mm inside {name} at ({place}) m"
+    def met(self, grasps: np.ndarray, nodes: np.ndarray) -> list[str]:
+        """Return in words which constraints such states break."""
+        return [words for each in self.constraints if (words := each.broken(grasps, nodes))]
 
     @classmethod
     def of(cls, settings: PlanSettings, stiffer: float = 1.0) -> "Limits":
@@ -129,26 +105,35 @@ class Limits:
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
                    strain, (settings.max_stress or np.inf) / stiffer,
                    settings.max_axial_force or np.inf, settings.max_torque or np.inf, low=low,
-                   high=high)
+                   high=high, constraints=tuple(made for make in CONSTRAINTS
+                                                if (made := make(settings)) is not None))
 
     def tightened(self, factors: dict[str, float]) -> "Limits":
-        """Return the limits divided by ``factors``, by the names of ``UNITS``."""
-        return replace(self, **{name: getattr(self, name) / factor
-                                for name, factor in factors.items()})
+        """Return the limits divided by ``factors``, by the names of ``asked``."""
+        of_loads = {name: limit / factors[name] for name, limit in self.asked_loads().items()
+                    if name in factors}
+        return replace(self, **of_loads, constraints=tuple(
+            each.tightened(factors[each.name]) if each.name in factors else each
+            for each in self.constraints))
+
+    def asked_loads(self) -> dict[str, float]:
+        """Return the limits without constraints that were asked for, by the names of ``UNITS``."""
+        limits = {name: getattr(self, name, np.inf) for name in UNITS}
+        return {name: limit for name, limit in limits.items() if limit < np.inf}
 
     def asked(self) -> dict[str, float]:
-        """Return the limits that were asked for, by the names of ``UNITS``."""
-        return {name: getattr(self, name) for name in UNITS if getattr(self, name) < np.inf}
+        """Return the limits that were asked for, by the names of ``UNITS`` and of constraints."""
+        return self.asked_loads() | {each.name: each.limit for each in self.constraints}
 
     def margins(self, known: EnergyField) -> "dict[str, float]":
         """Return how much tighter than asked to plan on a field: by limit, 0 for none asked."""
         missed = {"energy": known.missed[:, 0],
                   "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
-                  **dict(zip(LOADS, known.missed[:, 4:].T, strict=True))}
+                  **dict(zip(known.load_names, known.missed[:, 4:].T, strict=True))}
         values, inner = _sampled(known.samples), ~known.region.is_face()
         found = dict.fromkeys(UNITS, 0.0)
         for name, limit in self.asked().items():
-            if values[name] is None:
+            if values.get(name) is None:
                 raise InputError(f"The energy field knows no {name.replace('_', ' ')}.",
                                  "It was sampled by an older program.",
                                  "Run `limber energy` again with --force.")
@@ -171,10 +156,11 @@ class Limits:
         inner, values = ~known.region.is_face(), _sampled(known.samples)
         above = _above(known)
         for name, limit in self.asked().items():
-            size, more = values[name], above[name]
+            size = values.get(name)
             if size is None:
                 found[name] = np.inf
                 continue
+            more = above[name]
             sure = inner & np.isfinite(more)
             near = sure & (np.abs(size) < _NEAR[1] * limit)
             near = near if near.sum() >= _FEWEST else sure
@@ -187,10 +173,10 @@ class Limits:
 
     def on(self, known: EnergyField, margins: dict[str, float] | None = None) -> FieldArrays:
         """Return the field with these limits for compiled loops, tighter by ``margins``."""
-        less = margins or dict.fromkeys(UNITS, 0.0)
-        tighter = {name: getattr(self, name) - less[name] for name in UNITS}
-        return known.limited(tighter.pop("energy"), tighter.pop("force"), low=self.low,
-                             high=self.high, **tighter)
+        less = margins or {}
+        tighter = {name: limit - less.get(name, 0.0) for name, limit in self.asked().items()}
+        return known.limited(tighter.pop("energy", np.inf), tighter.pop("force", np.inf),
+                             low=self.low, high=self.high, **tighter)
 
     def broken(self, states: SolvedPoses) -> list[Broken]:
         """Return the limits that states of the full model break, each where it is worst."""
@@ -226,7 +212,7 @@ def _above(known: EnergyField) -> dict[str, np.ndarray]:
              "force": np.linalg.norm(samples.forces + missed[:, 1:4], axis=1) - size}
     table = samples.load_table
     more = np.abs(table + missed[:, 4:]) - np.abs(table)
-    return above | dict(zip(LOADS, more.T, strict=True))
+    return above | dict(zip(known.load_names, more.T, strict=True))
 
 
 def with_unit(name: str) -> str:

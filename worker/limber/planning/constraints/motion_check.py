@@ -16,10 +16,11 @@ from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult, NewmarkSettings
-from limber.planning.constraints.limits import UNITS, Broken, Limits, sizes, with_unit
-from limber.planning.constraints.obstacles import closest
+from limber.planning.constraints.constraint import Broken
+from limber.planning.constraints.limits import Limits, sizes, with_unit
 from limber.planning.cost import STEP
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.limited import UNITS
 from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.timing import Pace, poses_at, time_law
 
@@ -116,11 +117,8 @@ def _moved(grasp_model: GraspModel, poses: np.ndarray, start: np.ndarray, pace: 
     broken = [str(Broken(f"{name.replace('_', ' ')} in motion [{UNITS[name]}]".replace(" []", ""),
                          float(size.max()), getattr(limits, name), places[size.argmax()]))
               for name, size in values.items() if size.max() > getattr(limits, name)]
-    nodes = (grasp_model.mesh.nodes + found.displacement).reshape(-1, 3)
-    if limits.obstacles and (hit := closest(limits.obstacles, nodes)):
-        where = ", ".join(f"{x:.3f}" for x in hit[2])
-        broken.append(f"in motion the branch is {1e3 * hit[1]:.1f} mm inside {hit[0]} at "
-                      f"({where}) m")
+    broken += [f"in motion {words}" for words in limits.met(
+        places[:len(found.displacement)], grasp_model.mesh.nodes + found.displacement)]
     if not found.converged:
         where = ", ".join(f"{x:.3f}" for x in places[len(found.times) - 1])
         broken.append(f"in motion the branch does not come along ({found.message}) at ({where}) m")

@@ -1,12 +1,13 @@
 """Bodies in the way of branch and gripper: boxes and closed surfaces."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.surface import Surface
+from limber.planning.constraints.constraint import Constraint
 
 _SCALE = 0.1  # [m] by which closeness falls to a third
 _CHUNK = 2_000_000  # point and face pairs whose solid angles are summed at a time
@@ -53,11 +54,31 @@ class Solid:
         return distance
 
 
-def closeness(obstacles: tuple[Obstacle, ...], nodes: np.ndarray) -> float:
-    """Return how close a body with ``nodes`` [n, 3] is to any obstacle: ``exp(-d / 0.1 m)`` of its
-    clearance d, 1 where it touches one, more inside; smooth for a planner's field."""
-    clearance = min(float(obstacle.clearance(nodes).min()) for obstacle in obstacles)
-    return float(np.exp(-clearance / _SCALE))
+@dataclass(frozen=True)
+class Obstacles(Constraint):
+    """Bodies that the branch must not meet.
+
+    What is limited is the closeness, ``exp(-d / 0.1 m)`` of the clearance d: 1 where the branch
+    touches one, more inside; smooth for a planner's field.
+    """
+
+    bodies: tuple[Obstacle, ...]
+    limit: float = 1.0
+    name = "closeness"
+
+    def values(self, grasps: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        return np.array([np.exp(-min(float(body.clearance(each).min()) for body in self.bodies)
+                                / _SCALE) for each in nodes])
+
+    def tightened(self, factor: float) -> "Obstacles":
+        return replace(self, limit=self.limit / factor)
+
+    def broken(self, grasps: np.ndarray, nodes: np.ndarray) -> str | None:
+        if (hit := closest(self.bodies, nodes.reshape(-1, 3))) is None:
+            return None
+        name, depth, where = hit
+        place = ", ".join(f"{x:.3f}" for x in where)
+        return f"the branch is {1e3 * depth:.1f} mm inside {name} at ({place}) m"
 
 
 def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,

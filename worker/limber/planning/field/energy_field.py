@@ -8,7 +8,7 @@ The field also gives the rotation that the grasped piece takes by itself, and th
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,7 +52,7 @@ _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_n
 LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
 """What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
 gripper's force along the branch [N], outward positive, and its torque [Nm]; how close the branch is
-to an obstacle, 1 where it touches one."""
+to an obstacle, 1 where it touches one. A plan's constraints may add more."""
 _WHAT = "an energy field (`limber energy --force` makes one)"
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
@@ -95,7 +95,7 @@ class GraspSamples:
         axial_forces: Part of the force along the branch at the grasp, outward [N], shape [m].
         reduced: Which the reduced model found, corrected once by the full one; the others, and all
             of a file that does not say it, the full model alone; shape [m].
-        closeness: To the obstacles that a plan is made among, shape [m]; in no file.
+        added: What a plan's constraints are on, by their names, shape [m] each; in no file.
     """
 
     poses: np.ndarray
@@ -112,7 +112,7 @@ class GraspSamples:
     shape_slopes: np.ndarray | None = None
     axial_forces: np.ndarray | None = None
     reduced: np.ndarray | None = None
-    closeness: np.ndarray | None = None
+    added: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def positions(self) -> np.ndarray:
@@ -128,10 +128,10 @@ class GraspSamples:
 
     @property
     def loads(self) -> dict[str, np.ndarray | None]:
-        """By the names of ``LOADS``, shape [m] each; None where a file does not have them."""
+        """By the names of ``LOADS`` and of what was added, shape [m] each; None where not known."""
         torque = None if self.torques is None else np.linalg.norm(self.torques, axis=1)
-        return dict(zip(LOADS, (self.strains, self.stresses, self.axial_forces, torque,
-                                self.closeness), strict=True))
+        known = (self.strains, self.stresses, self.axial_forces, torque, None)
+        return dict(zip(LOADS, known, strict=True)) | self.added
 
     @property
     def load_table(self) -> np.ndarray:
@@ -143,15 +143,19 @@ class GraspSamples:
         """Return these samples and those of ``other`` behind them."""
         if self.reduced is not None and other.reduced is None:
             other = replace(other, reduced=np.zeros(len(other.poses), bool))
-        return replace(self, **{
+        added = {name: np.concatenate([values, other.added[name]])
+                 for name, values in self.added.items()}
+        return replace(self, added=added, **{
             name: np.concatenate([values, getattr(other, name)])
             for name, values in vars(self).items()
-            if values is not None and getattr(other, name) is not None})
+            if name != "added" and values is not None and getattr(other, name) is not None})
 
     def take(self, index: np.ndarray) -> "GraspSamples":
         """Return the samples of ``index``; rejected poses stay."""
-        return replace(self, **{name: values[index] for name, values in vars(self).items()
-                                if name != "rejected_poses" and values is not None})
+        added = {name: values[index] for name, values in self.added.items()}
+        return replace(self, added=added, **{
+            name: values[index] for name, values in vars(self).items()
+            if name not in ("added", "rejected_poses") and values is not None})
 
 
 class FieldArrays(NamedTuple):
@@ -178,10 +182,10 @@ class EnergyField:
         shape_chart: Those of the other two.
         energy_fit: Interpolant of the energy (cut off at 0 by the methods).
         shape_fit: Channels: natural rotation vector, position of the tip and of each target.
-        load_fit: Channels: those of ``LOADS``.
+        load_fit: Channels: those of ``load_names``.
         region: Where the field may be believed.
         errors: On samples left out; see :func:`error_measures`.
-        missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 9]; nan
+        missed: There, prediction less truth of energy [J], force [N] and loads, [m, 4 + loads]; nan
             where it is not known.
         misplaced: There, distance of the predicted tip and targets from the true ones [m], shape
             [m, 1 + targets]; nan where it is not known.
@@ -202,6 +206,11 @@ class EnergyField:
     def rest(self) -> np.ndarray:
         """Position of the grasp in the rest state [m], shape [3]."""
         return self.samples.positions[0]
+
+    @property
+    def load_names(self) -> tuple[str, ...]:
+        """``LOADS``, and what a plan's constraints added."""
+        return tuple(self.samples.loads)
 
     def energy(self, points: np.ndarray) -> np.ndarray:
         """Return the deformation energy [J] at ``points`` [n, 3], never negative, shape [n]."""
@@ -254,13 +263,13 @@ class EnergyField:
         return chart.pull_back(points, slope[:, :, 0])
 
     def load(self, points: np.ndarray, name: str) -> np.ndarray:
-        """Return one of ``LOADS`` at ``points`` [n, 3], shape [n]."""
-        channel = LOADS.index(name)
+        """Return one of the loads at ``points`` [n, 3], shape [n]."""
+        channel = self.load_names.index(name)
         return self._value(self.load_fit, points, slice(channel, channel + 1), True)[:, 0]
 
     def load_gradient(self, points: np.ndarray, name: str) -> np.ndarray:
         """Return its gradient to the position, shape [n, 3]."""
-        return self._gradient(self.load_fit, points, LOADS.index(name), True)
+        return self._gradient(self.load_fit, points, self.load_names.index(name), True)
 
     def limited(self, max_energy: float = np.inf, max_force: float = np.inf, *,
                 low: np.ndarray | None = None, high: np.ndarray | None = None,
@@ -270,7 +279,7 @@ class EnergyField:
         return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.region.arrays,
                            (self.shape_chart.arrays, self.load_fit.arrays),
                            float(max_energy), float(max_force),
-                           np.array([max_loads.get(name, np.inf) for name in LOADS]),
+                           np.array([max_loads.get(name, np.inf) for name in self.load_names]),
                            np.full(3, -np.inf) if low is None else np.asarray(low, float),
                            np.full(3, np.inf) if high is None else np.asarray(high, float))
 
@@ -448,9 +457,9 @@ def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
     return _as_before(field, field.samples.joined(added))
 
 
-def among_obstacles(field: EnergyField, closeness: np.ndarray) -> EnergyField:
-    """Return the field that knows how close the branch is to obstacles at its samples, [m]."""
-    return _as_before(field, replace(field.samples, closeness=closeness))
+def knowing(field: EnergyField, added: dict[str, np.ndarray]) -> EnergyField:
+    """Return the field that knows as loads what is ``added`` at its samples, by name, [m] each."""
+    return _as_before(field, replace(field.samples, added=added))
 
 
 def _as_before(field: EnergyField, samples: GraspSamples) -> EnergyField:

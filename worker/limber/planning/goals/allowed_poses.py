@@ -4,13 +4,8 @@ import numpy as np
 
 from limber.core.errors import NoPathError
 from limber.core.numerics.compiled import compiled
-from limber.planning.field.energy_field import (
-    LOADS,
-    EnergyField,
-    FieldArrays,
-    allowed_at,
-    energy_at,
-)
+from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
+from limber.planning.field.limited import limited
 from limber.planning.goals.goal import Goal
 
 _MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
@@ -46,13 +41,9 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
 def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
     """Return in words which limits none of ``points`` [n, 3] keeps, and by how much."""
     outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
-    found = [("energy", field.energy(points), limits.max_energy, " J"),
-             ("force", np.linalg.norm(field.force(points), axis=1), limits.max_force, " N")]
-    found += [(name.replace("_", " "), np.abs(field.load(points, name)), limit, unit)
-              for name, limit, unit in zip(LOADS, limits.max_loads, ("", " Pa", " N", " Nm", ""),
-                                           strict=True) if limit < np.inf]
-    told = [f"the {name} is at least {values.min():.3g}{unit} where {limit:.3g}{unit} is allowed"
-            for name, values, limit, unit in found if values.min() > limit]
+    told = [f"the {one.words} is at least {one.with_unit(least)} where "
+            f"{one.with_unit(one.limit)} is allowed" for one in limited(field, limits)
+            if (least := float(one.size(points).min())) > one.limit]
     if outside.min() > 0.0:
         told.append(f"the workspace is {outside.min():.3f} m away"
                     + unit_doubt(outside.min(), field))

@@ -14,7 +14,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from limber.planning.cost import resample
-from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.limited import limited
 from limber.planning.goals.goal import Goal
 
 _ALONG, _ACROSS = 64, 48  # points of the grid along the shell, each way, and off it
@@ -80,14 +81,8 @@ def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.n
     within &= ((points >= limits.low) & (points <= limits.high)).all(axis=1)
     inside = points[within]
     shares = np.where(field.region.contains(inside), 0.0, _REFUSED)
-    if limits.max_energy < np.inf:
-        shares = np.maximum(shares, field.energy(inside) / limits.max_energy)
-    if limits.max_force < np.inf:
-        size = np.linalg.norm(field.force(inside), axis=1)
-        shares = np.maximum(shares, size / limits.max_force)
-    for name, limit in zip(LOADS, limits.max_loads, strict=True):
-        if limit < np.inf:
-            shares = np.maximum(shares, np.abs(field.load(inside, name)) / limit)
+    for one in limited(field, limits):
+        shares = np.maximum(shares, one.size(inside) / one.limit)
     out[within] = shares
     return out
 

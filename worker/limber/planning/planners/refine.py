@@ -19,7 +19,6 @@ import numpy as np
 import scipy
 
 from limber.planning.cost import resample
-from limber.planning.field.energy_field import LOADS
 from limber.planning.field.trust import nearest_of
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
@@ -224,7 +223,7 @@ class Limited:
         if limits.max_energy < np.inf:
             yield excess(known.energy(points), limits.max_energy,
                          lambda active: known.energy_gradient(points[active]))
-        for name, limit in zip(LOADS, limits.max_loads, strict=True):
+        for name, limit in zip(known.load_names, limits.max_loads, strict=True):
             if limit < np.inf:
                 load = known.load(points, name)
                 yield excess(np.abs(load), limit, lambda active, load=load, name=name:

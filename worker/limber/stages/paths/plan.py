@@ -30,6 +30,7 @@ from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
     from limber.planning.constraints.limits import Limits
+    from limber.planning.constraints.obstacles import Obstacle
     from limber.planning.field.grasp_model import GraspModel
     from limber.planning.goals.goal import CellPlace
     from limber.planning.make_plan import PlannedMotion
@@ -139,7 +140,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
             found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
-                                                limits.obstacles, pace.speed)
+                                                in_cell.obstacles, pace.speed)
         progress(0.95, "writing")
         rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
         found.summary["setpoint_rate_hz"] = rate
@@ -164,6 +165,7 @@ class _InCell:
     """A cell, and the limits that hold in it."""
 
     cell: Cell
+    obstacles: tuple[Obstacle, ...]
     limits: Limits
     places: dict[str, CellPlace]
 
@@ -172,8 +174,8 @@ class _InCell:
         from limber.stages.paths.plan_cell import cell_for, cell_obstacles, limits_in, places_in
 
         cell = cell_for(branch, path, progress)
-        return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)),
-                   places_in(cell))
+        obstacles = cell_obstacles(cell, path.parent)
+        return cls(cell, obstacles, limits_in(cell, limits, obstacles), places_in(cell))
 
     def slowed(self, pace: Pace) -> Pace:
         """Return the pace, no faster than the cell allows."""
@@ -187,7 +189,7 @@ class _InCell:
         from limber.planning.goals.kinds import asked_kinds
 
         for place in (kind.place(settings) for kind in asked_kinds(settings)):
-            hit = place and closest(self.limits.obstacles, np.array([place], float))
+            hit = place and closest(self.obstacles, np.array([place], float))
             if hit:
                 raise NoPathError(
                     f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
