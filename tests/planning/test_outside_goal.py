@@ -2,13 +2,14 @@
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from pydantic import Field
 
+from limber.cli.main import call
 from limber.core.errors import InputError, NoPathError
 from limber.core.settings import Groups
 from limber.planning.goals.goal import GoalKind
@@ -16,6 +17,7 @@ from limber.planning.goals.kinds import KINDS
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
 from limber.results.scene.paths import _goal as drawn
+from limber.stages.paths import plan as plan_stage
 from limber.stages.paths.plan import plan as plan_paths
 
 
@@ -69,13 +71,13 @@ class SideGoal:
 @pytest.fixture
 def side():
     """The kind, known while a test runs."""
-    kind = GoalKind("goal_side", lambda asked: SideGoal(
-        asked.settings.goal_side, asked.settings.goal_tolerance))
+    kind = GoalKind("goal_side", lambda asked, x: SideGoal(x, asked.settings.goal_tolerance))
     KINDS.append(kind)
     yield kind
     KINDS.remove(kind)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("side", "coarse_bound")
 def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     """The stage plans to it; the end is in it on the full model, no path costs less than the bound
@@ -95,6 +97,19 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     assert read_plan(folder / "plans/side.json").summary["goal"]["kind"] == "side"
     assert drawn(told["goal"], None)["kind"] == "side"
     assert plan_paths(folder, settings, name="side") == done
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("side", "coarse_bound")
+def test_a_goal_from_outside_has_its_option(planned_branch, tmp_path, monkeypatch, capsys):
+    """The command with those settings takes it, and says what it is."""
+    folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
+    monkeypatch.setattr(plan_stage, "STAGE", replace(plan_stage.STAGE, settings=SideSettings))
+    rest = read_plan(folder / "plans/there.json").motion.poses[0]
+    code = call(["plan", str(folder), "--name", "side", "--goal-side", f"{rest[0] + 0.05:.3f}",
+                 "--iterations", "100", "--field-error", "20", "--json"])
+    last = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert code == 0 and last["goal"]["kind"] == "side"
 
 
 @pytest.mark.usefixtures("side")

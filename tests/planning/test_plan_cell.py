@@ -116,11 +116,11 @@ def test_a_second_arm_reaches_as_far_as_it_can():
     region = place.region
     assert region.middle == pytest.approx([1.0, 0.0, 0.15185])
     assert 0.5 < region.radius < 0.6
-    place.require(np.array([1.0, 0.3, 0.3]))
+    place.require("the tip", np.array([1.0, 0.3, 0.3]), None)
     with pytest.raises(NoPathError, match="second arm"):
-        place.require(np.array([1.0, 0.9, 0.3]))
+        place.require("the tip", np.array([1.0, 0.9, 0.3]), None)
     with pytest.raises(NoPathError, match="directions"):
-        place.require(np.array([1.0, 0.0, 0.15]))
+        place.require("the tip", np.array([1.0, 0.0, 0.15]), None)
 
 
 def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from limber.core.numerics.compiled import compiled
-from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
+from limber.planning.field.energy_field import EnergyField, allowed_at, energy_at
 
 STEP = 0.005
 """Longest distance between points where an edge is evaluated [m]; also the paper-like spacing."""
@@ -56,10 +56,6 @@ class CostWeights:
     def weights(self) -> EdgeWeights:
         return EdgeWeights(self.deformation / (self.energy_scale * self.length_scale),
                            self.distance / self.length_scale, STEP)
-
-    def cost(self, path: np.ndarray, field: FieldArrays) -> float:
-        """Return ``J`` of a polyline [n, 3]; infinite if it leaves what is allowed."""
-        return float(path_cost(np.ascontiguousarray(path, float), field, self.weights))
 
 
 @dataclass(frozen=True)

@@ -46,11 +46,6 @@ class Risk:
     factors: dict[str, float]
     excess: dict[str, float]
 
-    @property
-    def is_kept(self) -> bool:
-        """Whether every limit is kept with the confidence."""
-        return not self.told()
-
     def left(self, limits: Limits, path: ResolvedPath) -> Limits:
         """Return what the estimate's branch may reach in motion where the motion keeps limits.
 

@@ -243,21 +243,14 @@ def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarr
     return _solve_tree(grasp_model, targets, numbers, known, report)
 
 
-def without_taut(samples: GraspSamples, drawn: float = 0.0) -> tuple[GraspSamples, int]:
-    """Return the samples without those that pull the branch taut, and how many those were.
+def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
+    """Return which of ``forces`` [m] are no wall; ``usual`` are those of poses that lie evenly.
 
     Bending a branch, even double, takes about the same force anywhere; pulled taut it takes many
     times that within millimetres. Such a wall spoils the field around it, and no gentle path
     goes there: poses over twice the median force stay out, and so out of the trusted region; but
     none that takes no more than ``drawn`` [N], the force that the branch was drawn outward with.
     """
-    forces = np.linalg.norm(samples.forces, axis=1)
-    slack = _slack(forces, forces, drawn)
-    return samples.take(np.flatnonzero(slack)), int((~slack).sum())
-
-
-def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
-    """Return which of ``forces`` [m] are no wall; ``usual`` are those of poses that lie evenly."""
     middle = np.median(usual) if len(usual) else 0.0
     slack = forces <= max(_TAUT * middle, drawn * (1.0 + 1e-9))
     slack[0] = True

@@ -1,15 +1,11 @@
-"""The target in the view of the cell's camera: ``--in-view``."""
+"""The view of a camera that stands still, and what hides a target in it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.errors import InputError, NoPathError
-from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.goal import GoalKind, GoalRequest
+from limber.core.errors import NoPathError
 from limber.planning.goals.regions import Convex
-from limber.planning.goals.target import TargetGoal, target_of
-from limber.planning.path_on_full_model import SolvedPoses
 
 _OWN = 0.003  # [m] of the surface about a target that does not hide it
 
@@ -69,28 +65,10 @@ class View(Convex):
         hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
         return bool((hit & (t < 1.0 - slack / np.linalg.norm(way))).any())
 
-
-@dataclass(frozen=True)
-class SeenGoal(TargetGoal):
-    """A target in a camera's view, and not behind the branch."""
-
-    region: View
-
-    def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
-        nodes = grasp_model.mesh.nodes + states.displacements[-1]
-        if self.region.hidden_by(nodes[grasp_model.mesh.surface_faces()], self.place(states),
-                                 _OWN):
+    def require_seen(self, what: str, place: np.ndarray, triangles: np.ndarray) -> None:
+        """Raise NoPathError where the branch's surface hides ``what`` at a place."""
+        if self.hidden_by(triangles, place, _OWN):
             raise NoPathError(
-                f"At the path's end the branch hides {self.what} from the camera.",
+                f"At the path's end the branch hides {what} from the camera.",
                 "Limber checks the line of sight at a path's end, but cannot plan for it yet.",
                 "Choose a --target-box on the camera's side, or move the camera.")
-
-
-def _in_view(asked: GoalRequest) -> SeenGoal:
-    if "in_view" not in asked.cell:
-        raise InputError("--in-view is given, but no cell with a [camera] that stands still.",
-                         "The cell file says where it stands.", "Give --cell with one.")
-    return SeenGoal(asked.cell["in_view"].region, *target_of(asked))
-
-
-IN_VIEW = GoalKind("in_view", _in_view, is_of_target=True)

@@ -59,10 +59,10 @@ def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits:
     return near(points[np.flatnonzero(fit)[0]], tolerance)
 
 
-def _drawn(asked: GoalRequest) -> GraspGoal:
-    reach, settings = asked.grasp_model.reach, asked.settings
+def _drawn(asked: GoalRequest, seed: int) -> GraspGoal:
+    reach = asked.grasp_model.reach
     return hemisphere_goal(asked.field, reach.base, reach.arc_length, asked.limits,
-                           settings.goal_tolerance, settings.goal_seed)
+                           asked.settings.goal_tolerance, seed)
 
 
 DRAWN = GoalKind("goal_seed", _drawn)

@@ -71,11 +71,14 @@ class Goal(Protocol):
 
 @dataclass(frozen=True)
 class CellPlace:
-    """A region that a robot's cell gives, and what raises NoPathError where a place [3] in it does
-    not do."""
+    """A region that a robot's cell gives.
+
+    ``require`` raises NoPathError where it does not do for something, said in words, at a place [3]
+    in it, while the branch's surface is where triangles [f, 3, 3] are.
+    """
 
     region: Region
-    require: Callable[[np.ndarray], None] = lambda place: None
+    require: Callable[[str, np.ndarray, np.ndarray], None]
 
 
 @dataclass(frozen=True)
@@ -103,15 +106,16 @@ class GoalKind:
     Attributes:
         name: Of the setting that asks for it, where it is neither None nor False. A kind from
             outside brings settings of its own, a class that inherits from ``PlanSettings``.
-        make: Makes the goal; raises InputError or NoPathError where that cannot be.
+        make: Makes the goal, given the setting's value; raises InputError or NoPathError where
+            that cannot be.
         is_of_target: It is a place of the tip or of ``--target``.
-        place: Returns a place [m] that no obstacle may cover, if the settings name one.
+        is_place: The setting's value is a place [m], which no obstacle may cover.
     """
 
     name: str
-    make: Callable[[GoalRequest], Goal]
+    make: Callable[[GoalRequest, Any], Goal]
     is_of_target: bool = False
-    place: Callable[[PlanSettings], tuple[float, float, float] | None] = lambda settings: None
+    is_place: bool = False
 
     @property
     def option(self) -> str:

@@ -58,5 +58,4 @@ def near(place: np.ndarray, tolerance: float) -> GraspGoal:
 
 
 AT_PLACE = GoalKind(
-    "goal", lambda asked: near(asked.settings.goal, asked.settings.goal_tolerance),
-    place=lambda settings: settings.goal)
+    "goal", lambda asked, place: near(place, asked.settings.goal_tolerance), is_place=True)

@@ -1,11 +1,10 @@
 """The kinds of goals, and the one that a plan's settings ask for."""
 
 from limber.core.errors import InputError
-from limber.planning.goals.camera_view import IN_VIEW
+from limber.planning.goals.cell_place import IN_VIEW, SECOND_ARM
 from limber.planning.goals.chosen import DRAWN, default_goal
 from limber.planning.goals.goal import Goal, GoalKind, GoalRequest
 from limber.planning.goals.grasp import AT_PLACE
-from limber.planning.goals.second_arm import SECOND_ARM
 from limber.planning.goals.target import IN_BALL, IN_BOX
 from limber.planning.settings import PlanSettings
 
@@ -37,4 +36,4 @@ def goal_of(request: GoalRequest) -> Goal:
                          f"Give {', '.join(others)} or {last} as well.")
     if not asked:
         return default_goal(request.field, settings.goal_tolerance)
-    return asked[0].make(request)
+    return asked[0].make(request, getattr(settings, asked[0].name))

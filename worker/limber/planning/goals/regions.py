@@ -60,11 +60,14 @@ class Ball:
         return {"position_m": list(map(float, self.centre)), "tolerance_m": self.radius}
 
 
-class Convex:
+class Convex(Protocol):
     """What is below planes ``n . x + c`` with unit normals; ``planes`` [k, 4]."""
 
-    planes: np.ndarray
-    corners: np.ndarray
+    @property
+    def planes(self) -> np.ndarray: ...
+
+    @property
+    def corners(self) -> np.ndarray: ...
 
     @property
     def middle(self) -> np.ndarray:

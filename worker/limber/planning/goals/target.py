@@ -121,13 +121,13 @@ def target_of(asked: GoalRequest) -> tuple[int | None, str]:
     return names.index(name), name
 
 
-def _in_ball(asked: GoalRequest) -> TargetGoal:
-    region = Ball(asked.settings.tip_goal, asked.settings.goal_tolerance)
-    return TargetGoal(region, *target_of(asked))
+def _in_ball(asked: GoalRequest, place: tuple[float, float, float]) -> TargetGoal:
+    return TargetGoal(Ball(place, asked.settings.goal_tolerance), *target_of(asked))
 
 
-def _in_box(asked: GoalRequest) -> TargetGoal:
-    low, high = asked.settings.target_box[:3], asked.settings.target_box[3:]
+def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> TargetGoal:
+    x, y, z, *far = corners
+    low, high = (x, y, z), (far[0], far[1], far[2])
     if not np.all(np.less(low, high)):
         raise InputError(f"The box from {low} to {high} m is empty.",
                          "Its lower corner must be below the upper one in x, y and z.",
@@ -135,6 +135,5 @@ def _in_box(asked: GoalRequest) -> TargetGoal:
     return TargetGoal(BoxRegion(low, high), *target_of(asked))
 
 
-IN_BALL = GoalKind("tip_goal", _in_ball, is_of_target=True,
-                   place=lambda settings: settings.tip_goal)
+IN_BALL = GoalKind("tip_goal", _in_ball, is_of_target=True, is_place=True)
 IN_BOX = GoalKind("target_box", _in_box, is_of_target=True)

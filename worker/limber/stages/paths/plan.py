@@ -188,8 +188,9 @@ class _InCell:
         from limber.planning.constraints.obstacles import closest
         from limber.planning.goals.kinds import asked_kinds
 
-        for place in (kind.place(settings) for kind in asked_kinds(settings)):
-            hit = place and closest(self.obstacles, np.array([place], float))
+        places = [getattr(settings, kind.name) for kind in asked_kinds(settings) if kind.is_place]
+        for place in places:
+            hit = closest(self.obstacles, np.array([place], float))
             if hit:
                 raise NoPathError(
                     f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",

@@ -73,7 +73,7 @@ def places_in(cell: Cell) -> dict[str, CellPlace]:
     """Return what goals may ask of the cell: its camera's view and its second arm's reach."""
     found = {}
     if (view := _view_of(cell)) is not None:
-        found["in_view"] = CellPlace(view)
+        found["in_view"] = CellPlace(view, view.require_seen)
     if cell.second_arm is not None:
         arm = arm_named(cell.second_arm.model)
         shoulder = matrices(np.array(cell.second_arm.base_pose)) @ np.r_[arm.shoulder, 1.0]
@@ -83,8 +83,8 @@ def places_in(cell: Cell) -> dict[str, CellPlace]:
     return found
 
 
-def require_taken(entry: SecondArmEntry, place: np.ndarray) -> None:
-    """Raise NoPathError where the second arm can take nothing at ``place`` [3] from any side."""
+def require_taken(entry: SecondArmEntry, what: str, place: np.ndarray, _surface: object) -> None:
+    """Raise NoPathError where an arm cannot take ``what`` at ``place`` [3] from any side."""
     arm = arm_named(entry.model)
     turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
     frames = np.tile(np.eye(4), (_TURNS, 1, 1))
@@ -93,7 +93,7 @@ def require_taken(entry: SecondArmEntry, place: np.ndarray) -> None:
         matrices(np.array(entry.grasp_pose)))
     if np.isnan(arm.inverse(flange)).any(axis=-1).all():
         where = ", ".join(f"{x:.3f}" for x in place)
-        raise NoPathError(f"The second arm ({arm.name}) cannot reach the target at ({where}) m.",
+        raise NoPathError(f"The second arm ({arm.name}) cannot take {what} at ({where}) m.",
                           f"The inverse kinematics has no solution for any of {_TURNS} "
                           "directions.",
                           "Move the arm, or give a --target-box.")
