@@ -28,9 +28,8 @@ def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):
     limited = field.limited(**limits)
     cost = CostWeights.between(field, START, goal.centre(field),
                                   deformation=deformation, distance=distance)
-    return PathProblem(START, goal_points(goal, field, limited),
-                   lambda points: goal.distance(field, points) <= goal.tolerance,
-                   field, limited, cost.weights)
+    return PathProblem(field, limited, cost.weights, START, goal,
+                       goals=goal_points(goal, field, limited))
 
 
 def measured(field, points):
@@ -122,8 +121,7 @@ def test_goal_behind_a_wall(ridge_field):
     wall = np.random.default_rng(0).uniform([-0.03, -0.2, -0.2], [0.03, 0.2, 0.2], (2000, 3))
     start_and_goal_only = ridge_field.limited(max_energy=1.0)._replace(
         region=replace(ridge_field.region, rejected=wall).arrays)
-    walled = PathProblem(problem.start, problem.goals, problem.in_goal, ridge_field,
-                     start_and_goal_only, problem.weights)
+    walled = replace(problem, limits=start_and_goal_only)
     with pytest.raises(NoPathError, match="500 iterations"):
         plan_path(walled, Search(iterations=500))
 

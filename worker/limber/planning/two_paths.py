@@ -157,10 +157,9 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
-    trees = _trees(limits, field, start, goal, goals, settings, weighed,
-                   {} if before is None else before.trees,
-                   progress.part(0.0, 0.5)) if nobody is None else {}
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
+    trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
+                   progress.part(0.0, 0.5)) if nobody is None else {}
     known = [path.points for path in trees.values()]
     try:
         gentle, detour = _gentle(problem, known, settings, progress.part(0.5, 1.0))
@@ -171,27 +170,35 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     if detour is not None:
         weighed = replace(weighed, distance=detour.weight * weighed.distance)
         problem = replace(problem, weights=weighed.weights)
-    if settings.planner == "d-rrt-star":
-        if "D-RRT*" not in trees:
-            raise NoPathError(
-                f"D-RRT* found no path in {settings.iterations} iterations, but there is one.",
-                "The eikonal planner found it.",
-                "Allow more --iterations, or leave --planner away.")
-        plan = trees["D-RRT*"]
-        certificate = replace(gentle.certificate, upper=problem.cost(plan.points))
-    else:
-        certificate = gentle.certificate
-        plan = FoundPath(gentle.points, gentle.cost, gentle.cost, [
-            {"iteration": number + 1, "cost": level["upper"]}
-            for number, level in enumerate(certificate.levels)], engine="eikonal")
+    plan, certificate = _chosen(problem, gentle, trees, settings)
     baseline = trees.get("RRT*") or _shortest(problem, gentle.points)
     compared = {"straight line": np.stack([start, goal.centre(field)]),
                 "eikonal": gentle.points}
     for name, path in trees.items():
-        compared[name] = path.points
-        compared[f"{name}, not smoothed"] = path.raw
+        compared |= {name: path.points, f"{name}, not smoothed": path.raw}
     return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
                     detour=detour, trees=trees)
+
+
+def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPath],
+            settings: PlanSettings) -> tuple[FoundPath, Certificate]:
+    """Return the plan of the planner that is asked for, and how close to the best it is.
+
+    Raises:
+        NoPathError: that planner found none.
+    """
+    certificate = gentle.certificate
+    if settings.planner == "eikonal":
+        return FoundPath(gentle.points, gentle.cost, gentle.cost, [
+            {"iteration": number + 1, "cost": level["upper"]}
+            for number, level in enumerate(certificate.levels)], engine="eikonal"), certificate
+    if "D-RRT*" not in trees:
+        raise NoPathError(
+            f"D-RRT* found no path in {settings.iterations} iterations, but there is one.",
+            "The eikonal planner found it.",
+            "Allow more --iterations, or leave --planner away.")
+    plan = trees["D-RRT*"]
+    return plan, replace(certificate, upper=problem.cost(plan.points))
 
 
 def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
@@ -234,13 +241,10 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSetti
                        progress=progress.part(0.3, 1.0))
 
 
-def _trees(limits: FieldArrays, field: EnergyField, start: np.ndarray, goal: Goal,
-           goals: np.ndarray, settings: PlanSettings, weighed: CostWeights,
-           before: dict[str, FoundPath], progress: Progress) -> dict[str, FoundPath]:
+def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
+           weighed: CostWeights, before: dict[str, FoundPath], progress: Progress,
+           ) -> dict[str, FoundPath]:
     """Return what RRT* and D-RRT* find, or had found before: either, both or nothing."""
-    def in_goal(points: np.ndarray) -> np.ndarray:
-        return goal.distance(field, points) <= goal.tolerance
-
     engine = chosen_engine(settings.engine)
     search = Search(iterations=settings.iterations, seed=settings.seed)
     shortest = replace(weighed, deformation=0.0, distance=1.0)
@@ -248,12 +252,13 @@ def _trees(limits: FieldArrays, field: EnergyField, start: np.ndarray, goal: Goa
     for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
         part = progress.part(0.5 * number, 0.5 * (number + 1))
         part(0.0, name)
-        problem = PathProblem(start, goals, in_goal, field, limits, cost.weights)
-        if name in before and (again := found_again(before[name], problem)):
+        asked = PathProblem(problem.energy_field, problem.limits, cost.weights, problem.start,
+                            problem.goal, goals=goals)
+        if name in before and (again := found_again(before[name], asked)):
             found[name] = again
             continue
         try:
-            found[name] = plan_path(problem, search, engine=engine, progress=part)
+            found[name] = plan_path(asked, search, engine=engine, progress=part)
         except NoPathError as error:
             # No verdict: the eikonal planner finds the path, or proves that there is none.
             progress.warn(f"{name}: {error}")
@@ -286,9 +291,8 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     if not np.isfinite(least):
         try:
             rough = plan_path(PathProblem(
-                field.rest, start[None],
-                lambda points: np.linalg.norm(points - start, axis=1) < 1e-9, field,
-                problem.limits, cost.weights), Search(iterations=1500, seed=settings.seed)).points
+                field, problem.limits, cost.weights, field.rest, near(start, 1e-9),
+                goals=start[None]), Search(iterations=1500, seed=settings.seed)).points
             points, _ = refine(rough, way)
         except NoPathError:
             # A tree that misses a narrow way is no verdict: the grid finds it, or says why not.

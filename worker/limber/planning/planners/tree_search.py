@@ -1,35 +1,23 @@
 """What a sampling planner is, what it is asked and what it answers."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from limber.core.progress import Progress
-from limber.planning.cost import EdgeWeights
-from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.problem import GentleProblem
 
 
-@dataclass(frozen=True)
-class PathProblem:
-    """A start, goals and a cost.
+@dataclass(frozen=True, kw_only=True)
+class PathProblem(GentleProblem):
+    """A planning problem with ``goals`` [g, 3], allowed positions in the goal region."""
 
-    Attributes:
-        start: Grasp position [m], shape [3].
-        goals: Allowed positions in the goal region, shape [g, 3].
-        in_goal: Whether positions [n, 3] are in the goal region, bool [n].
-        energy_field: The energy field.
-        limits: The same with limits on energy and force, for compiled loops.
-        weights: The cost of an edge.
-    """
-
-    start: np.ndarray
     goals: np.ndarray
-    in_goal: Callable[[np.ndarray], np.ndarray]
-    energy_field: EnergyField
-    limits: FieldArrays
-    weights: EdgeWeights
+
+    def in_goal(self, points: np.ndarray) -> np.ndarray:
+        """Return whether positions [n, 3] are in the goal region, bool [n]."""
+        return self.goal.distance(self.energy_field, points) <= self.goal.tolerance
 
     @property
     def low(self) -> np.ndarray:
