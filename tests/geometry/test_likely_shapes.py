@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from limber.geometry.shape_samples import likely_skeletons, reshaped
-from limber.geometry.skeleton.radii.axis_fit import fit_axes, fit_precision
+from limber.geometry.skeleton.radii.axis_fit import fit_axes
+from limber.geometry.skeleton.radii.normal_equations import fit_precision
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 

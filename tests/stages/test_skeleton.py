@@ -21,8 +21,8 @@ from limber.geometry.generated import generate_branch
 from limber.geometry.io.skeletons import read_skeleton, read_swc
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.checkpoint import FoundSkeleton
+from limber.geometry.skeleton.search_result import given_skeleton
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.skeletonise import given_skeleton
 from limber.results.scene.contents import scene_data
 from limber.results.scene.still_objects import EDITED
 from limber.stages.shape.edit_skeleton import review_skeleton

@@ -159,7 +159,7 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
     from limber.geometry.io.clouds import read_points
     from limber.geometry.io.skeletons import read_skeleton
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
-    from limber.geometry.skeleton.skeletonise import given_skeleton
+    from limber.geometry.skeleton.search_result import given_skeleton
 
     found = given_skeleton(read_skeleton(template / "skeleton.csv"),
                            read_points(template / "cloud.ply").points[::10])

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
-from limber.geometry.skeleton.radii.along_runs import (
+from limber.geometry.skeleton.repair.run_radii import (
     filled_in,
     point_counts,
     steadied,

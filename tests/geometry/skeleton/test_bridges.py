@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import fork_matches, main_axis_error, seen_part
-from limber.geometry.skeleton.bridges import filled, free_ends, hypotheses
+from limber.geometry.skeleton.contraction.bridges import filled, free_ends, hypotheses
 from limber.geometry.skeleton.contraction.pieces import join_pieces
 from limber.geometry.skeleton.skeletonise import skeletonise
 

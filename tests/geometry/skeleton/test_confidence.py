@@ -5,7 +5,7 @@ import pytest
 
 from limber.geometry.io.skeletons import read_fitted, write_cylinders
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
-from limber.geometry.skeleton.radii.along_runs import tapered
+from limber.geometry.skeleton.repair.run_radii import tapered
 from limber.geometry.skeleton.skeleton import (
     BRIDGED,
     INTERPOLATED,

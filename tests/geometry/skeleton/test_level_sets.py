@@ -9,9 +9,10 @@ from benchmarks.geometry_crowns import axis_scores, explained, generated_crown
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
 from limber.geometry.skeleton.contraction.level_sets import is_sparse, level_graph
-from limber.geometry.skeleton.radii import axis_fit
+from limber.geometry.skeleton.radii.normal_equations import NormalEquations
+from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
+from limber.geometry.skeleton.skeletonise import skeletonise
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -90,13 +91,13 @@ def test_last_digits_of_a_solve_do_not_choose_the_skeleton(monkeypatch, leaves, 
 
     Where leaves lead the fit astray they had grown to other cylinders, and to other branches.
     """
-    solve, rng = axis_fit._System.solve, np.random.default_rng(0)
+    solve, rng = NormalEquations.solve, np.random.default_rng(0)
 
     def rounded(system):
         step = solve(system)
         return step + 1e-15 * np.abs(step).max() * rng.standard_normal(step.shape)
 
-    monkeypatch.setattr(axis_fit._System, "solve", rounded)
+    monkeypatch.setattr(NormalEquations, "solve", rounded)
     found = skeletonise(leaves[0], root=np.zeros(3))
     assert found.noise == of_leaves.noise
     assert found.residual.tobytes() == of_leaves.residual.tobytes()

@@ -9,10 +9,10 @@ import pytest
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.reconstruction import reconstruct_cloud
-from limber.geometry.settings import ReconstructSettings
+from limber.geometry.settings import ReconstructSettings, SkeletonSettings
 from limber.geometry.skeleton.contraction.pieces import join_pieces, second_base
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.skeletonise import SkeletonSettings, skeletonise
+from limber.geometry.skeleton.skeletonise import skeletonise
 
 Z = np.array([0.0, 0.0, 1.0])
 

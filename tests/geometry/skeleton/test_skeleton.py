@@ -6,7 +6,7 @@ import pytest
 from limber.core.errors import InputError
 from limber.geometry.io.skeletons import read_cylinders, read_swc, write_cylinders
 from limber.geometry.skeleton.control_points import control_points
-from limber.geometry.skeleton.radii.axis_fit import attached
+from limber.geometry.skeleton.repair.attachment import attached
 from limber.geometry.skeleton.skeleton import Skeleton
 
 

@@ -7,17 +7,15 @@ from benchmarks.scan_cases import round_case
 from benchmarks.scan_scores import score
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import Progress
+from limber.geometry.cloud.thinning import thinned
 from limber.geometry.generated import GeneratedBranch, generate_branch
+from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.contraction.laplacian_contraction import cloud_laplacian, contract
 from limber.geometry.skeleton.contraction.tangent_laplacian import tangent_laplacian
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
+from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.skeletonise import (
-    SkeletonResult,
-    SkeletonSettings,
-    skeletonise,
-    thinned,
-)
+from limber.geometry.skeleton.skeletonise import skeletonise
 
 RNG = np.random.default_rng(0)
 
@@ -199,10 +197,10 @@ def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch, of_f
                         rounds=0).skeleton.radius_sigma
 
     quick = deviations()
-    monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 10**9)
+    monkeypatch.setattr("limber.geometry.skeleton.radii.normal_equations._PROBE", 10**9)
     exact = deviations()
     np.testing.assert_allclose(quick, exact, rtol=0.02)
-    monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 2)
+    monkeypatch.setattr("limber.geometry.skeleton.radii.normal_equations._PROBE", 2)
     assert not np.allclose(deviations(), exact, rtol=0.02)
 
 
@@ -235,7 +233,7 @@ def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
 def _root_of_stem(foot: np.ndarray, thick: list[float], support: list[int]) -> int:
     """The root's node of a stem with one twig, to whose foot a chain of nodes was contracted."""
     from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
-    from limber.geometry.skeleton.skeletonise import _root_node
+    from limber.geometry.skeleton.contraction.root_end import root_node
 
     z, x = np.arange(0, 0.6, 0.005), 0.005 * np.arange(1, 41)
     count = len(foot)
@@ -252,7 +250,7 @@ def _root_of_stem(foot: np.ndarray, thick: list[float], support: list[int]) -> i
     points = on_axis + thickness[np.maximum(owner, count)][:, None] * np.resize(
         np.roll(ring, 5, axis=0), (len(owner), 3))
     graph = CurveGraph(nodes, edges, thickness, support, owner=owner)
-    return _root_node(graph, points, None, np.array([0.0, 0.0, 1.0]), 2.5)[0]
+    return root_node(graph, points, None, np.array([0.0, 0.0, 1.0]), 2.5)[0]
 
 
 def test_an_end_that_contraction_drew_far_beyond_its_points_may_be_the_root() -> None:
@@ -271,28 +269,25 @@ def test_a_ragged_foot_that_contraction_led_around_its_rim_may_be_the_root() -> 
 
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
-    from limber.geometry.skeleton.radii.axis_fit import AxisFit
-    from limber.geometry.skeleton.radii.sides_seen import SCATTERED_ALONG_SIGHT
-    from limber.geometry.skeleton.skeletonise import _with_full_tips
+    from limber.geometry.skeleton.repair.ends import with_full_tips
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     z = np.concatenate([[-0.03, -0.001], np.linspace(0.01, 0.29, 29)])
     axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
                                np.full(31, 0.01))
-    fit = AxisFit(axis, np.zeros(0), np.zeros(0), 0.001, SCATTERED_ALONG_SIGHT)
-    assert abs(_with_full_tips(axis, points, fit).nodes[0, 2]) < 0.008
+    assert abs(with_full_tips(axis, points, 0.001).nodes[0, 2]) < 0.008
 
 
 def test_an_end_that_slid_beyond_the_points_is_drawn_back() -> None:
     """Both ends of an axis 12 mm past a tube: they come back to it; ends within it stay."""
-    from limber.geometry.skeleton.skeletonise import _ends_within
+    from limber.geometry.skeleton.repair.ends import ends_within
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     for over, moved in ((0.012, True), (-0.002, False)):
         z = np.concatenate([[-over], np.linspace(0.01, 0.29, 29), [0.3 + over]])
         axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
                                    np.full(31, 0.01))
-        ended = _ends_within(axis, points).nodes[[0, -1], 2]
+        ended = ends_within(axis, points).nodes[[0, -1], 2]
         if moved:
             assert abs(ended - [0.0, 0.3]).max() < 0.002
         else:

@@ -10,8 +10,10 @@ from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
 from limber.geometry.cloud.leaves import Leaf, find_leaves
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
+from limber.geometry.cloud.thinning import thinned
+from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
-from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT, SkeletonResult, thinned
+from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
 
 UNASKED = 0.1
 """Share of the points up to which leaves are cut off without the user's consent."""

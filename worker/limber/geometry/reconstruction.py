@@ -35,8 +35,9 @@ from limber.geometry.skeleton.edits import Edit, edited
 from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.search_result import SkeletonResult, given_skeleton
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
-from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
+from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
@@ -325,8 +326,6 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
 def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
               progress: Progress) -> SkeletonResult:
     if own is not None:
-        from limber.geometry.skeleton.skeletonise import given_skeleton
-
         if (own.radius <= 0).any():
             raise InputError(
                 f"{int((own.radius <= 0).sum())} of {own.node_count} nodes of the given skeleton "

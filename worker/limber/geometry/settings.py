@@ -85,6 +85,10 @@ class SkeletonSettings(Settings):
     radius_high: float = Field(
         0.1, gt=0, le=1, description="Largest radius, as a fraction of the cloud's diagonal.")
 
+    def radius_limits(self, diagonal: float) -> tuple[float, float]:
+        """Least and largest radius [m] in a cloud of this size [m]: the paper's rule."""
+        return self.radius_low * diagonal, self.radius_high * diagonal
+
 
 class MeshSettings(Settings):
     """How the tetrahedra are made."""

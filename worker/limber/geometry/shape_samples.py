@@ -12,8 +12,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from limber.geometry.skeleton.confidence import given_carrier
-from limber.geometry.skeleton.radii.axis_fit import fit_precision
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
+from limber.geometry.skeleton.radii.normal_equations import fit_precision
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import tangents
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh

@@ -20,8 +20,8 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import (
     Contraction,
     ContractionStatus,
 )
+from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.skeletonise import SkeletonResult
 
 _WHAT = "a skeleton as reconstruct has found it"
 _SKELETON: dict[str, tuple[int | str, ...]] = {

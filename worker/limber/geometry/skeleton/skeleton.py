@@ -125,12 +125,12 @@ class Skeleton:
 
         A side run starts with the node that it forks off from, which is its parent's.
         """
-        runs = []
-        for branch in range(self.branch_count):
-            members = np.flatnonzero(self.branch == branch)
-            start = self.parent[members[0]]
-            runs.append(members if start < 0 else np.concatenate([[start], members]))
-        return runs
+        return [own if self.parent[own[0]] < 0 else np.concatenate([self.parent[own[:1]], own])
+                for own in self.own_runs()]
+
+    def own_runs(self) -> list[np.ndarray]:
+        """Node indices of each unforked run without the node that it forks off from."""
+        return [np.flatnonzero(self.branch == branch) for branch in range(self.branch_count)]
 
     def point_at(self, fraction: float) -> np.ndarray:
         """Position [m], shape [3], at a fraction of the main path's length."""
@@ -149,10 +149,15 @@ class Skeleton:
         """Return the skeleton with other node positions [m], shape [n, 3]."""
         return replace(self, nodes=np.asarray(nodes, float))
 
-    def subset(self, keep: np.ndarray) -> "Skeleton":
-        """Return the skeleton of the nodes where ``keep`` [n] is true; a parent must be kept."""
+    def subset(self, keep: np.ndarray, parent: np.ndarray | None = None) -> "Skeleton":
+        """Return the skeleton of the nodes where ``keep`` [n] is true; a parent must be kept.
+
+        Args:
+            keep: Shape [n].
+            parent: Other parents of all nodes, shape [n]; None: those that they have.
+        """
         new_index = np.cumsum(keep) - 1
-        parent = self.parent[keep]
+        parent = (self.parent if parent is None else parent)[keep]
         parent = np.where(parent < 0, -1, new_index[parent])
         return Skeleton.from_edges(
             self.nodes[keep], parent, self.radius[keep], radius_sigma=self.radius_sigma[keep],

@@ -5,6 +5,11 @@ import numpy as np
 _SAME = 1e-13  # of the coordinates: nodes that close are at one place
 
 
+def arc_lengths(points: np.ndarray) -> np.ndarray:
+    """Length of a polyline up to each of its points [m], shape [n]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
 def tangents(points: np.ndarray) -> np.ndarray:
     """Unit tangents of a polyline by central differences, shape [n, 3]."""
     step = np.diff(points, axis=0)
@@ -97,7 +102,7 @@ def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormal
 def resample(points: np.ndarray, radius: np.ndarray, spacing: np.ndarray | float,
              ) -> tuple[np.ndarray, np.ndarray]:
     """Points and radii anew along a polyline, ``spacing`` (a number, or one a point) apart."""
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = arc_lengths(points)
     wanted = np.broadcast_to(np.asarray(spacing, float), along.shape)
     # Equal steps in the integral of 1/spacing follow a spacing that changes along the way.
     density = np.concatenate([[0], np.cumsum(np.diff(along) * 2 / (wanted[1:] + wanted[:-1]))])

@@ -108,68 +108,12 @@ def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
     return np.stack([first, near[first, place]], axis=1), spacing
 
 
-def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, factor: float,
-                ) -> tuple[np.ndarray, int]:
-    """Mark the nodes to keep when twigs shorter than ``factor`` radii of their carrier go.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        parent: Parents, -1 for the root, shape [n].
-        thickness: Radii [m], shape [n].
-        factor: A side twig stays if it reaches so many times the radius of the node it starts
-            from beyond that node.
-
-    Returns:
-        Mask [n], and how many spurs went.
-    """
-    keep, pruned = np.ones(len(nodes), bool), 0
-    step = np.where(parent >= 0, np.linalg.norm(nodes - nodes[parent], axis=1), 0.0)
-    while True:
-        children = np.bincount(parent[keep & (parent >= 0)], minlength=len(nodes))
-        spurs = []
-        for tip in np.flatnonzero(keep & (children == 0) & (parent >= 0)):
-            chain, length, node = [], 0.0, tip
-            while parent[node] >= 0 and children[node] <= 1:
-                chain.append(node)
-                length += step[node]
-                node = parent[node]
-            if children[node] > 1 and length < factor * max(
-                    thickness[node], float(np.median(thickness[chain]))):
-                spurs.append((length, chain))
-        if not spurs:
-            return keep, pruned
-        # The shortest alone: what was a fork may then be no fork any more.
-        _, chain = min(spurs, key=lambda spur: spur[0])
-        keep[chain] = False
-        pruned += 1
-
-
 def rooted(nodes: np.ndarray, edges: np.ndarray, root: int) -> np.ndarray:
     """Parents of the tree of ``edges`` hung up at ``root``; -1 for the root, -2 if not reached."""
     _, before = breadth_first_order(_matrix(len(nodes), edges), root, directed=False)
     parent = np.where(before < 0, -2, before).astype(np.int64)
     parent[root] = -1
     return parent
-
-
-def end_chain(edges: list[list[int]], nodes: np.ndarray, tip: int, reach: float) -> list[int]:
-    """Nodes from a tip to the first fork, or up to a length of ``reach`` [m].
-
-    Args:
-        edges: Neighbours of each node.
-        nodes: Positions [m], shape [n, 3].
-        tip: Where to start.
-        reach: How far to go.
-    """
-    chain, length, before = [tip], 0.0, -1
-    while length < reach:
-        ahead = [node for node in edges[chain[-1]] if node != before]
-        if len(ahead) != 1:
-            break
-        before = chain[-1]
-        length += float(np.linalg.norm(nodes[ahead[0]] - nodes[before]))
-        chain.append(ahead[0])
-    return chain
 
 
 def _smoothed(drawn: np.ndarray, contracted: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.bridges import (
+from limber.geometry.skeleton.contraction.bridges import (
     Ends,
     Hypotheses,
     Known,

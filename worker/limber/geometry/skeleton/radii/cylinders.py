@@ -22,6 +22,11 @@ def nearest_cylinders(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarra
     return np.concatenate(segments), np.concatenate(residuals)
 
 
+def point_counts(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
+    """Number of points on each node's cylinder, shape [n]."""
+    return np.bincount(nearest_cylinders(skeleton, points)[0], minlength=skeleton.node_count)
+
+
 def on_cylinders(skeleton: Skeleton, points: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Where points lie along the cylinders that they are nearest to, or inside of.

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import i0e
 
+from limber.geometry.skeleton.radii.cylinders import Match
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
+from limber.geometry.skeleton.skeleton import Skeleton
 
 PLACES = 180  # on the circle, of which each is weighed
 _CLEAR = 12.0  # concentration from which a point tells which sides were seen
@@ -37,6 +39,10 @@ _FURTHER = np.deg2rad(3.0)  # and no more: past the last point, few scores say h
 # The points' angles fit the model worse than chance has it, and are wrong together: so many of them
 # tell as much as one that is independent.
 _MISFIT = 3.0
+# Radii to either side whose points tell how evenly a side is seen, each at least so many noises.
+_WINDOW, _NOISY_WINDOW = 4.0, 2.0
+_TELLING = 80  # points there that tell
+_ASKEW, _NARROW = 0.25, 0.33  # mean of the sine from the sight, and of its square: half a circle's
 
 
 @dataclass(frozen=True)
@@ -257,3 +263,28 @@ def sides_of(axis: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray
     side = np.where((size > 1e-6)[:, None], side, other)
     side /= np.linalg.norm(side, axis=1)[:, None]
     return side, np.cross(axis, side)
+
+
+def evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
+                weight: np.ndarray, across: np.ndarray, noise: float) -> np.ndarray:
+    """Whether enough points around each node show all of the side that was seen, shape [n].
+
+    Where a point comes from is weighed by which sides were seen. Of a strip along a branch whose
+    rest is hidden, or of a few points, that makes a cylinder as thin as the strip is wide: measured
+    from the truth as start, twigs with under 7 points a radius of length shrank to 0.8 of theirs,
+    and hidden stems to a third. There the nearest places are the better guess (0.95). Where noise
+    is as wide as the branch they tell little of it, and points from farther along speak.
+    """
+    sums = np.stack([np.bincount(match.segment, weight * value, len(nodes))
+                     for value in (np.ones(len(across)), across, across**2)], axis=1)
+    even = np.zeros(len(nodes), bool)
+    for own in skeleton.own_runs():
+        step = np.linalg.norm(nodes[own] - nodes[np.maximum(skeleton.parent[own], 0)], axis=1)
+        along, total = np.cumsum(step), np.vstack([np.zeros(3), np.cumsum(sums[own], axis=0)])
+        reach = _WINDOW * np.maximum(radius[own], _NOISY_WINDOW * noise)
+        first, last = (np.searchsorted(along, along + way, side) for way, side in (
+            (-reach, "left"), (reach, "right")))
+        count, mean, square = (total[last] - total[first]).T
+        even[own] = (count > _TELLING) & (np.abs(mean) < _ASKEW * count) & (
+            square > _NARROW * count)
+    return even

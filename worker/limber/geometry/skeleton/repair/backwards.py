@@ -34,13 +34,7 @@ def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
             keep[members[1:place]] = False
             parent[members[place]] = fork
             count += 1
-    if count == 0:
-        return skeleton, 0
-    new_index = np.cumsum(keep) - 1
-    moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
-    return Skeleton.from_edges(
-        skeleton.nodes[keep], moved, skeleton.radius[keep],
-        radius_sigma=skeleton.radius_sigma[keep], radius_state=skeleton.radius_state[keep]), count
+    return (skeleton.subset(keep, parent) if count else skeleton), count
 
 
 def _straight_back(skeleton: Skeleton, members: np.ndarray, carrier: np.ndarray,

@@ -4,18 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import point_counts
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
+from limber.geometry.skeleton.sweep import arc_lengths
 
 _RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
 _STEADY = 40  # points whose nodes' radii make a steady one
 _SURE = 1.96  # standard deviations
 _SPEAK = 1 / 8  # of a run's nodes, and of its points, that speak for what follows
-
-
-def point_counts(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
-    """Number of points on each node's cylinder, shape [n]."""
-    return np.bincount(nearest_cylinders(skeleton, points)[0], minlength=skeleton.node_count)
 
 
 def filled_in(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
@@ -40,13 +36,11 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
     """
     count = point_counts(skeleton, points)
     radius = skeleton.radius.copy()
-    for run, members in enumerate(skeleton.runs()):
-        own = members if run == 0 else members[1:]
+    for members, own in zip(skeleton.runs(), skeleton.own_runs(), strict=True):
         speak = own[count[own] > 0]
         if len(speak) == 0:
             continue
-        step = np.linalg.norm(np.diff(skeleton.nodes[members], axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(step)])
+        along = arc_lengths(skeleton.nodes[members])
         there = along[np.searchsorted(members, speak)]
         for node, here in zip(own, along[-len(own):], strict=True):
             # Each has a point or more: no more nodes than that to either side.
@@ -70,8 +64,7 @@ def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
         points: Scanned points [m], shape [m, 3].
     """
     count, radius = point_counts(skeleton, points), skeleton.radius.copy()
-    for run, members in enumerate(skeleton.runs()):
-        own = members if run == 0 else members[1:]
+    for own in skeleton.own_runs():
         for place, node in enumerate(own):
             beyond = own[place:][count[own[place:]] > 0]
             if len(beyond):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from limber.geometry.skeleton.bridge_kernels import nearest_others, priced
+from limber.geometry.skeleton.contraction.bridge_kernels import nearest_others, priced
 
 _CHAIN = 6.0  # radii of an end that tell its direction
 _CHAIN_NODES = 4  # and so many nodes at least

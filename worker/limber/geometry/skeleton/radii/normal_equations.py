@@ -1,0 +1,138 @@
+"""The least-squares problem of a fit: what points ask of axes and radii, and of smoothness."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from limber.geometry.skeleton.radii.cylinders import Match, match_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import normal_blocks
+from limber.geometry.skeleton.radii.noisy_rings import Aims
+from limber.geometry.skeleton.radii.robust_noise import robust_sigma, settled_weights
+from limber.geometry.skeleton.radii.smoothness import smoothness
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import tangents
+
+_PROBE = 128  # nodes between two whose radii are taken as independent of each other
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations of one round in x, y, z and radius of n nodes.
+
+    Attributes:
+        matrix: Shape [4 n, 4 n].
+        right: Shape [4 n].
+        per_node: Weight of the points at each node, shape [n].
+    """
+
+    matrix: sparse.csc_matrix
+    right: np.ndarray
+    per_node: np.ndarray
+
+    def factor(self) -> SuperLU:
+        """Return the matrix's factor."""
+        return splu(self.matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+    def solve(self) -> np.ndarray:
+        """Step of each node: x, y, z, radius [m], shape [n, 4]."""
+        return self.factor().solve(self.right).reshape(-1, 4)
+
+
+def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
+                     weight: np.ndarray, noise: float, place: np.ndarray | None = None,
+                     aims: Aims | None = None, across: np.ndarray | None = None,
+                     ) -> NormalEquations:
+    """Set up a round: what points ask, how smooth runs are, and what holds bare nodes.
+
+    Args:
+        skeleton: As the fit began.
+        nodes: Positions now [m], shape [n, 3].
+        radius: Radii now [m], shape [n].
+        match: The cylinder of each point.
+        weight: How far each point counts, shape [m].
+        noise: Standard deviation of the points [m].
+        place: Mean direction of each point's true place (:mod:`noisy_rings`), shape [m, 3]; None:
+            the nearest place on the circle is the true one.
+        aims: How far out the points should lie; None: at the radius.
+        across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not.
+    """
+    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place, aims, across)
+    smooth = smoothness(skeleton, nodes, radius, per_node, noise)
+    state = np.column_stack([nodes, radius]).ravel()
+    matrix = (data + smooth + _anchor(skeleton, nodes, per_node)).tocsc()
+    return NormalEquations(matrix, right - smooth @ state, per_node)
+
+
+def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_matrix, float]:
+    """How firmly points hold a fitted skeleton, and their noise [m].
+
+    The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
+    shape [4 n, 4 n]: of a smoothing spline as Wahba (1983) has it. Its noise is that of single
+    points, independent of each other. True errors of generated scans, averaged over ninths of the
+    main axis, came to 1.0 of the deviations so foretold (medians over 0.6745) on 8 scans of both
+    kinds, to 1.2 to 1.4 on 6 more of one side only. Where the axis ran into a twig and back, at a
+    fork that one side hides, they were far larger.
+    """
+    match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
+                            points)
+    noise = max(robust_sigma(match.residual, match.thick), 1e-12)
+    weight = settled_weights(match.residual, noise)
+    return normal_equations(skeleton, skeleton.nodes, skeleton.radius, match, weight,
+                            noise).matrix, noise
+
+
+def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
+                      weight: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviation of each radius [m], and whether the node has points of its own."""
+    system = normal_equations(skeleton, nodes, radius, match, weight, noise)
+    # Nodes so far apart say nothing about each other: the inverse's diagonal is read off one
+    # solve for all of them. Nodes of a run have consecutive numbers.
+    period = min(_PROBE, len(nodes))
+    unit = np.zeros((4 * len(nodes), period))
+    own = np.arange(len(nodes))
+    unit[4 * own + 3, own % period] = 1.0
+    variance = system.factor().solve(unit)[4 * own + 3, own % period]
+    return noise * np.sqrt(np.maximum(variance, 0)), system.per_node > 2.0
+
+
+def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
+                place: np.ndarray | None, aims: Aims | None, across: np.ndarray | None,
+                ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
+    """Normal equations of the residuals in (x, y, z, r) of both ends, and weight a node."""
+    count = len(nodes)
+    aims = Aims(match.thick, match.thick) if aims is None else aims
+    across = np.zeros_like(match.normal) if across is None else across
+    place = match.normal if place is None else place
+    low = np.where(match.own_radius, 0.0, 1 - match.share)
+    high = np.where(match.own_radius, 1.0, match.share)
+    distance = match.residual + match.thick
+    pull = distance[:, None] * match.normal - aims.axis[:, None] * place
+    grow = distance * np.einsum("mj,mj->m", match.normal, place) - aims.radius
+    gradient = np.column_stack([
+        (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
+    block, right = normal_blocks(match.segment, match.share, low, high, match.normal, across,
+                                 gradient, weight, count)
+    ends = np.arange(1, count)
+    index = (4 * np.stack([parent[ends], ends], axis=1)[:, :, None] + np.arange(4)).reshape(-1, 8)
+    rows = np.repeat(index, 8, axis=1).ravel()
+    columns = np.tile(index, (1, 8)).ravel()
+    matrix = sparse.coo_matrix((block[1:].ravel(), (rows, columns)), (4 * count, 4 * count))
+    vector = np.bincount(index.ravel(), right[1:].ravel(), 4 * count)
+    per_node = np.bincount(match.segment, weight * match.share, count)
+    per_node += np.bincount(parent[match.segment], weight * (1 - match.share), count)
+    return matrix.tocsc(), vector, per_node
+
+
+def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> sparse.csc_matrix:
+    """Hold nodes along their axis, where points say nothing, and weakly elsewhere."""
+    typical = float(np.median(per_node[per_node > 0])) if (per_node > 0).any() else 1.0
+    direction = np.zeros_like(nodes)
+    for members in skeleton.runs():
+        direction[members[1:]] = tangents(nodes[members])[1:]
+    direction[0] = tangents(nodes[skeleton.runs()[0]])[0]
+    block = np.zeros((len(nodes), 4, 4))
+    block[:, :3, :3] = typical * direction[:, :, None] * direction[:, None, :]
+    block[:, range(4), range(4)] += 1e-3 * typical
+    return sparse.bsr_matrix((block, np.arange(len(nodes)), np.arange(len(nodes) + 1))).tocsc()

@@ -1,0 +1,92 @@
+"""Where twigs hang on their carriers: the contraction draws a fork towards the twig."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.geometry.skeleton.skeleton import Skeleton
+
+_HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and that tell where
+_KINK = np.deg2rad(50.0)
+# A twig's start may be as long as so many radii of its carrier, and end in such a kink.
+_HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
+_LINE = 2.0  # radii of its carrier that a twig's start is long, which tells where that leads
+
+
+def attached(skeleton: Skeleton) -> Skeleton:
+    """Hang each side run where its own direction meets the carrier's axis.
+
+    The contraction draws a fork towards the twig. The twig's nodes inside the carrier are
+    dropped, and its line is followed back to the carrier's axis.
+    """
+    parent, keep = skeleton.parent.copy(), np.ones(skeleton.node_count, bool)
+    runs = skeleton.runs()
+    for run in range(1, len(runs)):
+        members = runs[run][1:]
+        carrier = runs[int(skeleton.branch[skeleton.parent[members[0]]])]
+        distance, near = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[members])
+        outside = distance > 1.05 * skeleton.radius[carrier[near]]
+        first = int(np.argmax(outside)) if outside.any() else len(members) - 1
+        first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
+        keep[members[:first]] = False
+        # A hair's first nodes lie so near each other that only noise is between them.
+        along = np.cumsum(np.linalg.norm(np.diff(skeleton.nodes[members[first:]], axis=0), axis=1))
+        least = int(np.searchsorted(along, _LINE * skeleton.radius[carrier[near[first]]])) + 2
+        ahead = members[first:first + max(least, 5)]
+        if len(ahead) < 2:
+            parent[members[first]] = carrier[near[first]]
+            continue
+        direction = skeleton.nodes[ahead[-1]] - skeleton.nodes[ahead[0]]
+        direction /= np.linalg.norm(direction)
+        parent[members[first]] = _meeting(skeleton, carrier, members[first], direction)
+    # A run that hung on dropped nodes hangs on the next kept ancestor.
+    for node in range(skeleton.node_count):
+        while parent[node] >= 0 and not keep[parent[node]]:
+            parent[node] = parent[parent[node]]
+    return skeleton.subset(keep, parent)
+
+
+def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
+    """The place in a twig from which it goes the way that it goes on: its start may be a hook.
+
+    Where the scan lacks a twig's base, it hangs on its carrier by a short way across, and kinks
+    where its own axis begins.
+    """
+    nodes = skeleton.nodes
+    last = min(first + _HOOK, len(members) - _AHEAD)
+    start = max(first, last)
+    for place in range(first, last):
+        step = nodes[members[place + 1]] - nodes[members[place]]
+        ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place + 1]]
+        size = np.linalg.norm(step) * np.linalg.norm(ahead)
+        if size > 0 and step @ ahead > np.cos(_KINK) * size:
+            start = place
+            break
+    reach = _HOOK_REACH * skeleton.radius[skeleton.parent[members[0]]]
+    length = 0.0
+    for place in range(start + 1, len(members) - _AHEAD):
+        step = nodes[members[place]] - nodes[members[place - 1]]
+        length += float(np.linalg.norm(step))
+        if length > reach:
+            break
+        before = nodes[members[place]] - nodes[members[max(place - _BESIDE, start)]]
+        ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place]]
+        size = np.linalg.norm(before) * np.linalg.norm(ahead)
+        if size > 0 and before @ ahead < np.cos(_SHARP_KINK) * size:
+            start = place
+    return start
+
+
+def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
+    """Carrier node nearest to the twig's line followed back from its first node outside.
+
+    A twig grows away from its fork: a node that its line meets ahead is none, unless all are.
+    """
+    offset = skeleton.nodes[carrier] - skeleton.nodes[first]
+    back = -(offset @ direction)
+    across = np.linalg.norm(offset + back[:, None] * direction, axis=1)
+    # No farther back than the carrier is thick: at a small angle the lines meet far away.
+    reach = np.linalg.norm(offset, axis=1).min() * 2.5
+    allowed = np.linalg.norm(offset, axis=1) <= reach
+    if (allowed & (back > 0)).any():
+        allowed &= back > 0
+    return int(carrier[np.argmin(np.where(allowed, across, np.inf))])

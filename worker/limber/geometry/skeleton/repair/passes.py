@@ -1,0 +1,215 @@
+"""The repairs that lead a skeleton from the contracted points to the scan, as a list in order."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from limber.core.progress import SILENT, Progress
+from limber.geometry.settings import SkeletonSettings
+from limber.geometry.skeleton.confidence import assessed
+from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
+from limber.geometry.skeleton.radii.cylinders import point_counts
+from limber.geometry.skeleton.repair.attachment import attached
+from limber.geometry.skeleton.repair.backwards import without_backward_starts
+from limber.geometry.skeleton.repair.ends import ends_within, with_full_tips, without_bare_ends
+from limber.geometry.skeleton.repair.kinks import without_kinks
+from limber.geometry.skeleton.repair.resampling import resampled
+from limber.geometry.skeleton.repair.run_radii import (
+    filled_in,
+    limited,
+    steadied,
+    tapered,
+    unpinched,
+)
+from limber.geometry.skeleton.repair.spurs import prune_spurs
+from limber.geometry.skeleton.repair.strands import without_strands
+from limber.geometry.skeleton.skeleton import Skeleton
+
+LEAF_SHARE = 0.5
+"""Share of points over two radii off their axis from which a scan shows leaves, not branches."""
+
+_COARSE = 1.5  # local radii between the nodes of the first fit
+_NOISY = 0.2  # of the median radius
+_ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # of the last fit
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """A skeleton between two passes, and what they go by.
+
+    Attributes:
+        skeleton: As far as it is.
+        points: The scan, thinned [m], shape [m, 3].
+        radius_limits: Least and largest radius [m].
+        prune: A twig stays if it reaches so many radii of its carrier beyond that.
+        camera: The points are a depth camera's.
+        fit: The last fit.
+        pinched: What the first fit started from, where one side alone was seen of wood: that may
+            make a hair of a stem.
+        strands: How many the last search for strands has dropped.
+        pruned: Number of twigs dropped.
+        progress: Called as a fit goes.
+    """
+
+    skeleton: Skeleton
+    points: np.ndarray
+    radius_limits: tuple[float, float]
+    prune: float
+    camera: bool = False
+    fit: AxisFit | None = None
+    pinched: Skeleton | None = None
+    strands: int = 0
+    pruned: int = 0
+    progress: Progress = SILENT
+
+    def of(self, skeleton: Skeleton) -> "Repaired":
+        """The same with another skeleton."""
+        return replace(self, skeleton=skeleton)
+
+    def fitted(self, first: Skeleton, **how: Any) -> "Repaired":
+        """The same after a fit that starts from ``first``."""
+        fit = fit_axes(first, self.points, along_sight=self.camera, progress=self.progress, **how)
+        return replace(self, fit=fit, skeleton=fit.skeleton)
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the points [m], as the last fit has it."""
+        return self.last_fit.noise
+
+    @property
+    def beside(self) -> float:
+        """Share of points farther off their axis than twice its radius, as leaves lie."""
+        fit = self.last_fit
+        return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
+
+    @property
+    def last_fit(self) -> AxisFit:
+        """The last fit, once there is one."""
+        assert self.fit is not None, "the first fit comes before what asks for it"
+        return self.fit
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One repair.
+
+    Attributes:
+        name: Names it in tests and to developers.
+        repairs: What is wrong before it, a sentence.
+        run: The repair.
+        until: Share of all passes' work that is done after it; None: it takes next to no time.
+    """
+
+    name: str
+    repairs: str
+    run: Callable[[Repaired], Repaired]
+    until: float | None = None
+
+
+def _fit_coarsely(now: Repaired) -> Repaired:
+    after = now.fitted(resampled(now.skeleton, _COARSE), uncertainty=False)
+    # Of leaves too unpinched radii would make thick stems, that seem to have none.
+    may_be = after.last_fit.seen.one_sided and after.beside <= LEAF_SHARE
+    return replace(after, pinched=now.skeleton if may_be else None)
+
+
+def _fit_unpinched(now: Repaired) -> Repaired:
+    if now.pinched is None:
+        return now
+    return now.fitted(resampled(unpinched(now.pinched, now.points), _COARSE), uncertainty=False)
+
+
+def _prune_spurs(now: Repaired) -> Repaired:
+    # Noise makes a carrier look thicker, and its outliers look like twigs.
+    reach = now.skeleton.radius + 2 * now.noise
+    keep, count = prune_spurs(now.skeleton.nodes, now.skeleton.parent, reach, now.prune)
+    return replace(now, skeleton=now.skeleton.subset(keep), pruned=now.pruned + count)
+
+
+def _drop_strands(now: Repaired) -> Repaired:
+    skeleton, count = without_strands(now.skeleton)
+    return replace(now, skeleton=skeleton, strands=count, pruned=now.pruned + count)
+
+
+def _settle(now: Repaired) -> Repaired:
+    # Noise leaves little information a round.
+    noisy = now.noise > _NOISY * float(np.median(now.skeleton.radius))
+    rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.strands else 0
+    return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.strands,
+                      seen=now.last_fit.seen)
+
+
+def _fill_in(now: Repaired) -> Repaired:
+    # Where leaves swell or starve the axes, what lies beside a blank tells nothing of it either.
+    return now.of(filled_in(now.skeleton, now.points)) if now.beside <= LEAF_SHARE else now
+
+
+STEADY = Pass("steady radii", "Where points are missing, a first radius is a hair's.",
+              lambda now: now.of(steadied(now.skeleton, now.points)))
+DROP_BARE_ENDS = Pass("drop bare ends", "The contraction overshoots an end, and no point is there.",
+                      lambda now: now.of(without_bare_ends(now.skeleton, now.points)))
+DROP_STRANDS = Pass("drop strands", "Where a scan has holes, one branch holds two strands.",
+                    _drop_strands)
+LIMIT = Pass("limit radii", "A radius is beyond what a cloud of this size can hold.",
+             lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
+
+PASSES = (
+    STEADY,
+    Pass("fit coarsely", "The contracted axes lie beside those that the points show.",
+         _fit_coarsely, until=0.4),
+    Pass("fit unpinched", "A strip along a stem whose rest is hidden was fitted as a hair.",
+         _fit_unpinched, until=0.5),
+    Pass("attach twigs", "The contraction draws a fork towards its twig.",
+         lambda now: now.of(attached(now.skeleton))),
+    Pass("lead twigs back", "A twig whose foot is missing hangs on a place farther out.",
+         lambda now: now.of(without_backward_starts(now.skeleton)[0])),
+    DROP_BARE_ENDS,
+    Pass("lengthen ends", "The contraction draws an end in.",
+         lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
+    Pass("prune spurs", "A twig hardly reaches out of its carrier and the noise.", _prune_spurs),
+    DROP_STRANDS,
+    STEADY,
+    Pass("unpinch radii", "Of a strip along a stem, the radius is a hair's.",
+         lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
+    LIMIT,
+    Pass("fit finely", "Axes and radii are those of too few nodes, and of forks since moved.",
+         lambda now: now.fitted(resampled(now.skeleton), uncertainty=False), until=0.8),
+    DROP_STRANDS,
+    Pass("settle", "Noise, or a strand just dropped, leaves the fit unfinished.", _settle,
+         until=1.0),
+    DROP_BARE_ENDS,
+    Pass("draw ends back", "A fit lets an end slide along its axis beyond the points.",
+         lambda now: now.of(ends_within(now.skeleton, now.points))),
+    Pass("fill in blank radii", "No point tells a radius, and those beside it do.", _fill_in),
+    LIMIT,
+    Pass("taper radii", "A bunch of twigs that the scan did not resolve is a fat cylinder.",
+         lambda now: now.of(tapered(now.skeleton, point_counts(now.skeleton, now.points)))),
+    Pass("weigh unresolved radii", "A radius thinner than spacing or noise is taken as measured.",
+         lambda now: now.of(assessed(now.skeleton, now.points, now.noise))),
+    Pass("mend kinks", "A run turns more sharply than wood.",
+         lambda now: now.of(without_kinks(now.skeleton)[0])),
+)
+"""In the order in which they run; some run again after a fit."""
+
+
+def repaired(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
+             camera: bool, progress: Progress = SILENT) -> Repaired:
+    """Run all passes on the skeleton of the contracted points.
+
+    Args:
+        skeleton: With first radii.
+        points: The scan, thinned [m], shape [m, 3].
+        settings: How.
+        diagonal: Size of the cloud [m].
+        camera: The points are a depth camera's.
+        progress: Called as fits go.
+    """
+    now = Repaired(skeleton, points, settings.radius_limits(diagonal), settings.prune, camera)
+    done = 0.0
+    for each in PASSES:
+        until = done if each.until is None else each.until
+        now = each.run(replace(now, progress=progress.part(done, until)))
+        done = until
+    return now

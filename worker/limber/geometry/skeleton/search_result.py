@@ -1,0 +1,93 @@
+"""What the search for a skeleton came to: the skeleton, and what was done to get it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from limber.geometry.skeleton.confidence import shares
+from limber.geometry.skeleton.contraction.laplacian_contraction import (
+    Contraction,
+    ContractionStatus,
+)
+from limber.geometry.skeleton.plausibility import Where, warnings
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.totals import totals
+
+
+@dataclass(frozen=True)
+class SkeletonResult:
+    """A skeleton, and what was done to get it.
+
+    Attributes:
+        skeleton: Axes and radii [m] in the cloud's frame.
+        contraction: Contracted points and history.
+        node_of_point: Skeleton node of each point, shape [m].
+        residual: Distance of each point from its cylinder [m], shape [m].
+        noise: Robust standard deviation of the residuals [m].
+        bridges: Gaps closed: ``from``, ``to``, ``length`` [m].
+        split_off: Pieces left away: ``points``, ``distance`` [m], ``at``.
+        loops: Lengths [m] of closed loops that were opened.
+        pruned: Number of spurs pruned.
+        second_base: Where the plant seems to stand on the ground a second time [m], shape [3].
+        other_root: An end that is about as likely the root [m], shape [3].
+        unlikely: Twigs dropped as more likely not there: ``length`` [m], ``at`` [m, 3],
+            ``probability``.
+        leafy: Most points lay on no cylinder, and axes were led through the middle of leaves.
+    """
+
+    skeleton: Skeleton
+    contraction: Contraction
+    node_of_point: np.ndarray
+    residual: np.ndarray
+    noise: float
+    bridges: list[dict] = field(default_factory=list)
+    split_off: list[dict] = field(default_factory=list)
+    loops: list[float] = field(default_factory=list)
+    pruned: int = 0
+    second_base: np.ndarray | None = None
+    other_root: np.ndarray | None = None
+    leafy: bool = False
+    unlikely: list[dict] = field(default_factory=list)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know, with places in the cloud's frame."""
+        return self.warnings_at(lambda place: place)
+
+    def warnings_at(self, where: Where) -> list[str]:
+        """What the user should know, with places as ``where`` takes them to other coordinates."""
+        return warnings(self, where)
+
+    def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
+        """Return the result in another frame; ``move`` takes points [n, 3] there."""
+        bridges = [bridge | {"from": move(bridge["from"][None])[0],
+                             "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
+        split_off, unlikely = ([part | {"at": move(part["at"][None])[0]} for part in parts]
+                               for parts in (self.split_off, self.unlikely))
+        base, other = (None if place is None else move(place[None])[0]
+                       for place in (self.second_base, self.other_root))
+        return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
+                       bridges=bridges, split_off=split_off, unlikely=unlikely, second_base=base,
+                       other_root=other)
+
+    def report(self) -> dict[str, Any]:
+        """Numbers for the stage's result."""
+        return totals(self.skeleton, self.unlikely) | {
+                "contraction_iterations": self.contraction.iterations,
+                "contraction_status": self.contraction.status, "noise_m": self.noise,
+                "bridges": self.bridges, "length_shares": shares(self.skeleton),
+                "doubtful_run_count": len({int(run) for run in self.skeleton.branch[
+                    self.skeleton.probability < 0.5]}), "split_off": self.split_off,
+                "unlikely_twigs": self.unlikely,
+                "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
+
+
+def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
+    """Wrap a user's own skeleton, in the cloud's frame; nothing is changed in it."""
+    segment, residual = nearest_cylinders(skeleton, points)
+    noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+    nothing = Contraction(points[:0], np.empty(0), 0, ContractionStatus.given)
+    return SkeletonResult(skeleton, nothing, segment, residual, noise)
