@@ -1,6 +1,6 @@
 """Warming up compiles what fits and surfaces need."""
 
-from limber.geometry.skeleton.contraction.bridge_kernels import nearest_others, priced
+from limber.geometry.skeleton.joining.bridge_kernels import nearest_others, priced
 from limber.geometry.skeleton.radii.fit_kernels import (
     mean_on_circle,
     nearest_of,

@@ -5,8 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.contraction import pieces
-from limber.geometry.skeleton.contraction.pieces import join_pieces
+from limber.geometry.skeleton.joining import join_pieces as joining
+from limber.geometry.skeleton.joining import pieces
+from limber.geometry.skeleton.joining.join_pieces import join_pieces
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -61,9 +62,9 @@ def test_what_is_remembered_changes_nothing(monkeypatch):
 
     def anew(state, pair, rules, refused, dearest):
         tried.append(pair)
-        return pieces._joined(state.rounds[0].before.copy([]), rules, refused | {pair}, dearest)
+        return joining._joined(state.rounds[0].before.copy([]), rules, refused | {pair}, dearest)
 
-    monkeypatch.setattr(pieces, "_without", anew)
+    monkeypatch.setattr(joining, "_without", anew)
     monkeypatch.setattr(pieces.Joined, "ends", lambda state: pieces.free_ends(
         state.nodes, state.edges, state.thickness, state.joints))
     for seed, state in enumerate(states):

@@ -10,7 +10,8 @@ from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.reconstruction import reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings, SkeletonSettings
-from limber.geometry.skeleton.contraction.pieces import join_pieces, second_base
+from limber.geometry.skeleton.joining.join_pieces import join_pieces
+from limber.geometry.skeleton.joining.plants import second_base
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 

@@ -14,8 +14,8 @@ from limber.geometry.skeleton.confidence import likely
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
 from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
-from limber.geometry.skeleton.contraction.pieces import second_base
 from limber.geometry.skeleton.contraction.root_end import root_node
+from limber.geometry.skeleton.joining.plants import second_base
 from limber.geometry.skeleton.leaf_axes import through_leaves
 from limber.geometry.skeleton.plausibility import (
     Where,

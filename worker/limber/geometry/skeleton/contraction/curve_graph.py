@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.sparse.csgraph import (
     breadth_first_order,
     dijkstra,
@@ -11,7 +10,8 @@ from scipy.sparse.csgraph import (
 )
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.contraction.pieces import Joined, join_pieces, specks
+from limber.geometry.skeleton.joining.join_pieces import join_pieces
+from limber.geometry.skeleton.joining.pieces import Joined, edge_matrix, specks
 from limber.geometry.skeleton.repair.ties import untied
 
 _Z = np.array([0.0, 0.0, 1.0])
@@ -110,7 +110,7 @@ def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def rooted(nodes: np.ndarray, edges: np.ndarray, root: int) -> np.ndarray:
     """Parents of the tree of ``edges`` hung up at ``root``; -1 for the root, -2 if not reached."""
-    _, before = breadth_first_order(_matrix(len(nodes), edges), root, directed=False)
+    _, before = breadth_first_order(edge_matrix(len(nodes), edges), root, directed=False)
     parent = np.where(before < 0, -2, before).astype(np.int64)
     parent[root] = -1
     return parent
@@ -152,14 +152,14 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
     """Shortest edges first; an edge that closes a long way round is a loop of the plant."""
     if len(edges) == 0:
         return edges, []
-    tree = minimum_spanning_tree(_matrix(len(nodes), edges, length)).tocoo()
+    tree = minimum_spanning_tree(edge_matrix(len(nodes), edges, np.maximum(length, 1e-300))).tocoo()
     kept = np.stack([tree.row, tree.col], axis=1).astype(np.int64)
     known = {tuple(sorted(edge)) for edge in kept.tolist()}
     extra = np.array([e for e in edges.tolist() if tuple(e) not in known], np.int64).reshape(-1, 2)
     if len(extra) == 0:
         return kept, []
     # Only edges between nodes that the tree holds far apart can close a loop.
-    graph = _matrix(len(nodes), kept, tree.data)
+    graph = edge_matrix(len(nodes), kept, tree.data)
     loops: list[float] = []
     seen = np.zeros(len(nodes), bool)
     for a, b in extra:
@@ -210,9 +210,3 @@ def _leave_away(graph: CurveGraph, main: np.ndarray, label: np.ndarray) -> None:
     graph.edges = new_index[graph.edges[inside]]
     graph.nodes, graph.thickness = graph.nodes[main], graph.thickness[main]
     graph.support = graph.support[main]
-
-
-def _matrix(count: int, edges: np.ndarray, weight: np.ndarray | None = None) -> sparse.csr_matrix:
-    values = np.ones(len(edges)) if weight is None else np.maximum(weight, 1e-300)
-    return sparse.coo_matrix(
-        (values, (edges[:, 0], edges[:, 1])), shape=(count, count)).tocsr()

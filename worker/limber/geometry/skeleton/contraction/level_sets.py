@@ -9,7 +9,6 @@ modeling of laser-scanned trees (2007).
 """
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
@@ -19,7 +18,8 @@ from limber.geometry.skeleton.contraction.curve_graph import (
     neighbour_links,
     spreads,
 )
-from limber.geometry.skeleton.contraction.pieces import join_pieces
+from limber.geometry.skeleton.joining.join_pieces import join_pieces
+from limber.geometry.skeleton.joining.pieces import edge_matrix, labels
 
 POINT_LIMIT = 30_000
 """Points that levels are made of at most: more tell no finer twigs apart, they only take longer."""
@@ -66,7 +66,7 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
     distance, before = _along_plant(points, links, source)
     level = np.floor(distance / max(width or 0.0, _WIDTH * spacing)).astype(np.int64)
     same = links[level[links[:, 0]] == level[links[:, 1]]]
-    owner = connected_components(_matrix(len(points), same), directed=False)[1]
+    owner = labels(len(points), same)
     support = np.bincount(owner)
     nodes = np.stack([np.bincount(owner, points[:, k]) for k in range(3)], axis=1)
     nodes /= support[:, None]
@@ -91,7 +91,7 @@ def _along_plant(points: np.ndarray, links: np.ndarray, source: np.ndarray,
     A piece that hangs together with nothing starts anew where it is nearest to those done.
     """
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
-    graph = _matrix(len(points), links, np.maximum(length, 1e-12))
+    graph = edge_matrix(len(points), links, np.maximum(length, 1e-12))
     graph = graph.maximum(graph.T)
     _, piece = connected_components(graph, directed=False)
     distance, before = np.full(len(points), np.inf), np.full(len(points), -1)
@@ -140,8 +140,3 @@ def _thickness(points: np.ndarray, owner: np.ndarray, nodes: np.ndarray, parent:
     across = np.linalg.norm(offset - along[:, None] * axis[owner], axis=1)
     thick = np.bincount(owner, across) / support
     return np.median([thick, thick[upper], thick[lower]], axis=0)
-
-
-def _matrix(count: int, pairs: np.ndarray, weight: np.ndarray | None = None) -> sparse.csr_matrix:
-    values = np.ones(len(pairs)) if weight is None else weight
-    return sparse.coo_matrix((values, (pairs[:, 0], pairs[:, 1])), (count, count)).tocsr()

@@ -1,0 +1,1 @@
+"""Pieces of a scan joined to one tree over its gaps."""

@@ -1,0 +1,144 @@
+"""Bridges over gaps of a scan, as hypotheses: which ends of its pieces belong together.
+
+The shortest way over a gap is often wrong: where a fork is missing, it leads from the stem along a
+twig and back. An end of a piece goes on in its own direction, meets another end that comes towards
+it and is about as thick, or the side of a thicker piece at the angle that twigs stand at. How far
+that is from what was found prices a hypothesis; the cheapest ones for their thickness are taken
+first, so that stems come before twigs, and what they fill in can carry the next.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.geometry.skeleton.joining.bridge_kernels import nearest_others, priced
+from limber.geometry.skeleton.joining.free_ends import UNSURE, Ends, Known
+
+_BLIND = 5.0  # price of a bridge that no direction speaks for
+_BLIND_NEAR = 3  # nodes of other pieces that each node is tried with
+_STRAIGHT = np.deg2rad(45.0)  # ends that turn more tell no direction to a bridge
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Possible bridges, cheapest for their thickness first.
+
+    Attributes:
+        one: Node at the end that reaches out, shape [h].
+        other: Node that it reaches, shape [h].
+        length: [m], shape [h].
+        price: Length times how odd the bridge is [m], shape [h].
+        turn: Angle between the end's direction and the bridge [rad], pi where it has none,
+            shape [h].
+        meets: 1 where the other node is an end that comes towards this one, else 0, shape [h].
+        thick: How thick the end that reaches out is [m]; of a blind one the thinner, shape [h].
+    """
+
+    one: np.ndarray
+    other: np.ndarray
+    length: np.ndarray
+    price: np.ndarray
+    turn: np.ndarray
+    meets: np.ndarray
+    thick: np.ndarray
+
+
+def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, label: np.ndarray,
+               weight: np.ndarray, limit: float, ends: Ends, known: Known | None = None,
+               ) -> Hypotheses:
+    """Price the ways in which pieces can be joined.
+
+    Args:
+        nodes: Positions [m], shape [n, 3].
+        edges: Node pairs of a forest, shape [e, 2].
+        thickness: First radii [m], shape [n].
+        label: Which piece each node belongs to, shape [n].
+        weight: Points of each piece, shape [pieces].
+        limit: No bridge is longer [m], unless an end points straight at what it reaches.
+        ends: The pieces' free ends.
+        known: What earlier calls found; what this one finds is added.
+    """
+    axes = _axes(nodes, edges, known or Known())
+    end_of = np.full(len(nodes), -1)
+    end_of[ends.node] = np.arange(len(ends.node))
+    nodes, label = np.ascontiguousarray(nodes, float), label.astype(np.int64)
+    single = np.bincount(label)[label] <= UNSURE
+    parts = [priced(nodes, thickness, axes, single, label, ends.node, ends.direction, ends.radius,
+                    end_of, float(limit)),
+             _blind(nodes, label, int(np.argmax(weight)), limit)]
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    thick = thickness.copy()
+    thick[ends.node] = ends.radius
+    thick = np.where(columns[4] == np.pi, np.minimum(thick[columns[0]], thick[columns[1]]),
+                     thick[columns[0]])
+    thick = np.maximum(thick, 1e-12)
+    order = np.argsort(columns[3] / thick, kind="stable")
+    return Hypotheses(*(column[order] for column in (*columns, thick)))
+
+
+def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other: int,
+           step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [m], shape [k, 3], and radii [m] along a bridge, about ``step`` [m] apart.
+
+    A cubic from end to end in their directions; where only one end has a direction, it leaves in
+    that and arrives as it comes.
+    """
+    start, stop = nodes[one], nodes[other]
+    way = stop - start
+    length = float(np.linalg.norm(way))
+    count = int(length / max(step, 1e-12)) - 1
+    if count < 1:
+        return np.empty((0, 3)), np.empty(0)
+    leave = _lead(ends, one, way)
+    arrive = _lead(ends, other, -way)
+    leave = None if leave is None else leave * length
+    arrive = None if arrive is None else -arrive * length
+    if leave is None and arrive is None:
+        leave = arrive = way
+    elif leave is None:
+        leave = (3 * way - arrive) / 2
+    elif arrive is None:
+        arrive = (3 * way - leave) / 2
+    t = (np.arange(count) + 1)[:, None] / (count + 1)
+    curve = ((2 * t**3 - 3 * t**2 + 1) * start + (t**3 - 2 * t**2 + t) * leave
+             + (3 * t**2 - 2 * t**3) * stop + (t**3 - t**2) * arrive)
+    thick = thickness[one] + t[:, 0] * (min(thickness[other], thickness[one]) - thickness[one])
+    return curve, thick
+
+
+def _axes(nodes: np.ndarray, edges: np.ndarray, known: Known) -> np.ndarray:
+    """Direction of the axis at each node, without sign; zero at single nodes, shape [n, 3]."""
+    sums = np.zeros((len(nodes), 3, 3))
+    way = nodes[edges[:, 1]] - nodes[edges[:, 0]]
+    square = way[:, :, None] * way[:, None, :]
+    np.add.at(sums, edges[:, 0], square)
+    np.add.at(sums, edges[:, 1], square)
+    axes = np.zeros((len(nodes), 3))
+    axes[:len(known.axes)] = known.axes
+    fresh = np.trace(sums, axis1=1, axis2=2) > 0
+    fresh[:len(known.sums)] &= (sums[:len(known.sums)] != known.sums).any(axis=(1, 2))
+    axes[fresh] = np.linalg.eigh(sums[fresh])[1][:, :, 2]
+    known.sums, known.axes = sums, axes
+    return axes
+
+
+def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,
+           ) -> tuple[np.ndarray, ...]:
+    """The shortest ways from each piece to others, whatever the directions."""
+    own = np.argsort(label, kind="stable")
+    own = own[label[own] != largest]
+    near, distance = nearest_others(nodes, label, own, float(limit), _BLIND_NEAR)
+    place, which = np.nonzero(near >= 0)
+    length = distance[place, which]
+    return (own[place], near[place, which], length, (1 + _BLIND) * length,
+            np.full(len(length), np.pi), np.zeros(len(length), np.int64))
+
+
+def _lead(ends: Ends, node: int, way: np.ndarray) -> np.ndarray | None:
+    """Direction that an end gives to a bridge along ``way``; None if it is none or turns much."""
+    place = np.flatnonzero(ends.node == node)
+    if len(place) == 0 or not ends.direction[place[0]].any():
+        return None
+    direction = ends.direction[place[0]]
+    cosine = direction @ way / max(float(np.linalg.norm(way)), 1e-300)
+    return direction if cosine > np.cos(_STRAIGHT) else None

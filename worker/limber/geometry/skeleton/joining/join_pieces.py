@@ -1,0 +1,127 @@
+"""Pieces of a scan: which belong to one plant and are bridged, and which are left away."""
+
+from dataclasses import fields
+
+import numpy as np
+
+from limber.geometry.skeleton.joining.bridge_choice import mutual
+from limber.geometry.skeleton.joining.bridges import Hypotheses, hypotheses
+from limber.geometry.skeleton.joining.pieces import Joined, Round, Rules, labels
+from limber.geometry.skeleton.joining.plants import plants_apart
+
+_ODD = 1.9  # price of a bridge over its length, from which those around it are tried without
+_AROUND = 2.0  # lengths of such a bridge
+_CLEARLY = 0.98  # of what all bridges cost, under which others are better
+
+
+def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
+                spread: np.ndarray, *, gap: float, bridge_limit: float, up: np.ndarray,
+                join_plants: bool) -> Joined:
+    """Join pieces over gaps by the bridges that their directions and radii speak for.
+
+    The smaller piece of a long bridge must have some length itself: so a severed twig comes back to
+    its branch, and a stray clump of pixels is joined to nothing far away.
+
+    Two large pieces that each stand on the ground are two plants, and are not joined.
+
+    Args:
+        nodes: Positions [m], shape [n, 3].
+        edges: Node pairs of a forest, shape [e, 2].
+        thickness: First radii [m], shape [n].
+        support: Number of points of each node, shape [n].
+        spread: How far its points reach from each node [m], shape [n].
+        gap: Steps up to this length [m] are no gap (the paper's gamma rule).
+        bridge_limit: No bridge is longer [m], unless its end points straight at what it reaches.
+        up: Which way is up, shape [3].
+        join_plants: Join even what looks like two plants.
+    """
+    label = labels(len(nodes), edges)
+    first = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
+                   np.empty(0), np.empty((0, 2), np.int64), label, np.empty((0, 2), np.int64),
+                   label)
+    rules = Rules(gap, bridge_limit, up, join_plants)
+    state = _reconsidered(_joined(first, rules), rules)
+    plants = plants_apart(state.nodes, state.thickness, state.support, state.label, up)
+    state.plants = np.array(plants, np.int64).reshape(-1, 2)
+    return state
+
+
+def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = frozenset(),
+            dearest: float = np.inf, alone: bool = True) -> Joined:
+    """Bridge after bridge from what was given; those between ``refused`` pieces are not made.
+
+    It ends early once they cost ``dearest`` [m]. One node or two tell no direction: as long as
+    ``alone`` holds, they are joined only to ends that go straight on to them.
+    """
+    state = first.copy(first.rounds)
+    while True:
+        weight = np.bincount(state.label, state.support)
+        if len(weight) == 1 or state.cost() >= dearest:
+            break
+        ends = state.ends()
+        found = _unrefused(hypotheses(state.nodes, state.edges, state.thickness, state.label,
+                                      weight, rules.bridge_limit, ends, state.known),
+                           state.piece, refused)
+        chosen, decisive = mutual(found, state, ends, weight, rules, alone)
+        state.rounds.append(Round(state.copy([]), alone, decisive))
+        if not chosen and alone:
+            alone = False
+            continue
+        if not chosen:
+            break
+        for place in chosen:
+            state.bridge(ends, found, place, rules.gap / 3)
+        state.label = labels(len(state.nodes), state.edges)
+    return state
+
+
+def _without(state: Joined, pair: tuple[int, int], rules: Rules,
+             refused: frozenset[tuple[int, int]], dearest: float) -> Joined:
+    """As ``state`` was joined, but for bridges between a ``pair`` of pieces, ``refused`` as well.
+
+    All is the same up to the first round that such a bridge mattered in.
+    """
+    at = next(k for k, past in enumerate(state.rounds) if pair in past.decisive)
+    past = state.rounds[at]
+    start = past.before.copy(state.rounds[:at])
+    return _joined(start, rules, refused | {pair}, dearest, past.alone)
+
+
+def _reconsidered(state: Joined, rules: Rules) -> Joined:
+    """The bridges without one that left an odd one to others, if all together then cost less.
+
+    A stem's end takes the foot of a twig that happens to be nearer than the stem's next patch;
+    that patch is then left to come to the twig from aside.
+    """
+    refused: frozenset[tuple[int, int]] = frozenset()
+    while True:
+        best, without = state, refused
+        for pair in _doubted(state, rules.gap):
+            dearest = _CLEARLY * best.cost()
+            other = _without(state, pair, rules, refused, dearest)
+            if other.label.max() <= best.label.max() and other.cost() < dearest:
+                best, without = other, refused | {pair}
+        if without == refused:
+            return state
+        state, refused = best, without
+
+
+def _doubted(state: Joined, gap: float) -> list[tuple[int, int]]:
+    """Pairs of pieces whose bridge ends near an odd one."""
+    ends, length = state.nodes[state.bridges], state.lengths()
+    doubted = set()
+    for odd in np.flatnonzero((state.prices > _ODD) & (length > gap)):
+        apart = np.linalg.norm(ends[:, :, None] - ends[odd], axis=3).min(axis=(1, 2))
+        near = np.flatnonzero((apart <= _AROUND * length[odd]) & (length > gap))
+        pairs = np.sort(state.piece[state.bridges[near]], axis=1)
+        doubted |= set(map(tuple, pairs[pairs[:, 0] >= 0].tolist()))
+    return sorted(doubted)
+
+
+def _unrefused(found: Hypotheses, piece: np.ndarray, refused: frozenset[tuple[int, int]],
+               ) -> Hypotheses:
+    if not refused:
+        return found
+    pairs = np.sort(np.stack([piece[found.one], piece[found.other]], axis=1), axis=1)
+    able = ~(pairs[:, None] == np.array(sorted(refused))).all(axis=2).any(axis=1)
+    return Hypotheses(*(getattr(found, column.name)[able] for column in fields(Hypotheses)))
