@@ -46,8 +46,7 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
     mesh = sweep_run(centres, radius, sides=sides)
     if quadratic:
         mesh = mesh.quadratic()
-    return _with_beam_data(mesh, axis, length, fractions, grasp_fraction,
-                           young, poisson, density)
+    return _with_beam_data(mesh, axis, length, fractions, grasp_fraction, young, poisson, density)
 
 
 def curved_beam(points: np.ndarray, radius: np.ndarray, *, slice_length: float = 2.0,
@@ -76,15 +75,18 @@ def sweep_run(centres: np.ndarray, radius: np.ndarray, *, sides: int = 6) -> Tet
 
 def swept(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
     """Linear tetrahedra of the tube with these rings, shape [n, sides, 3], around ``centres``."""
-    sides = ring.shape[1]
+    return tube(centres, ring).oriented()
+
+
+def tube(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
+    """The same, oriented as the rings are."""
+    count, sides = ring.shape[:2]
     nodes = np.concatenate([centres[:, None], ring], axis=1).reshape(-1, 3)
-    wedges = []
-    for i in range(len(centres) - 1):
-        low, high = i * (sides + 1), (i + 1) * (sides + 1)
-        for k in range(sides):
-            a, b = 1 + k, 1 + (k + 1) % sides
-            wedges.append([low, low + a, low + b, high, high + a, high + b])
-    return TetMesh(nodes, split_wedges(np.array(wedges))).oriented()
+    centre, a = np.zeros(sides, np.int64), 1 + np.arange(sides)
+    triangle = np.stack([centre, a, 1 + a % sides], axis=1)
+    low = triangle + (np.arange(count - 1) * (sides + 1))[:, None, None]
+    return TetMesh(nodes, split_wedges(np.concatenate(
+        [low, low + sides + 1], axis=2).reshape(-1, 6)))
 
 
 def split_wedges(wedges: np.ndarray) -> np.ndarray:

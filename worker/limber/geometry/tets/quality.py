@@ -10,6 +10,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
+FLAT = 0.02
+"""A tetrahedron's shape under that (1 is regular) is avoided."""
+
 
 @dataclass(frozen=True)
 class MeshQuality:
@@ -122,3 +125,16 @@ def _elements_across(mesh: TetMesh, skeleton: Skeleton) -> float:
     _, near = cKDTree(mesh.centroids).query(skeleton.nodes, k=min(6, mesh.tet_count))
     local = edges[near].reshape(skeleton.node_count, -1).mean(axis=1)
     return float(np.median(2 * skeleton.radius / local))
+
+
+def shapes(corner: np.ndarray) -> np.ndarray:
+    """Volume over the cube of the mean edge, 1 if a tetrahedron is regular, negative if inverted.
+
+    Args:
+        corner: Corners [m], shape [..., 4, 3].
+    """
+    edges = [corner[..., i, :] - corner[..., j, :] for i in range(4) for j in range(i)]
+    square = sum(np.einsum("...k,...k->...", e, e) for e in edges) / 6
+    a, b, c = (corner[..., k, :] - corner[..., 0, :] for k in (1, 2, 3))
+    volume = np.einsum("...k,...k->...", a, np.cross(b, c)) / 6
+    return 6 * np.sqrt(2) * volume / np.maximum(square, 1e-300)**1.5

@@ -1,0 +1,116 @@
+"""How a run is cut into slices: one for each of its twigs, and even ones between."""
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.geometry.tets.run_axis import RunAxis
+
+_CLAMP_SLICES = (1.0, 3.0)  # where the first slices end, in radii of the root
+_TAPERED, _THINNEST = 2.5, 0.06  # radius ratio from which rings are graded; down to which
+
+
+@dataclass
+class Window:
+    """A slice of a carrier that a twig grows out of.
+
+    Attributes:
+        run: The twig.
+        low, high: Where the slice begins and ends along the carrier [m].
+        outward: Where the twig leaves, a unit vector, shape [3].
+    """
+
+    run: int
+    low: float
+    high: float
+    outward: np.ndarray
+
+    @classmethod
+    def of(cls, axis: RunAxis, twig: RunAxis, run: int) -> "Window | None":
+        """The slice of a carrier's ``axis`` that a ``twig`` leaves through; None: it stays inside.
+        """
+        where = np.linspace(0, twig.length, 200)
+        distance, foot = axis.nearest(twig.at(where))
+        out = np.flatnonzero(distance > axis.radius_at(foot))
+        if len(out) == 0:
+            return None
+        exit_point, place = twig.at(where[out[0]]), foot[out[0]]
+        outward = exit_point - axis.at(place)
+        outward /= max(np.linalg.norm(outward), 1e-300)
+        half = 1.25 * float(twig.radius_at(where[out[0]]))
+        return cls(run, place - half, place + half, outward)
+
+
+def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> list[Window]:
+    """Move slices along an axis from ``start`` [m], so that none overlaps another.
+
+    Twigs that leave at one height to different sides share a slice.
+    """
+    end = axis.length + 1e-12
+    placed: list[Window] = []
+    free = start + 0.3 * float(axis.radius_at(start))
+    for window in sorted(windows, key=lambda w: w.low + w.high):
+        length = window.high - window.low
+        low = window.low
+        if placed:
+            last = placed[-1]
+            near = abs(low + length / 2 - (last.low + last.high) / 2) < 0.6 * (
+                last.high - last.low)
+            if near and window.outward @ last.outward < 0.3:
+                placed.append(Window(window.run, last.low, last.high, window.outward))
+                continue
+        low = max(min(low, axis.length - length), free)
+        if low + 0.5 * length > end:
+            continue
+        high = min(low + length, end)
+        placed.append(Window(window.run, low, high, window.outward))
+        free = high + 0.25 * length
+    return placed
+
+
+def ring_places(axis: RunAxis, start: float, windows: list[Window], spacing: float) -> np.ndarray:
+    """Where rings are along an axis from ``start`` [m], ``spacing`` local radii apart, shape [r].
+    """
+    fixed = sorted({round(v, 12) for w in windows for v in (w.low, w.high)})
+    marks = [start, *[v for v in fixed if start < v < axis.length], axis.length]
+    inside = {(round(w.low, 12), round(w.high, 12)) for w in windows}
+    places = [start]
+    if start == 0.0 and len(marks) > 1:
+        # Short slices at the clamp, which keeps the section from narrowing where it is
+        # stretched: long ones there made a cantilever 0.4 % too stiff, at any length elsewhere.
+        near = [g * float(axis.radius[0]) for g in _CLAMP_SLICES]
+        places += [v for v in near if v + near[0] < marks[1]]
+        marks[0] = places[-1]
+    for low, high in itertools.pairwise(marks):
+        size = spacing * float(axis.radius_at((low + high) / 2))
+        within = any(a <= low + 1e-9 and high <= b + 1e-9 for a, b in inside)
+        count = 1 if within else max(round((high - low) / size), 1)
+        between = np.linspace(low, high, count + 1)
+        if not within and _is_tapered(axis, low, high):
+            between = _graded(axis, low, high, spacing)
+        places += list(between[1:])
+    if len(places) < 3:
+        places = list(np.linspace(start, axis.length, 3))
+    return np.array(places)
+
+
+def _is_tapered(axis: RunAxis, low: float, high: float) -> bool:
+    radii = axis.radius_at(np.linspace(low, high, 20))
+    return bool(radii.max() > _TAPERED * radii.min())
+
+
+def _graded(axis: RunAxis, low: float, high: float, spacing: float) -> np.ndarray:
+    """Places of rings where the radius changes much: closer where it is thin.
+
+    Slices as long as suits the middle would be needles at a thin end, which look as if they
+    were folded over.
+    """
+    along = np.linspace(low, high, 400)
+    radii = axis.radius_at(along)
+    pitch = spacing * np.maximum(radii, _THINNEST * radii.max())
+    rings = np.concatenate([[0.0], np.cumsum((1 / pitch[1:] + 1 / pitch[:-1]) / 2
+                                             * np.diff(along))])
+    count = max(round(float(rings[-1])), 1)
+    return np.interp(np.linspace(0, rings[-1], count + 1), rings, along)
