@@ -25,7 +25,7 @@ from benchmarks.scan_scores import Dense, doubled, fork_matches, seen_part
 from limber.core.errors import LimberError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import prepare
-from limber.geometry.io.skeletons import read_fitted, write_cylinders
+from limber.geometry.io.skeletons import read_cylinders, write_cylinders
 from limber.geometry.leaf_removal import without_leaves
 from limber.geometry.reconstruction import seen_skeleton
 from limber.geometry.settings import ReconstructSettings
@@ -112,7 +112,7 @@ def outcomes(done: list[Skeletonised], out: Path) -> Outcomes:
         if one.failure:
             continue
         case = KINDS[one.kind](one.seed)
-        found = read_fitted(out / f"{one.kind}_{one.seed}.csv")
+        found = read_cylinders(out / f"{one.kind}_{one.seed}.csv")
         twig, node = evidence(found, case.points, one.noise)
         there, near_true, high = _there(seen_part(case.truth, case.points), found)
         told.twig.append(twig[1:])

@@ -26,7 +26,7 @@ from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_
 from benchmarks.table import Setting
 from limber.core.alignment import Alignment
 from limber.core.errors import LimberError
-from limber.geometry.io.skeletons import read_fitted
+from limber.geometry.io.skeletons import read_cylinders
 from limber.geometry.reconstruction import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -149,7 +149,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     path, branch = case.write(folder), folder / f"{case.name}.branch"
     result = reconstruct(path, branch, ReconstructSettings(**case.settings))
     manifest = json.loads((branch / "branch.json").read_text())
-    aligned = read_fitted(branch / "skeleton.csv")
+    aligned = read_cylinders(branch / "skeleton.csv")
     found = aligned.moved(Alignment.model_validate(manifest["alignment"]).undo(aligned.nodes))
     seen = seen_part(case.truth, case.points)
     # Wood that no point shows is in no mesh; it is told beside.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.geometry.io.skeletons import read_fitted, write_cylinders
+from limber.geometry.io.skeletons import read_cylinders, write_cylinders
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
 from limber.geometry.skeleton.repair.run_radii import tapered
 from limber.geometry.skeleton.skeleton import (
@@ -52,14 +52,14 @@ def test_gaps_and_thin_twigs_are_said(tmp_path) -> None:
     share = shares(told)
     assert sum(share.values()) == pytest.approx(1) and 0.08 < share["bridged"] < 0.2
     write_cylinders(told, tmp_path / "s.csv")
-    back = read_fitted(tmp_path / "s.csv")
+    back = read_cylinders(tmp_path / "s.csv")
     np.testing.assert_array_equal(back.radius_state[1:], told.radius_state[1:])
     np.testing.assert_allclose(back.probability[1:], told.probability[1:], atol=6e-4)
     # Two nodes at one place are read as one, and the others keep what was said of them.
     twice = told.nodes.copy()
     twice[20] = twice[19]
     write_cylinders(told.moved(twice), tmp_path / "t.csv")
-    once = read_fitted(tmp_path / "t.csv")
+    once = read_cylinders(tmp_path / "t.csv")
     assert once.node_count == told.node_count - 1
     np.testing.assert_allclose(once.probability[20:], told.probability[21:], atol=6e-4)
 

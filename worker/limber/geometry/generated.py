@@ -14,7 +14,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.settings import BranchSpec
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import frames, tangents
+from limber.geometry.skeleton.sweep import arc_lengths, frames, tangents
 from limber.geometry.surface.surface import Surface
 
 _Positive = Annotated[float, Field(gt=0)]
@@ -142,14 +142,11 @@ def _surface_points(skeleton: Skeleton, spec: BranchSpec, rng: np.random.Generat
     # Thinned afterwards by unevenness, so more are drawn.
     density = 1.0 / spec.point_spacing**2 / (1 - 0.5 * spec.unevenness)
     parts = []
-    for run, nodes in enumerate(skeleton.runs()):
-        centres, radius = skeleton.nodes[nodes], skeleton.radius[nodes].copy()
-        if run > 0:
-            radius[0] = radius[1]
+    for run in range(skeleton.branch_count):
+        centres, radius = skeleton.curve(run)
         tangent = tangents(centres)
         normals, binormals = frames(centres, tangent)
-        along = np.concatenate(
-            [[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+        along = arc_lengths(centres)
         area = np.concatenate([[0], np.cumsum(
             np.pi * (radius[1:] + radius[:-1]) * np.diff(along))])
         side_count = rng.poisson(area[-1] * density)
@@ -175,12 +172,9 @@ def _surface_points(skeleton: Skeleton, spec: BranchSpec, rng: np.random.Generat
 def _outside_others(skeleton: Skeleton, points: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Whether each point lies outside the cylinders of the other runs."""
     keep = np.ones(len(points), bool)
-    for other, nodes in enumerate(skeleton.runs()):
-        fine = np.repeat(skeleton.nodes[nodes], 4, axis=0)
+    for other in range(skeleton.branch_count):
+        fine, radius = (np.repeat(values, 4, axis=0) for values in skeleton.curve(other))
         fine[1:] = (fine[1:] + fine[:-1]) / 2
-        radius = np.repeat(skeleton.radius[nodes], 4)
-        if other > 0:
-            radius[:4] = radius[4]
         distance, nearest = cKDTree(fine).query(points)
         keep &= (distance > 0.97 * radius[nearest]) | (run == other)
     return keep

@@ -13,12 +13,14 @@ from limber.geometry.reconstruction import gravity_after, peak_memory_mb
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.upright import shortest_turn
+from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.marks import mark
 from limber.geometry.tets.quality import measure_quality
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
+
+_SECTIONS = 24  # that an axis is made of
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: A
         "gravity_m_s2": gravity_after(alignment, settings.up)}
 
 
-def section_axis(surface: Surface, root: np.ndarray | None, count: int = 24) -> Skeleton:
+def section_axis(surface: Surface, root: np.ndarray | None) -> Skeleton:
     """Return the axis of a slender solid: centroids of its cross-sections along its length.
 
     Radii are those of circles of the sections' areas. The body is one unforked run; it starts at
@@ -95,13 +97,12 @@ def section_axis(surface: Surface, root: np.ndarray | None, count: int = 24) -> 
     Args:
         surface: Closed.
         root: A point near the end that is held [m], shape [3], or None.
-        count: Number of sections.
     """
     axis = _long_axis(surface)
     along = surface.vertices @ axis
     low, high = float(along.min()), float(along.max())
     centres, radii = [], []
-    for at in low + (high - low) * (np.arange(count) + 0.5) / count:
+    for at in low + (high - low) * (np.arange(_SECTIONS) + 0.5) / _SECTIONS:
         area, centre = _section(surface, axis, at)
         if area > 0:
             centres.append(centre)
@@ -172,11 +173,8 @@ def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: 
 def aligned_body(surface: Surface, skeleton: Skeleton, scale: float,
                  settings: MeshSurfaceSettings) -> tuple[Alignment, Surface, Skeleton]:
     """From a file's coordinates to the body's own: its root at the origin, and upright."""
-    from limber.geometry.skeleton.upright import upright_rotation
-
     root = skeleton.nodes[0]
-    rotation = upright_rotation(skeleton, np.array(settings.up), settings.upright) \
-        if settings.upright else shortest_turn(np.array(settings.up), np.array([0.0, 0.0, 1.0]))
+    rotation = upright_rotation(skeleton, np.array(settings.up), settings.upright)
     alignment = Alignment(scale=scale, origin=tuple(root.tolist()),
                           rotation=tuple(map(tuple, rotation.tolist())))
     return (alignment, Surface((surface.vertices - root) @ rotation.T, surface.faces),

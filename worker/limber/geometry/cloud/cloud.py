@@ -76,7 +76,7 @@ class Cloud:
         attributes, titles = valid_columns(self.attributes, self.titles, len(self), taken)
         return replace(self, attributes=attributes, titles=titles)
 
-    def write_ply(self, path: Path, *, comment: str = "unit: m") -> None:
+    def write_ply(self, path: Path) -> None:
         """Write a binary PLY file: positions as double, attributes in their own types.
 
         Attributes get valid names, and comments tell what the scan's file called them.
@@ -94,7 +94,7 @@ class Cloud:
         titles = [f"column {name}: {title[:_LONGEST_TITLE]!a}"
                   for name, title in valid.titles.items()]
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<",
-                comments=[comment, *titles]).write(str(path))
+                comments=["unit: m", *titles]).write(str(path))
 
 
 def _first(choices: tuple[tuple[str, ...], ...], columns: dict[str, np.ndarray],

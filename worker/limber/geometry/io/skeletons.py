@@ -182,16 +182,6 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
                              f"{skeleton.radius[skeleton.parent[node]]:.12g}"])
 
 
-def read_fitted(path: Path) -> Skeleton:
-    """Read what :func:`write_cylinders` wrote, with deviations, states and probabilities."""
-    skeleton = read_cylinders(path)
-    if "probability" not in _lines(path)[0]:
-        raise InputError(f"{path} has no radius_sigma, radius_state and probability.",
-                         "It was written by another program or an older Limber.",
-                         "Reconstruct the scan again.")
-    return skeleton
-
-
 def _require_whole(path: Path, numbers: np.ndarray) -> None:
     if not (np.abs(numbers) < 2**53).all():
         raise InputError(f"{path} has an id or a parent that is no whole number.",

@@ -6,6 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.sweep import arc_lengths, stretches
 
 _LIKELY = 0.8  # probability from which a branch is not listed
 KINK = np.deg2rad(70.0)  # a turn within a branch that wood does not make
@@ -48,8 +49,8 @@ class Doubt:
 def doubtful_parts(skeleton: Skeleton) -> list[Doubt]:
     """Return what to look at, the longest of each kind first."""
     found: list[Doubt] = []
-    for run, members in enumerate(skeleton.runs()):
-        own = members if run == 0 else members[1:]
+    for run, (members, own) in enumerate(
+            zip(skeleton.runs(), skeleton.own_runs(), strict=True)):
         probability = float(skeleton.probability[own].min())
         if probability < _LIKELY:
             found.append(_part(skeleton, DoubtKind.unlikely, run, own, probability))
@@ -71,16 +72,14 @@ def doubtful_parts(skeleton: Skeleton) -> list[Doubt]:
 
 
 def _part(skeleton: Skeleton, kind: DoubtKind, run: int, nodes: np.ndarray, value: float) -> Doubt:
-    step = np.linalg.norm(skeleton.nodes[nodes] - skeleton.nodes[skeleton.parent[nodes]], axis=1)
-    length = float(step[skeleton.parent[nodes] >= 0].sum()) if len(nodes) > 1 else 0.0
+    length = float(skeleton.steps[nodes].sum()) if len(nodes) > 1 else 0.0
     return Doubt(kind, run, skeleton.nodes[nodes[len(nodes) // 2]], length,
                  float(np.median(skeleton.radius[nodes])), value)
 
 
 def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
     """Consecutive nodes where ``chosen`` is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
-    return [nodes[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True)]
+    return [nodes[part] for part in stretches(chosen)]
 
 
 def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
@@ -90,7 +89,7 @@ def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
     than that to an end do not turn.
     """
     nodes = skeleton.nodes[members]
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    along = arc_lengths(nodes)
     chord = _CHORD * skeleton.radius[members]
 
     def at(place: np.ndarray) -> np.ndarray:

@@ -211,10 +211,7 @@ def _merged(skeleton: Skeleton, edit: MergeBranch) -> Skeleton:
     for child in np.flatnonzero(~gone & gone[skeleton.parent] & (skeleton.parent >= 0)):
         near = np.linalg.norm(skeleton.nodes[hosts] - skeleton.nodes[child], axis=1)
         parent[child] = onto if skeleton.parent[child] == node else hosts[np.argmin(near)]
-    new_index = np.cumsum(~gone) - 1
-    moved = np.where(parent[~gone] < 0, -1, new_index[parent[~gone]])
-    return Skeleton.from_edges(skeleton.nodes[~gone], moved, skeleton.radius[~gone],
-                               **{name: values[~gone] for name, values in _data(skeleton).items()})
+    return skeleton.subset(~gone, parent)
 
 
 def _bridged(skeleton: Skeleton, edit: Bridge) -> Skeleton:

@@ -32,8 +32,7 @@ def cylinders(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
 
     They taper evenly; the first of a twig has the twig's radius all along.
     """
-    step = np.linalg.norm(skeleton.nodes[1:] - skeleton.nodes[skeleton.parent[1:]], axis=1)
-    foot, radius = _feet(skeleton), skeleton.radius[1:]
+    step, foot, radius = skeleton.steps[1:], _feet(skeleton), skeleton.radius[1:]
     return step, np.pi / 3 * step * (foot**2 + foot * radius + radius**2)
 
 
@@ -60,14 +59,13 @@ def diameters(skeleton: Skeleton, along: np.ndarray) -> np.ndarray:
                          for values in (skeleton.radius, skeleton.radius_sigma)], axis=1)
 
 
-def diameters_at_heights(skeleton: Skeleton, shares: tuple[float, ...] = HEIGHTS,
-                         ) -> list[dict[str, float]]:
-    """Diameter and its standard deviation [m] at shares of the main path's length."""
+def diameters_at_heights(skeleton: Skeleton) -> list[dict[str, float]]:
+    """Diameter and its standard deviation [m] at the shares HEIGHTS of the main path's length."""
     total = float(skeleton.arc_length[skeleton.main_path()[-1]])
-    along = total * np.array(shares)
+    along = total * np.array(HEIGHTS)
     return [{"share": share, "along_m": float(place), "diameter_m": float(row[0]),
              "sigma_m": float(row[1])}
-            for share, place, row in zip(shares, along, diameters(skeleton, along), strict=True)]
+            for share, place, row in zip(HEIGHTS, along, diameters(skeleton, along), strict=True)]
 
 
 def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[str, Any]]:

@@ -50,7 +50,7 @@ class Skeleton:
         if self.probability is None:
             object.__setattr__(self, "probability", np.ones(count))
         if self.branch is None or self.order is None:
-            branch, order = _runs(self.parent, self._edge_lengths())
+            branch, order = _runs(self.parent, self.steps)
             object.__setattr__(self, "branch", branch)
             object.__setattr__(self, "order", order)
 
@@ -88,14 +88,21 @@ class Skeleton:
         return int(self.branch.max()) + 1
 
     @property
+    def steps(self) -> np.ndarray:
+        """Distance of each node from its parent [m], 0 of the root, shape [n]."""
+        step = np.linalg.norm(self.nodes - self.nodes[self.parent], axis=1)
+        step[self.parent < 0] = 0.0
+        return step
+
+    @property
     def length(self) -> float:
         """Length of all axes together [m]."""
-        return float(self._edge_lengths().sum())
+        return float(self.steps.sum())
 
     @property
     def arc_length(self) -> np.ndarray:
         """Distance from the root along the tree [m], shape [n]."""
-        step, total = self._edge_lengths(), np.zeros(self.node_count)
+        step, total = self.steps, np.zeros(self.node_count)
         for node in range(1, self.node_count):
             total[node] = total[self.parent[node]] + step[node]
         return total
@@ -125,12 +132,24 @@ class Skeleton:
 
         A side run starts with the node that it forks off from, which is its parent's.
         """
-        return [own if self.parent[own[0]] < 0 else np.concatenate([self.parent[own[:1]], own])
-                for own in self.own_runs()]
+        return [self._members(run) for run in range(self.branch_count)]
 
     def own_runs(self) -> list[np.ndarray]:
         """Node indices of each unforked run without the node that it forks off from."""
         return [np.flatnonzero(self.branch == branch) for branch in range(self.branch_count)]
+
+    def curve(self, run: int) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes [m], shape [k, 3], and radii [m] of a run from its fork on, where a twig has its
+        own radius, not its carrier's."""
+        members = self._members(run)
+        radius = self.radius[members]
+        if run > 0:
+            radius[0] = radius[1]
+        return self.nodes[members], radius
+
+    def _members(self, run: int) -> np.ndarray:
+        own = np.flatnonzero(self.branch == run)
+        return own if self.parent[own[0]] < 0 else np.concatenate([self.parent[own[:1]], own])
 
     def point_at(self, fraction: float) -> np.ndarray:
         """Position [m], shape [3], at a fraction of the main path's length."""
@@ -179,11 +198,6 @@ class Skeleton:
             up = self.parent[i] + 1 if self.parent[i] >= 0 else -1
             lines.append(f"{i + 1} {kind[i]} {p[0]:.15g} {p[1]:.15g} {p[2]:.15g} {r:.9g} {up}")
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-    def _edge_lengths(self) -> np.ndarray:
-        step = np.linalg.norm(self.nodes - self.nodes[self.parent], axis=1)
-        step[self.parent < 0] = 0.0
-        return step
 
 
 def _check_tree(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray) -> None:

@@ -10,6 +10,12 @@ def arc_lengths(points: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
+def stretches(chosen: np.ndarray) -> list[slice]:
+    """Where ``chosen`` is true for places in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
+    return [slice(begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def tangents(points: np.ndarray) -> np.ndarray:
     """Unit tangents of a polyline by central differences, shape [n, 3]."""
     step = np.diff(points, axis=0)

@@ -103,28 +103,6 @@ def _uncrossed(fork: "_Fork", first: Any, others: list, tolerance: float) -> Any
     return None
 
 
-def crease_angles(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Angles [rad] by which faces turn towards each other at hollow edges, and their lengths.
-
-    Returns:
-        Angles, shape [k]; lengths [m], shape [k].
-    """
-    faces = surface.faces
-    edges = np.sort(np.vstack([faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
-    owner = np.tile(np.arange(len(faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    pair, one, other = edges[order[::2]], owner[order[::2]], owner[order[1::2]]
-    a, b, c = (surface.vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    ends = surface.vertices[pair]
-    corner = surface.vertices[faces[other]].sum(axis=1) - ends.sum(axis=1)
-    hollow = np.einsum("ij,ij->i", normal[one], corner - ends[:, 0]) > 0
-    cosine = np.einsum("ij,ij->i", normal[one], normal[other])
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    return np.arccos(np.clip(cosine[hollow], -1, 1)), length[hollow]
-
-
 def _warnings(plain: int, count: int) -> list[str]:
     return [f"{plain} of {count} forks stay sharp-edged in the surface: a fillet there would cross "
             "it or change its volume."] if plain else []

@@ -11,11 +11,12 @@ _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0],
 # Six tetrahedra around the diagonal 0-7 of a cube (Kuhn): alike in each cube, so faces match.
 _TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7],
                   [0, 5, 1, 7]])
+_ROUNDS = 2  # in which vertices are evened out
 _NEAR = 0.05  # of the step: a lattice point closer to the surface would make a sliver
 
 
 def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray,
-                  step: float, *, rounds: int = 2) -> Surface:
+                  step: float) -> Surface:
     """Triangles of ``level(x) = 0`` around the solid where it is negative; closed by the box.
 
     Marching tetrahedra (Doi and Koide 1991) on Kuhn's subdivision of a cubic lattice, which has
@@ -27,7 +28,6 @@ def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, hi
         low: Corner of the box [m], shape [3].
         high: The opposite corner [m].
         step: Edge of the lattice's cubes [m].
-        rounds: Number of times that the vertices are evened out.
     """
     count = np.maximum(np.ceil((high - low) / step).astype(int), 1) + 1
     axes = [low[k] + step * np.arange(count[k]) for k in range(3)]
@@ -42,7 +42,7 @@ def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, hi
             face[axis] = end
             grid[tuple(face)] = np.maximum(grid[tuple(face)], _NEAR * step)
     surface = _march(points, grid)
-    return _evened(surface, level, step, rounds) if len(surface.faces) else surface
+    return _evened(surface, level, step) if len(surface.faces) else surface
 
 
 def _march(points: np.ndarray, grid: np.ndarray) -> Surface:
@@ -94,14 +94,14 @@ def _march(points: np.ndarray, grid: np.ndarray) -> Surface:
 
 
 def _evened(surface: Surface, level: Callable[[np.ndarray], np.ndarray], step: float,
-            rounds: int) -> Surface:
+            ) -> Surface:
     from scipy.sparse import coo_matrix
 
     vertices, faces = surface.vertices, surface.faces
     rows, columns = faces.ravel(), faces[:, [1, 2, 0]].ravel()  # each edge once in each direction
     near = coo_matrix((np.ones(len(rows)), (rows, columns)), (len(vertices),) * 2).tocsr()
     degree = np.asarray(near.sum(axis=1))
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         for _ in range(2):
             vertices = (vertices + near @ vertices / degree) / 2
         vertices = _onto(vertices, level, step)

@@ -26,10 +26,7 @@ class RunAxis:
     @classmethod
     def of(cls, skeleton: Skeleton, run: int) -> "RunAxis":
         """The axis of a run from its fork on, with the twig's own radius there."""
-        members = skeleton.runs()[run]
-        points, radius = skeleton.nodes[members], skeleton.radius[members].copy()
-        if run > 0:
-            radius[0] = radius[1]
+        points, radius = skeleton.curve(run)
         return cls(points, radius, arc_lengths(points))
 
     @property

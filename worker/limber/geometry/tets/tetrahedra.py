@@ -79,9 +79,7 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
 
 def _share(skeleton: Skeleton, runs: list[int]) -> float:
     """Share of the skeleton's volume that the runs have."""
-    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[skeleton.parent], axis=1)
-    step[0] = 0.0
-    volume = skeleton.radius**2 * step
+    volume = skeleton.radius**2 * skeleton.steps
     return float(volume[np.isin(skeleton.branch, runs)].sum() / volume.sum())
 
 

@@ -34,6 +34,8 @@ NEIGHBOURS = 12
 
 _LINE_NEIGHBOURS = 20
 _MOST_ATTRACTION = 1e3  # chosen: beyond it the linear system loses digits
+_SOLVES = 12  # at most
+_LINEAR, _FEW_LEFT = 0.95, 0.03  # when a point counts as contracted; share of others at the end
 _GROWTH = 3.0
 _STILL_THICK = 0.6  # share of points not yet on a line, down to which the weights grow
 
@@ -79,7 +81,6 @@ class Contraction:
 
 
 def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] = "constant",
-             iteration_limit: int = 12, linear_enough: float = 0.95, active_share: float = 0.03,
              progress: Progress = SILENT) -> Contraction:
     """Contract points to the axes of their branches.
 
@@ -91,9 +92,6 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
         attraction: constant, or growing as neighbourhoods shrink (Cao et al., section 4). On 4
             generated branches growing was as good where all sides were seen; from one side radii
             were 2.6 instead of 2.0 % off, and one fork of 12 was lost.
-        iteration_limit: At most so many solves.
-        linear_enough: Linearity from which a point counts as contracted.
-        active_share: Stops when so few points are left that are not contracted.
         progress: Called each iteration.
 
     Raises:
@@ -109,13 +107,13 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
     growing = _Attraction(positions) if attraction == "growing" else None
     history: list[dict[str, float]] = []
     status, linearity = ContractionStatus.iteration_limit, local_linearity(positions)
-    for iteration in range(iteration_limit):
+    for iteration in range(_SOLVES):
         started = time.perf_counter()
         drawn = solver.solve(weight, attractions, positions)
         moved = float(np.linalg.norm(drawn - positions, axis=1).mean())
         positions = drawn
         linearity = local_linearity(positions)
-        active = linearity < linear_enough
+        active = linearity < _LINEAR
         # Past that share it is forks and noise that never become lines; more weight only pulls
         # the rest off its axis.
         growth = _GROWTH if active.mean() > _STILL_THICK else 1.0
@@ -124,9 +122,9 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
             attractions = growing.at(positions)
         history.append({"moved": moved * scale, "active": float(active.mean()),
                         "seconds": time.perf_counter() - started})
-        progress((iteration + 1) / iteration_limit, "contracting", iteration=iteration + 1,
+        progress((iteration + 1) / _SOLVES, "contracting", iteration=iteration + 1,
                  active=float(active.mean()), moved_m=moved * scale)
-        if active.mean() < active_share:
+        if active.mean() < _FEW_LEFT:
             status = ContractionStatus.contracted
             break
         if iteration > 3 and moved * scale < 0.1 * max(done["moved"] for done in history):

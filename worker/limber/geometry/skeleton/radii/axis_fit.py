@@ -45,6 +45,7 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 _GRID = 1e-5
 _MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
+_MEDIAN_OF = 24  # points that make one of the paper's radii
 _HELD = 2  # trusted rounds in which the limit stays that of most sensors
 
 
@@ -238,7 +239,7 @@ def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
         radius, skeleton.radius / (2 * _REACH), 2 * _REACH * skeleton.radius)
 
 
-def median_radii(skeleton: Skeleton, points: np.ndarray, neighbours: int = 24) -> np.ndarray:
+def median_radii(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
     """The paper's radii: median distance of the k nearest points to each node [m], shape [n]."""
-    distance, _ = cKDTree(points).query(skeleton.nodes, k=min(neighbours, len(points)))
+    distance, _ = cKDTree(points).query(skeleton.nodes, k=min(_MEDIAN_OF, len(points)))
     return np.median(distance, axis=1)

@@ -6,6 +6,7 @@ import numpy as np
 
 from limber.geometry.skeleton.doubtful_parts import KINK, turns
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import arc_lengths
 
 _END = 8.0  # radii from a kink to the tip, up to which what lies beyond is a folded end
 _ROUNDED = 4.0  # radii to each side of a kink that are evened out
@@ -59,8 +60,7 @@ def _round_off(skeleton: Skeleton, nodes: np.ndarray, members: np.ndarray) -> No
         sharp = np.flatnonzero(turns(now, members) > KINK)
         if len(sharp) == 0:
             return
-        along = np.concatenate([[0], np.cumsum(np.linalg.norm(
-            np.diff(nodes[members], axis=0), axis=1))])
+        along = arc_lengths(nodes[members])
         reach = _ROUNDED * skeleton.radius[members[sharp]]
         near = (np.abs(along[:, None] - along[sharp]) < reach).any(axis=1)
         near[[0, -1]] = False

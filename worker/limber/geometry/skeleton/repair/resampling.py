@@ -14,9 +14,7 @@ def resampled(skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
     made: dict[int, np.ndarray] = {}
     count = 0
     for run, members in enumerate(skeleton.runs()):
-        points, thick = skeleton.nodes[members], skeleton.radius[members].copy()
-        if run > 0:
-            thick[0] = thick[1]
+        points, thick = skeleton.curve(run)
         new_points, new_radius = resample(points, thick, spacing * thick)
         if run == 0:
             hang = np.arange(len(new_points)) - 1

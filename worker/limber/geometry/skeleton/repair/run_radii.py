@@ -11,6 +11,7 @@ from limber.geometry.skeleton.sweep import arc_lengths
 _RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
 _STEADY = 40  # points whose nodes' radii make a steady one
 _SURE = 1.96  # standard deviations
+_GROWTH = 1.25  # of a radius along a run, over the median of what was measured of it so far
 _SPEAK = 1 / 8  # of a run's nodes, and of its points, that speak for what follows
 
 
@@ -82,10 +83,10 @@ def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
     return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
 
 
-def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float = 1.25) -> Skeleton:
+def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
     """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
 
-    A run is no thicker than its carrier where it starts, nor ``growth`` times the median of what
+    A run is no thicker than its carrier where it starts, nor 1.25 times the median of what
     was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
     not resolve would otherwise become a fat cylinder. What limits counts as thick as its interval
     allows: a foot that few points show says little of the twig. What is far thinner than most of
@@ -95,16 +96,14 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float =
     Args:
         skeleton: Fitted.
         count: Points on each node, shape [n]; None: on each as many.
-        growth: See above.
     """
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
     at_most = radius + _SURE * skeleton.radius_sigma
     count = np.ones(skeleton.node_count) if count is None else count
-    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[np.maximum(skeleton.parent, 0)], axis=1)
-    for run, members in enumerate(skeleton.runs()):
-        own = members if run == 0 else members[1:]
-        carrier = members[0]
-        cap = np.inf if run == 0 else max(at_most[carrier], at_most[skeleton.parent[carrier]])
+    step = skeleton.steps
+    for own in skeleton.own_runs():
+        carrier = skeleton.parent[own[0]]
+        cap = np.inf if carrier < 0 else max(at_most[carrier], at_most[skeleton.parent[carrier]])
         speaks = (state[own] == MEASURED) & (count[own] > 0)
         if speaks.any():
             speaks &= radius[own] > _RAG * _middle(radius[own[speaks]], step[own[speaks]])
@@ -114,7 +113,7 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float =
             # The first few are too few to speak for the run: a cut stem starts with a ragged end.
             if len(before) >= max(6, int(_SPEAK * len(own))) and (
                     told[place - 1] >= _SPEAK * total):
-                allowed = growth + (1 - growth) * place / len(own)
+                allowed = _GROWTH + (1 - _GROWTH) * place / len(own)
                 cap = min(cap, allowed * _middle(at_most[before], count[before]))
             if radius[node] > cap:
                 radius[node], at_most[node], state[node] = cap, cap, LIMITED
