@@ -1,5 +1,6 @@
 """The registry: every stage described whole, its schema and command line round trips."""
 
+import inspect
 import json
 import subprocess
 import sys
@@ -98,6 +99,22 @@ def test_description_is_whole(name):
         fields |= set(model.model_fields)
     for place in (stage.key, *stage.reads, *stage.writes):
         assert "{name}" not in place or "name" in fields
+
+
+def test_stages_pass_over_none_of_their_fields():
+    """The functions that are called by name take every input, setting and option."""
+    by_name = {}
+    for name in NAMES:
+        stage = stage_description(name)
+        taken = inspect.getclosurevars(stage.run).nonlocals.get("taken")
+        if taken is None:
+            continue
+        by_name[name] = {*taken.values()}
+        lacking = {field for part in ("inputs", "settings", "options")
+                   if part not in by_name[name]
+                   for field in getattr(stage, part).model_fields} - by_name[name]
+        assert not lacking, name
+    assert len(by_name) > 10
 
 
 def test_units_and_experts_are_in_the_schema():

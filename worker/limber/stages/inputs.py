@@ -1,11 +1,17 @@
 """Inputs and options that several stages share."""
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import Field
 
+from limber.core.progress import Progress
 from limber.core.settings import Groups, Settings
+
+Run = Callable[[Any, Any, Any, Progress], dict[str, Any]]
+"""How a stage is run: by inputs, settings, options and progress."""
 
 
 def argument(description: str) -> Any:
@@ -19,6 +25,25 @@ def required(description: str, example: str) -> Any:
     ``{stem}`` in it stands for the name of the first file or folder that is given.
     """
     return Field(description=description, json_schema_extra={"example": example})
+
+
+def by_name(function: Callable[..., dict[str, Any]], **fields: str) -> Run:
+    """Return how a stage is run by a function whose parameters are called as its fields.
+
+    Args:
+        function: Takes fields of inputs, settings and options, and ``settings``, ``options`` or
+            ``progress`` whole.
+        fields: Of a parameter with a name of its own, the field that it takes.
+    """
+    taken = {name: fields.get(name, name) for name in inspect.signature(function).parameters}
+
+    def run(inputs: Settings, settings: Settings, options: Settings, progress: Progress,
+            ) -> dict[str, Any]:
+        values = {**dict(inputs), **dict(settings), **dict(options), "settings": settings,
+                  "options": options, "progress": progress}
+        return function(**{name: values[field] for name, field in taken.items()})
+
+    return run
 
 
 NOT_KEPT = {"panel": False}

@@ -11,7 +11,7 @@ from limber.core.errors import InputError
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import PredictSettings
-from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -55,13 +55,7 @@ def _entry(branch: Branch, name: str | None) -> PullEntry:
     return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
 
 
-def run(inputs: BranchInputs, settings: PredictSettings, _options: NoOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return predict(inputs.branch_folder, settings, progress=progress)
-
-
 STAGE = StageDescription(
-    "predict", 77, run, BranchInputs, PredictSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"),
-    step="estimate", label="Predict Another Load")
+    "predict", 77, by_name(predict), BranchInputs, PredictSettings, NoOptions,
+    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"), step="estimate",
+    label="Predict Another Load")

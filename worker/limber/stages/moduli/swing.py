@@ -13,7 +13,7 @@ from limber.core.json_values import plain
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, SwingSettings
-from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -119,13 +119,7 @@ def _summary(found: SwingFit, young: np.ndarray, pull: Pull, warnings: list[str]
         "converged": found.converged, "warnings": warnings}
 
 
-def run(inputs: BranchInputs, settings: SwingSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return swing(inputs.branch_folder, settings, force=options.force, progress=progress)
-
-
 STAGE = StageDescription(
-    "swing", 75, run, BranchInputs, SwingSettings, RunOptions, key="swing",
+    "swing", 75, by_name(swing), BranchInputs, SwingSettings, RunOptions, key="swing",
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"),
     step="estimate", label="Fit a Free Swing")

@@ -18,7 +18,7 @@ from limber.core.errors import InputError, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, RunOptions, argument
+from limber.stages.inputs import BranchInputs, RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -172,14 +172,7 @@ def _summary(seen: Ringing, told: dict[str, Any], level: float) -> dict[str, Any
         "start_s": seen.start, "duration_s": seen.duration})
 
 
-def run(inputs: VibrationInputs, settings: VibrationSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return vibration(inputs.branch_folder, inputs.record, settings, force=options.force,
-                     progress=progress)
-
-
 STAGE = StageDescription(
-    "vibration", 76, run, VibrationInputs, VibrationSettings, RunOptions, key="vibration",
-    reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"),
-    step="estimate", label="Fit Natural Frequencies")
+    "vibration", 76, by_name(vibration), VibrationInputs, VibrationSettings, RunOptions,
+    key="vibration", reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"), step="estimate",
+    label="Fit Natural Frequencies")

@@ -14,7 +14,7 @@ from limber.core.files.atomic import file_digest
 from limber.core.files.reading import read_json
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -200,14 +200,8 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
            f"{100 * limit * row['strain']:.0f} %"] for row in result["along"])])]
 
 
-def run(inputs: BranchInputs, settings: LoadSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return load(inputs.branch_folder, settings, force=options.force, progress=progress)
-
-
 STAGE = StageDescription(
-    "load", 45, run, BranchInputs, LoadSettings, RunOptions, key="load:{name}",
-    reads=("mesh.vtu", "skeleton.swc"),
+    "load", 45, by_name(load, folder="branch_folder"), BranchInputs, LoadSettings, RunOptions,
+    key="load:{name}", reads=("mesh.vtu", "skeleton.swc"),
     writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
     tables=_tables, step="material", label="Wind, Snow, Fruit, Cuts")

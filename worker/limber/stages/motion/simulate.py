@@ -226,6 +226,5 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
 
 
 STAGE = StageDescription(
-    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY,
-    reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"),
-    step="material", label="Simulate a Motion")
+    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY, reads=("mesh.vtu",),
+    writes=("frames/{name}.pc2", "frames/{name}.json"), step="material", label="Simulate a Motion")

@@ -8,7 +8,7 @@ import numpy as np
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings
-from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -77,14 +77,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
     return branch.manifest.stages["energy"].result
 
 
-def run(inputs: BranchInputs, settings: EnergySettings, options: ParallelOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return sample_energy_field(inputs.branch_folder, settings, workers=options.workers,
-                               force=options.force, progress=progress)
-
-
 STAGE = StageDescription(
-    "energy", 90, run, BranchInputs, EnergySettings, ParallelOptions, key="energy",
-    reads=("mesh.vtu", "skeleton.swc"), writes=("energy.npz",),
-    step="goal", label="Sample the Energy")
+    "energy", 90, by_name(sample_energy_field, folder="branch_folder"), BranchInputs,
+    EnergySettings, ParallelOptions, key="energy", reads=("mesh.vtu", "skeleton.swc"),
+    writes=("energy.npz",), step="goal", label="Sample the Energy")

@@ -18,7 +18,7 @@ from limber.core.files.reading import read_columns, read_text
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
-from limber.stages.inputs import NOT_KEPT, BranchInputs, required
+from limber.stages.inputs import NOT_KEPT, BranchInputs, by_name, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -437,15 +437,9 @@ def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, A
         raise
 
 
-def run(inputs: ExecuteInputs, settings: ExecuteSettings, options: ExecuteOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return execute(inputs.branch_folder, inputs.name, inputs.cell, settings, options,
-                   progress=progress)
-
-
 STAGE = StageDescription(
-    "execute", 110, run, ExecuteInputs, ExecuteSettings, ExecuteOptions, key="execute:{name}",
+    "execute", 110, by_name(execute, folder="branch_folder", cell_file="cell"), ExecuteInputs,
+    ExecuteSettings, ExecuteOptions, key="execute:{name}",
     reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
-    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
-    step="robot", label="Check With Robot", moves_robot="when armed")
+    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"), step="robot",
+    label="Check With Robot", moves_robot="when armed")

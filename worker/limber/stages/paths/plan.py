@@ -24,7 +24,7 @@ from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.planning.settings import PlanSettings
-from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
@@ -299,14 +299,6 @@ def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | N
     return text.getvalue()
 
 
-def run(inputs: PlanInputs, settings: PlanSettings, options: ParallelOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return plan(inputs.branch_folder, settings, name=inputs.name, cell_file=inputs.cell,
-                workers=options.workers,
-                force=options.force, progress=progress)
-
-
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     from limber.results.report.tables import comparison_rows
 
@@ -314,10 +306,9 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 
 
 STAGE = StageDescription(
-    "plan", 100, run, PlanInputs, PlanSettings, ParallelOptions, key="plan:{name}",
-    reads=("mesh.vtu", "energy.npz"),
+    "plan", 100, by_name(plan, folder="branch_folder", cell_file="cell"), PlanInputs, PlanSettings,
+    ParallelOptions, key="plan:{name}", reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
             "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
             "plans/{name}-bound.npz", "frames/{name}.pc2", "frames/{name}.json",
-            "frames/{name}.npz"),
-    tables=_tables, step="plan", label="Plan Path")
+            "frames/{name}.npz"), tables=_tables, step="plan", label="Plan Path")

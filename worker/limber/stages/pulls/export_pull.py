@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, required
+from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, by_name, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -51,12 +51,7 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
     return {"output": output, "messages": counts}
 
 
-def run(inputs: ExportPullInputs, settings: NoSettings, options: NoOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return export_pull(inputs.branch_folder, inputs.name, inputs.mcap, progress=progress)
-
-
 STAGE = StageDescription(
-    "export-pull", 58, run, ExportPullInputs, NoSettings, NoOptions,
-    reads=("pulls/{name}/",), step="pulls", label="Export a Pull")
+    "export-pull", 58, by_name(export_pull, folder="branch_folder", output="mcap"),
+    ExportPullInputs, NoSettings, NoOptions, reads=("pulls/{name}/",), step="pulls",
+    label="Export a Pull")

@@ -14,7 +14,7 @@ from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
-from limber.stages.inputs import NOT_KEPT, BranchInputs, required
+from limber.stages.inputs import NOT_KEPT, BranchInputs, by_name, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -338,14 +338,7 @@ def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str
     return stage.result
 
 
-def run(inputs: RecordInputs, settings: RecordSettings, options: RecordOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return record(inputs.branch_folder, inputs.cell, inputs.name, settings, options,
-                  progress=progress)
-
-
 STAGE = StageDescription(
-    "record", 55, run, RecordInputs, RecordSettings, RecordOptions, key="record:{name}",
-    reads=("skeleton.swc",), writes=("pulls/{name}/",), step="pulls", label="Record a Pull",
-    moves_robot="always")
+    "record", 55, by_name(record, folder="branch_folder", cell_file="cell"), RecordInputs,
+    RecordSettings, RecordOptions, key="record:{name}", reads=("skeleton.swc",),
+    writes=("pulls/{name}/",), step="pulls", label="Record a Pull", moves_robot="always")

@@ -20,7 +20,7 @@ from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.estimation.settings import EstimateSettings
-from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -217,13 +217,6 @@ def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
                    f"make only {100 * (ratio - 1):.1f} % more of that limit usable.")
 
 
-def run(inputs: SuggestPullInputs, settings: SuggestPullSettings, options: ParallelOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return suggest_pull(inputs.branch_folder, settings, plan=inputs.plan, workers=options.workers,
-                        force=options.force, progress=progress)
-
-
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     rows = [["held at", "to [m]", "travel", "strain", "force", "tells", "per % of strain",
              "E then known within"]]
@@ -242,7 +235,7 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 
 
 STAGE = StageDescription(
-    "suggest-pull", 78, run, SuggestPullInputs, SuggestPullSettings, ParallelOptions,
-    key="suggest-pull", reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"),
-    writes=("suggested_pull.json",), tables=_tables, step="estimate",
-    label="Suggest the Next Pull")
+    "suggest-pull", 78, by_name(suggest_pull), SuggestPullInputs, SuggestPullSettings,
+    ParallelOptions, key="suggest-pull",
+    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"), writes=("suggested_pull.json",),
+    tables=_tables, step="estimate", label="Suggest the Next Pull")

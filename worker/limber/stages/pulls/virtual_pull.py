@@ -12,7 +12,7 @@ from pydantic import Field
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.estimation.settings import VirtualPullSettings
-from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -109,14 +109,7 @@ def _is_meshed_body(branch: Branch) -> bool:
         "truth/truth.json")
 
 
-def run(inputs: VirtualPullInputs, settings: VirtualPullSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return virtual_pull(inputs.branch_folder, inputs.name, settings, force=options.force,
-                        progress=progress)
-
-
 STAGE = StageDescription(
-    "virtual-pull", 52, run, VirtualPullInputs, VirtualPullSettings, RunOptions,
-    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",),
-    step="pulls", label="Simulate a Pull")
+    "virtual-pull", 52, by_name(virtual_pull), VirtualPullInputs, VirtualPullSettings, RunOptions,
+    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",), step="pulls",
+    label="Simulate a Pull")

@@ -18,7 +18,7 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.geometry.io.formats import Format, Registry, listed, unknown_suffix
 from limber.geometry.io.skeletons import SKELETONS
-from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -184,12 +184,6 @@ class ExportInputs(BranchInputs):
         json_schema_extra={"short": "-o", "example": "{stem}.urdf"})
 
 
-def run(inputs: ExportInputs, settings: ExportSettings, _options: NoOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return export(inputs.branch_folder, inputs.output, settings, progress=progress)
-
-
 STAGE = StageDescription(
-    "export", 125, run, ExportInputs, ExportSettings, NoOptions,
+    "export", 125, by_name(export, folder="branch_folder"), ExportInputs, ExportSettings, NoOptions,
     reads=("mesh.vtu", "skeleton.swc"), step="report", label="Export for Other Programs")

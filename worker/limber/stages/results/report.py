@@ -8,7 +8,7 @@ from pydantic import Field
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.stages.inputs import BranchInputs, NoSettings, RunOptions
+from limber.stages.inputs import BranchInputs, NoSettings, RunOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 from limber.version import VERSION
@@ -74,13 +74,7 @@ def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> d
         for name, path in outside.items() if path is not None}
 
 
-def run(inputs: ReportInputs, _settings: NoSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return write_report(inputs.branch_folder, picture=inputs.picture, caliper_path=inputs.caliper,
-                        force=options.force, progress=progress)
-
-
 STAGE = StageDescription(
-    "report", 110, run, ReportInputs, NoSettings, RunOptions, key="report",
-    writes=("report.html",), step="report", label="Write Report")
+    "report", 110, by_name(write_report, folder="branch_folder", caliper_path="caliper"),
+    ReportInputs, NoSettings, RunOptions, key="report", writes=("report.html",), step="report",
+    label="Write Report")

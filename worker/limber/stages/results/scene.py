@@ -10,7 +10,7 @@ from limber.core.errors import InputError, WorkError
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -152,14 +152,6 @@ def _writable(path: Path) -> Path:
                          "The result goes there.", "Choose another location.") from error
 
 
-def run(inputs: SceneInputs, settings: SceneSettings, _options: NoOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return scene(inputs.branch_folder, output=inputs.output, picture=inputs.render,
-                 turntable=inputs.turntable, data_path=inputs.data, width=settings.width,
-                 sides=settings.sides, color=settings.color, plan=settings.plan,
-                 motion=settings.motion, strength=settings.strength, progress=progress)
-
-
-STAGE = StageDescription("scene", 120, run, SceneInputs, SceneSettings, NoOptions,
-                         reads=("mesh.vtu",))
+STAGE = StageDescription(
+    "scene", 120, by_name(scene, picture="render", data_path="data"), SceneInputs, SceneSettings,
+    NoOptions, reads=("mesh.vtu",))

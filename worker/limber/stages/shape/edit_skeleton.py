@@ -33,7 +33,7 @@ from limber.core.constants import FOUND_SKELETON
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.stages.inputs import BranchInputs, NoOptions, NoSettings
+from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, by_name
 from limber.stages.registry import StageDescription
 from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, write_branch
 from limber.store import Branch
@@ -238,15 +238,10 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
              doubt_rows(doubtful[:_SHOWN]))]
 
 
-def run(inputs: SkeletonInputs, _settings: NoSettings, _options: NoOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return review_skeleton(inputs.branch_folder, edits_path=inputs.edits, frame=inputs.frame,
-                           append=inputs.append, output=inputs.output, progress=progress)
-
-
 STAGE = StageDescription(
-    "skeleton", 25, run, SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
+    "skeleton", 25, by_name(review_skeleton, folder="branch_folder", edits_path="edits"),
+    SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
     reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", EDITS), tables=tables, step="skeleton", label="Review and Edit")
+            "point_masses.json", EDITS),
+    tables=tables, step="skeleton", label="Review and Edit")

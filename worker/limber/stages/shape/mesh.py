@@ -13,7 +13,7 @@ from limber.geometry.io.formats import listed
 from limber.geometry.io.skeletons import SKELETONS, write_cylinders
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.settings import MeshSurfaceSettings
-from limber.stages.inputs import RunOptions, argument
+from limber.stages.inputs import RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -97,14 +97,8 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     return branch.manifest.stages["mesh"].result
 
 
-def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return mesh_surface(inputs.surface, inputs.output, settings, force=options.force,
-                        progress=progress)
-
-
 STAGE = StageDescription(
-    "mesh", 30, run, MeshInputs, MeshSurfaceSettings, RunOptions, key="mesh",
+    "mesh", 30, by_name(mesh_surface, path="surface", folder="output"), MeshInputs,
+    MeshSurfaceSettings, RunOptions, key="mesh",
     writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"),
     step="mesh", label="Mesh a Closed Surface")

@@ -10,9 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError
-from limber.core.progress import Progress
 from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, RunOptions, argument
+from limber.stages.inputs import BranchInputs, RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -140,12 +139,7 @@ def _text(targets: list[NamedTarget]) -> str:
     return json.dumps({"format_version": TARGETS_FORMAT, "targets": entries}, indent=1) + "\n"
 
 
-def run(inputs: TargetInputs, settings: TargetSettings, options: RunOptions,
-        _progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    return set_target(inputs.branch_folder, inputs.name, settings, force=options.force)
-
-
 STAGE = StageDescription(
-    "target", 35, run, TargetInputs, TargetSettings, RunOptions, key="target:{name}",
-    reads=("mesh.vtu",), writes=("targets.json",), step="goal", label="Name a Target")
+    "target", 35, by_name(set_target), TargetInputs, TargetSettings, RunOptions,
+    key="target:{name}", reads=("mesh.vtu",), writes=("targets.json",), step="goal",
+    label="Name a Target")
