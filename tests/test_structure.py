@@ -249,8 +249,7 @@ def test_no_file_imports_itself_in_a_circle():
 
 
 # Lines between processes of ours, and lines that a killed program may have left half written.
-OWN_LINES = {"robot", "session", "core.processes", "core.json_lines", "batch.records", "store.lock",
-             "estimation.fitting.evaluations",
+OWN_LINES = {"robot", "session", "core.json_lines", "batch.records", "store.lock",
              "geometry.tets.tetwild_process"}
 
 

@@ -5,7 +5,6 @@ its reply carries again. Whatever is wrong with a line is said in an ``error`` r
 client sends ends the session but ``close`` and the end of the input.
 """
 
-import json
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
@@ -13,6 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from limber.core.errors import InputError
+from limber.core.json_lines import json_object
 
 PROTOCOL = 2
 """Of commands, events and the frames' file; a client of another one is told so."""
@@ -212,11 +212,7 @@ def parse_command(line: bytes) -> Command:
 
 def _id_of(line: bytes) -> int:
     """Return the id of a command that is wrong elsewhere, 0 if it has none."""
-    try:
-        content = json.loads(line)
-    except (ValueError, RecursionError):
-        return 0
-    found = content.get("id") if isinstance(content, dict) else None
+    found = (json_object(line) or {}).get("id")
     if isinstance(found, int) and not isinstance(found, bool) and 0 <= found <= _LARGEST_ID:
         return found
     return 0
