@@ -1,33 +1,9 @@
 """The job file: which stages are run on which scans or branch folders, and with what settings.
 
-::
-
-    out = "results"                       # where the branch folders, the table and the page go
-    time_limit = "1 h"                    # of each stage; memory_limit = "4 GB"
-    cluster = "slurm"                     # or "local", "pbs" ...; default: this process's pool
-    work = "/scratch/night"               # where to work if out is an address: "s3://bucket/night"
-
-    [[job]]
-    scans = ["scans/*.ply"]               # a branch each; or folders = ["old/*.branch"]
-
-    [[job.stage]]
-    run = "reconstruct"
-    unit = "mm"
-
-    [[job.stage]]
-    run = "import-pull"
-    source = "pulls/{scan}/*.csv"         # one run for each file
-    name = "{file}"
-
-    [[job.stage]]
-    run = "estimate"
-
-    [job.sweep]                           # a branch for each combination
-    "reconstruct.mesh_spacing" = [2.0, 3.0]
-
-It is checked whole against the stages' settings before anything runs. Nothing in it is executed;
-what it makes stays in ``out``, or in the folders that it names. Scans, folders, inputs and ``out``
-may be addresses, as fsspec knows them (:mod:`limber.batch.machines.staging`).
+`limber batch --help` shows one. It is checked whole against the stages' settings before anything
+runs. Nothing in it is executed; what it makes stays in ``out``, or in the folders that it names.
+Scans, folders, inputs and ``out`` may be addresses, as fsspec knows them
+(:mod:`limber.batch.machines.staging`).
 """
 
 import itertools

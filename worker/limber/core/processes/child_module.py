@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from limber.core.processes.ending import kill_tree
+from limber.core.processes.family import kill_tree
 from limber.core.processes.limits import Limits, LimitWatch
 
 _TICK_SECONDS, _MEMORY_SECONDS = 0.05, 0.1

@@ -78,19 +78,3 @@ def end_by_closing(process: subprocess.Popen, seconds: float = 5.0) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def kill_tree(process_id: int) -> None:
-    """Kill a process and all that it has started."""
-    import psutil
-
-    try:
-        process = psutil.Process(process_id)
-        doomed = [*process.children(recursive=True), process]
-    except psutil.NoSuchProcess:
-        return
-    for each in doomed:
-        try:
-            each.kill()
-        except psutil.NoSuchProcess:
-            continue

@@ -6,10 +6,13 @@ processes have computed. Where the second stands still nothing is computed; wher
 process is stopped, or native code keeps every thread of it from running.
 """
 
+import os
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
+
+from limber.core.processes.family import computed_seconds
 
 INTERVAL_SECONDS = 2.0
 
@@ -42,22 +45,4 @@ class Heartbeat:
         start = time.perf_counter()
         while not self._ended.wait(self._interval):
             self._say({"alive": round(time.perf_counter() - start, 1),
-                       "cpu_s": round(computed_seconds(), 2)})
-
-
-def computed_seconds() -> float:
-    """Return the processor time of this process and of all that it has started [s]."""
-    import psutil
-
-    own = psutil.Process()
-    total = 0.0
-    for process in (own, *own.children(recursive=True)):
-        try:
-            times = process.cpu_times()
-        except (psutil.NoSuchProcess, psutil.AccessDenied):
-            # It has ended meanwhile, or is another user's.
-            continue
-        # Of ended children too, which their parent has waited for.
-        total += sum(getattr(times, name, 0.0) for name in (
-            "user", "system", "children_user", "children_system"))
-    return total
+                       "cpu_s": round(computed_seconds(os.getpid()), 2)})

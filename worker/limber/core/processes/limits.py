@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass
 
 from limber.core.errors import WorkError
+from limber.core.processes.family import memory_mb
 
 
 @dataclass(frozen=True)
@@ -56,21 +57,3 @@ class LimitWatch:
         return None if used <= memory_limit else WorkError(
             f"{self._name} was stopped at {used:.0f} MB of memory.",
             f"Its limit is {memory_limit:.0f} MB.", "Allow it more, or make the task smaller.")
-
-
-def memory_mb(process_id: int) -> float:
-    """Return the memory [MB] of a process and all that it has started."""
-    import psutil
-
-    try:
-        process = psutil.Process(process_id)
-        family = [process, *process.children(recursive=True)]
-    except psutil.NoSuchProcess:
-        return 0.0
-    used = 0
-    for each in family:
-        try:
-            used += each.memory_info().rss
-        except psutil.NoSuchProcess:
-            continue
-    return used / 1e6

@@ -13,7 +13,8 @@ from typing import Any, TextIO
 from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
 from limber.core.json_lines import json_object
 from limber.core.processes.budget import CORES
-from limber.core.processes.ending import PARENT_PIPE, kill_tree
+from limber.core.processes.ending import PARENT_PIPE
+from limber.core.processes.family import kill_tree
 from limber.core.processes.limits import UNLIMITED, Limits, LimitWatch
 from limber.core.progress import SILENT, Progress
 

@@ -1,0 +1,36 @@
+"""A process and all that it has started: their memory, their time, their end."""
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+
+def memory_mb(process_id: int) -> float:
+    """Return the memory [MB] of a process and all that it has started."""
+    return sum(_of_each(process_id, lambda each: each.memory_info().rss)) / 1e6
+
+
+def computed_seconds(process_id: int) -> float:
+    """Return the processor time [s] of a process and all that it has started."""
+    # Of ended children too, which their parent has waited for.
+    kinds = ("user", "system", "children_user", "children_system")
+    return sum(getattr(times, kind, 0.0)
+               for times in _of_each(process_id, lambda each: each.cpu_times()) for kind in kinds)
+
+
+def kill_tree(process_id: int) -> None:
+    """Kill a process and all that it has started."""
+    _of_each(process_id, lambda each: each.kill())
+
+
+def _of_each(process_id: int, do: Callable[[Any], Any]) -> list[Any]:
+    """Return ``do`` of each process, but of those that have ended or are another user's."""
+    import psutil
+
+    found = []
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process = psutil.Process(process_id)
+        for each in (*process.children(recursive=True), process):
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):
+                found.append(do(each))
+    return found
