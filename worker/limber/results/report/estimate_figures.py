@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.estimation.uncertainty.covariance import OUTLIER
 from limber.estimation.uncertainty.identifiability import UNRESOLVED_DEVIATION
+from limber.results.report.charts import chart
 
 OBSERVED, SIMULATED, TRUE = "#222222", "#2a6fb0", "#c0602a"
 
@@ -44,7 +45,8 @@ def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
 
 def young_along_branch(estimate: dict[str, Any]) -> Any:
     """E at the control points with intervals, and the truth where there is one."""
-    figure, axes = _figure(5.2, 3.2)
+    figure, axes = chart(5.2, 3.2, "place on the main path (0 base, 1 tip)",
+                         "Young's modulus [MPa]")
     place = np.array(estimate["fractions"])
     young = np.array(estimate["young_pa"]) / 1e6
     interval = np.array(estimate["young_interval_pa"]) / 1e6
@@ -65,8 +67,6 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0)
-    axes.set_xlabel("place on the main path (0 base, 1 tip)")
-    axes.set_ylabel("Young's modulus [MPa]")
     axes.set_xlim(0, 1)
     axes.legend(frameon=False)
     return figure
@@ -74,7 +74,7 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
 
 def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
     """Standard deviations of the parameters before and after the fit."""
-    figure, axes = _figure(5.2, 3.0)
+    figure, axes = chart(5.2, 3.0, "", "standard deviation of log E")
     before = np.array(estimate["deviations_before_fit"], float)
     after = np.sqrt(np.abs(np.diag(np.array(estimate["covariance"], float))))
     groups = [*estimate["groups"]]
@@ -89,14 +89,13 @@ def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
     axes.axhline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
     axes.set_yscale("log")
     axes.set_xticks(place, names)
-    axes.set_ylabel("standard deviation of log E")
     axes.legend(frameon=False)
     return figure
 
 
 def residuals_over_time(pull: dict[str, Any]) -> Any:
     """Standardised residual of every point and of the force at every frame."""
-    figure, axes = _figure(5.2, 3.0)
+    figure, axes = chart(5.2, 3.0, "time [s]", "residual / its deviation")
     points = _numbers(pull["point_residual"])
     time = np.array(pull["all_times_s"])
     force = _numbers(pull["force_residual"])
@@ -110,8 +109,6 @@ def residuals_over_time(pull: dict[str, Any]) -> Any:
         axes.plot(time[far], values[far], "x", color=TRUE, ms=7)
     axes.axhline(OUTLIER, color=TRUE, lw=0.8)
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("residual / its deviation")
     figure.legend(frameon=False, ncol=5, fontsize=8, loc="outside upper left")
     return figure
 
@@ -119,7 +116,7 @@ def residuals_over_time(pull: dict[str, Any]) -> Any:
 def held_out_scores(estimate: dict[str, Any]) -> Any:
     """Errors of foretold pulls in percent, points and force."""
     scores = estimate["held_out"]
-    figure, axes = _figure(5.2, 1.2 + 0.45 * len(scores))
+    figure, axes = chart(5.2, 1.2 + 0.45 * len(scores), "error of the foretold pull [%]", "")
     place = np.arange(len(scores))
     for shift, key, colour, label in ((0.2, "relative_distance", SIMULATED, "points, of travel"),
                                       (-0.2, "relative_force", "#2e8b57", "force, of its peak")):
@@ -127,29 +124,26 @@ def held_out_scores(estimate: dict[str, Any]) -> Any:
         axes.barh(place + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
     axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
                             for name, score in scores.items()])
-    axes.set_xlabel("error of the foretold pull [%]")
     figure.legend(frameon=False, ncol=2, fontsize=8, loc="outside upper right")
     return figure
 
 
 def loss_over_evaluations(estimate: dict[str, Any]) -> Any:
     """The paper's loss J [m^2] of every forward simulation."""
-    figure, axes = _figure(5.2, 3.2)
+    figure, axes = chart(5.2, 3.2, "forward simulations", "loss J [m²]")
     loss = np.array([np.nan if entry["loss_m2"] is None else entry["loss_m2"]
                      for entry in estimate["history"]], float)
     count = np.arange(1, len(loss) + 1)
     axes.semilogy(count, loss, ".", color="#999999")
     axes.semilogy(count, np.fmin.accumulate(loss), color=SIMULATED,
                   label=estimate["method"])
-    axes.set_xlabel("forward simulations")
-    axes.set_ylabel("loss J [m²]")
     axes.legend(frameon=False)
     return figure
 
 
 def simulated_over_observed(pull: dict[str, Any], estimate: dict[str, Any]) -> Any:
     """Observed and simulated points at several frames, in the plane in which they move most."""
-    figure, axes = _figure(5.2, 4.2)
+    figure, axes = chart(5.2, 4.2, "sideways [m]", "along the branch at rest [m]")
     observed, simulated = _numbers(pull["observed_m"]), _numbers(pull["simulated_m"])
     rest = np.array(estimate["control_points_m"])
     centre = rest.mean(axis=0)
@@ -169,25 +163,20 @@ def simulated_over_observed(pull: dict[str, Any], estimate: dict[str, Any]) -> A
         for start, end in zip(model, model + 10 * (seen - model), strict=True):
             axes.plot([start[0], end[0]], [start[1], end[1]], color=TRUE, alpha=shade, lw=0.8)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("sideways [m]")
-    axes.set_ylabel("along the branch at rest [m]")
     axes.legend(frameon=False, loc="lower left")
     return figure
 
 
 def force_over_time(pull: dict[str, Any]) -> Any:
     """Measured and simulated force of the gripper on the branch."""
-    figure, axes = _figure(5.2, 3.0)
+    figure, axes = chart(5.2, 3.0, "time [s]", "force [N], dots measured")
     measured, simulated = _numbers(pull["measured_force_n"]), _numbers(pull["simulated_force_n"])
     time = np.array(pull["all_times_s"])
     for axis, colour in zip(range(3), ("#b03a2e", "#2e8b57", "#2a6fb0"), strict=True):
         axes.plot(time, measured[:, axis], ".", ms=4, color=colour, alpha=0.6)
         axes.plot(time, simulated[:, axis], color=colour, label="xyz"[axis])
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("force [N], dots measured")
     axes.legend(frameon=False, ncol=3)
     return figure
-
 
 
 def _interval_caption(estimate: dict[str, Any]) -> str:
@@ -213,12 +202,3 @@ def _number(value: float | None) -> float:
 def _numbers(values: Any) -> np.ndarray:
     """JSON's null, which stands for a number that was not measured, as NaN."""
     return np.array(values, dtype=float)
-
-
-def _figure(width: float, height: float) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes

@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.results.report.charts import chart, draw_faces, two_views
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -24,8 +25,8 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
     skeleton = load_skeleton(branch)
     points = _cloud_points(branch)
     mesh = TetMesh.read(branch.path("mesh.vtu")) if branch.has("mesh.vtu") else None
-    figure, axes = _two_views(points)
-    for axis, (first, label) in zip(axes, ((0, "x"), (1, "y")), strict=True):
+    figure, views = two_views(points)
+    for axis, first, _depth in views:
         axis.scatter(points[:, first], points[:, 2], s=1.0, color=_CLOUD, linewidths=0)
         _draw_tree(axis, skeleton, first)
         if mesh is not None and "control_point" in mesh.point_data:
@@ -38,18 +39,15 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
                       markeredgecolor="#5c4300", zorder=6)
             axis.annotate(target["name"], (place[first], place[2]), (7, 5), fontsize=9,
                           textcoords="offset points", zorder=6)
-        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
-        axis.grid(alpha=0.25)
     return figure
 
 
 def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Figure":
     """Diameter along the main path with its interval, and what calipers found."""
-    import matplotlib.pyplot as plt
-
     from limber.geometry.skeleton.qsm_tables import diameters as along_path
 
-    figure, axis = plt.subplots(figsize=(9, 3.2))
+    figure, axis = chart(9, 3.2, "distance from the root along the main path [m]",
+                         "diameter [mm]", has_grid=True)
     path = skeleton.main_path()
     along = skeleton.arc_length[path]
     thick, sigma = 1e3 * along_path(skeleton, along).T
@@ -62,18 +60,15 @@ def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Fig
                   [1e3 * row["measured_m"] for row in compared], "o", color="#b0126b",
                   markersize=6, label="calipers")
         axis.legend(frameon=False)
-    axis.set(xlabel="distance from the root along the main path [m]", ylabel="diameter [mm]")
     axis.set_ylim(bottom=0)
-    axis.grid(alpha=0.25)
     return figure
 
 
 def radii(branch: Branch) -> "Figure":
     """Radius and its uncertainty over the distance from the root, one colour an order."""
-    import matplotlib.pyplot as plt
-
     skeleton = load_skeleton(branch)
-    figure, axis = plt.subplots(figsize=(9, 3.6))
+    figure, axis = chart(9, 3.6, "distance from the root along the tree [m]", "radius [mm]",
+                         has_grid=True)
     distance = skeleton.arc_length
     for run in skeleton.runs():
         own = run if skeleton.branch[run[0]] == skeleton.branch[run[-1]] else run[1:]
@@ -84,16 +79,13 @@ def radii(branch: Branch) -> "Figure":
             axis.fill_between(distance[own], 1e3 * (skeleton.radius[own] - 2 * sigma),
                               1e3 * (skeleton.radius[own] + 2 * sigma), color=colour, alpha=0.15,
                               linewidth=0)
-    axis.set(xlabel="distance from the root along the tree [m]", ylabel="radius [mm]")
     axis.set_ylim(bottom=0)
-    axis.grid(alpha=0.25)
     return figure
 
 
 def mesh_by_modulus(branch: Branch) -> "Figure":
     """The mesh's surface, shaded, coloured by Young's modulus; base black, grasp patch red."""
     import matplotlib.pyplot as plt
-    from matplotlib.collections import PolyCollection
     from matplotlib.colors import LogNorm, Normalize
 
     mesh = TetMesh.read(branch.path("mesh.vtu"))
@@ -101,24 +93,18 @@ def mesh_by_modulus(branch: Branch) -> "Figure":
     spread = young.max() / young.min()
     low, high = (young.min(), young.max()) if spread > 1.001 else (0.0, 1.5 * young.max())
     norm = (LogNorm if spread > 10 else Normalize)(low / 1e6, high / 1e6)
-    figure, axes = _two_views(mesh.nodes)
-    for axis, first, depth, label in ((axes[0], 0, 1, "x"), (axes[1], 1, 0, "y")):
-        corners = mesh.nodes[faces]
-        back_to_front = np.argsort(corners[:, :, depth].mean(axis=1) * (1 if first else -1))
+    figure, views = two_views(mesh.nodes)
+    corners = mesh.nodes[faces]
+    for axis, first, depth in views:
         colours = plt.get_cmap("viridis")(norm(young / 1e6))
         colours[:, :3] *= _shade(corners, depth)[:, None]
-        axis.add_collection(PolyCollection(
-            corners[back_to_front][:, :, [first, 2]], facecolors=colours[back_to_front],
-            edgecolors="face", linewidths=0.1))
+        draw_faces(axis, corners, colours, first, depth)
         for name, colour in (("fixed", "black"), ("grasp", "#d1242f")):
             marked = mesh.nodes[np.asarray(mesh.point_data.get(name, [])).nonzero()[0]]
             axis.scatter(marked[:, first], marked[:, 2], s=3, color=colour, zorder=4)
-        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
-        axis.autoscale_view()
-        axis.grid(alpha=0.25)
     if spread > 1.001:
         scale = plt.cm.ScalarMappable(norm, "viridis")
-        figure.colorbar(scale, ax=axes, label="Young's modulus [MPa]", shrink=0.7)
+        figure.colorbar(scale, ax=figure.axes, label="Young's modulus [MPa]", shrink=0.7)
     else:
         figure.suptitle(f"Young's modulus {young.mean() / 1e6:.4g} MPa everywhere", fontsize=10)
     return figure
@@ -180,17 +166,6 @@ def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.25)
     return figure
-
-
-def _two_views(points: np.ndarray) -> tuple["Figure", np.ndarray]:
-    """Return a figure of two axes, as wide as a front and a side view of ``points`` need."""
-    import matplotlib.pyplot as plt
-
-    extent = np.ptp(points, axis=0)
-    height = 7.0
-    widths = np.clip(height * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
-    return plt.subplots(1, 2, figsize=(widths.sum() + 2.5, height), layout="constrained",
-                        width_ratios=widths)
 
 
 def _draw_tree(axis: Any, skeleton: Skeleton, first: int) -> None:

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from limber.core.files.reading import read_arrays, read_json_as, require_shapes
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.motion_files import read_pc2
+from limber.results.report.charts import draw_faces, two_views
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -112,7 +113,6 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
         InputError: the frames are damaged or of another mesh.
     """
     import matplotlib.pyplot as plt
-    from matplotlib.collections import PolyCollection
 
     nodes, corners = np.unique(mesh.surface_faces(), return_inverse=True)
     corners = corners.reshape(-1, 3)
@@ -125,25 +125,13 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
     shades = plt.get_cmap("inferno")
     largest = max(float(strain.max()), 1e-9)
     norm = plt.Normalize(0.0, largest)
-    both = positions.reshape(-1, 3)
-    extent = np.ptp(both, axis=0)
-    widths = np.clip(7.0 * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
-    figure, axes = plt.subplots(1, 2, figsize=(widths.sum() + 2.5, 7.0), layout="constrained",
-                                width_ratios=widths)
-    for axis, first, depth, label in ((axes[0], 0, 1, "x"), (axes[1], 1, 0, "y")):
-        for state, is_loaded in ((positions[0], False), (positions[1], True)):
-            faces = state[corners]
-            order = np.argsort(faces[:, :, depth].mean(axis=1) * (1 if first else -1))
-            colours = shades(0.9 * norm(strain)) if is_loaded else np.tile(
-                (0.8, 0.8, 0.8, 1.0), (len(faces), 1))
-            axis.add_collection(PolyCollection(
-                faces[order][:, :, [first, 2]], facecolors=colours[order], edgecolors="face",
-                linewidths=0.1))
-        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
-        axis.autoscale_view()
-        axis.grid(alpha=0.25)
+    figure, views = two_views(positions.reshape(-1, 3))
+    grey = np.tile((0.8, 0.8, 0.8, 1.0), (len(corners), 1))
+    for axis, across, depth in views:
+        for state, colours in zip(positions, (grey, shades(0.9 * norm(strain))), strict=True):
+            draw_faces(axis, state[corners], colours, across, depth)
     scale = plt.cm.ScalarMappable(plt.Normalize(0.0, largest / 0.9), shades)
-    bar = figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.7)
+    bar = figure.colorbar(scale, ax=figure.axes, label="largest principal strain [%]", shrink=0.7)
     bar.ax.set_ylim(0.0, largest)
     return figure
 

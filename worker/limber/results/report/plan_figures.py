@@ -11,6 +11,7 @@ from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
 from limber.planning.search_files import CostToGo, read_trees
+from limber.results.report.charts import chart
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -188,10 +189,7 @@ def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
 
 def convergence(plan: PlanFile) -> "Figure":
     """Draw the cost of the best path over iterations, both relative to their last."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 3.2), layout="constrained")
-    axis = figure.subplots()
+    figure, axis = chart(6, 3.2, "iterations", "cost / final cost", has_grid=True)
     for key, history in plan.summary["convergence"].items():
         # On a first, coarse grid there may be no path yet.
         history = [entry for entry in history if entry["cost"] is not None]
@@ -199,19 +197,14 @@ def convergence(plan: PlanFile) -> "Figure":
             cost = np.array([entry["cost"] for entry in history])
             axis.plot([entry["iteration"] for entry in history], cost / cost[-1],
                       color=PATH_COLOURS[key], label=_LABELS[key])
-    axis.set(xlabel="iterations", ylabel="cost / final cost")
-    axis.grid(alpha=0.25)
     axis.legend(frameon=False)
     return figure
 
 
 def certificate(plan: PlanFile) -> "Figure":
     """Draw how the lower and the upper bound on the best path's cost close, grid by grid."""
-    from matplotlib.figure import Figure
-
     levels = plan.summary["certificate"]["levels"]
-    figure = Figure(figsize=(6, 3.2), layout="constrained")
-    axis = figure.subplots()
+    figure, axis = chart(6, 3.2, "cells of the grid [mm]", "cost", has_grid=True)
     spacing = 1e3 * np.array([level["spacing_m"] for level in levels])
     lower, upper = (np.array([level[name] for level in levels], float)
                     for name in ("lower", "upper"))
@@ -219,19 +212,16 @@ def certificate(plan: PlanFile) -> "Figure":
                       label="the best path lies here")
     axis.plot(spacing, upper, "o-", color=PATH_COLOURS["plan"], label="best path found")
     axis.plot(spacing, lower, "o--", color=PATH_COLOURS["plan"], label="no path is cheaper: proven")
-    axis.set(xscale="log", xlabel="cells of the grid [mm]", ylabel="cost", ylim=(0.0, None))
+    axis.set(xscale="log", ylim=(0.0, None))
     axis.invert_xaxis()
     axis.set_xticks(spacing, [f"{value:.2g}" for value in spacing])
     axis.minorticks_off()
-    axis.grid(alpha=0.25)
     axis.legend(frameon=False, fontsize=8)
     return figure
 
 
 def trade_off(plan: PlanFile) -> "Figure":
     """Draw energy against length of the gentlest paths, and below which no path is."""
-    from matplotlib.figure import Figure
-
     detour = plan.summary["detour"]
     curve = sorted(detour["curve"], key=lambda point: point["length_m"])
     length = 1e3 * np.array([point["length_m"] for point in curve])
@@ -240,8 +230,8 @@ def trade_off(plan: PlanFile) -> "Figure":
     bounded = [point for point in curve if point["lower_bound_jm"] is not None]
     lines = [1e3 * point["lower_bound_jm"] - point["metre_jm"] * span for point in bounded]
     floor = np.maximum(np.max(lines, axis=0), 0.0)
-    figure = Figure(figsize=(6, 3.6), layout="constrained")
-    axis = figure.subplots()
+    figure, axis = chart(6, 3.6, "length of the path [mm]", "energy over length [mJ m]",
+                         has_grid=True)
     # A path that is allowed to be longer may be any shorter one: the curve only falls.
     best = np.minimum.accumulate(energy)
     axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
@@ -249,8 +239,7 @@ def trade_off(plan: PlanFile) -> "Figure":
     axis.plot(span, floor, "--", color=PATH_COLOURS["plan"], lw=1, label="proven bound")
     axis.plot(length, energy, "o-", color=PATH_COLOURS["plan"], ms=4, label="gentlest found")
     axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="length allowed")
-    axis.set(xlabel="length of the path [mm]", ylabel="energy over length [mJ m]", ylim=(0.0, None))
-    axis.grid(alpha=0.25)
+    axis.set_ylim(0.0, None)
     axis.legend(frameon=False, fontsize=8)
     return figure
 

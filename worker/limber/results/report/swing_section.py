@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_json_as
+from limber.results.report.charts import chart
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,17 +84,11 @@ def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
 
 def swing_over_time(swing: SwingFile) -> "Figure":
     """Draw seen and simulated displacement of the marker that swings most."""
-    from matplotlib.figure import Figure
-
     from limber.results.report.estimate_figures import OBSERVED, SIMULATED
 
-    figure = Figure(figsize=(5.2, 3.0), layout="constrained")
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
+    figure, axes = chart(5.2, 3.0, "time [s]", "displacement [mm]")
     seen, simulated = along_its_way(swing)
     axes.plot(swing.times_s, 1e3 * seen, ".", ms=4, color=OBSERVED, label="seen")
     axes.plot(swing.times_s, 1e3 * simulated, color=SIMULATED, label="simulated")
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("displacement [mm]")
     axes.legend(frameon=False)
     return figure

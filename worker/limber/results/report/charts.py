@@ -1,0 +1,54 @@
+"""What the report's pictures share: charts with their labels, and two views of a branch."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def chart(width: float, height: float, across: str, up: str, *, has_grid: bool = False,
+          ) -> tuple["Figure", "Axes"]:
+    """Return a figure of one chart, with labels; without a grid its frame is open."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel=across, ylabel=up)
+    if has_grid:
+        axes.grid(alpha=0.25)
+    else:
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int]]]:
+    """Return a figure of the front and the side of ``points`` [n, 3].
+
+    Each view is its axes, which coordinate runs across it and which into it; z runs up.
+    """
+    import matplotlib.pyplot as plt
+
+    extent = np.ptp(points, axis=0)
+    height = 7.0
+    widths = np.clip(height * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
+    figure, axes = plt.subplots(1, 2, figsize=(widths.sum() + 2.5, height), layout="constrained",
+                                width_ratios=widths)
+    for axis, label in zip(axes, "xy", strict=True):
+        axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
+        axis.grid(alpha=0.25)
+    return figure, [(axes[0], 0, 1), (axes[1], 1, 0)]
+
+
+def draw_faces(axis: "Axes", corners: np.ndarray, colours: np.ndarray, across: int, depth: int,
+               ) -> None:
+    """Draw triangles [n, 3, 3] in their colours, those behind first."""
+    from matplotlib.collections import PolyCollection
+
+    order = np.argsort(corners[:, :, depth].mean(axis=1) * (1 if across else -1))
+    axis.add_collection(PolyCollection(
+        corners[order][:, :, [across, 2]], facecolors=colours[order], edgecolors="face",
+        linewidths=0.1))
+    axis.autoscale_view()
