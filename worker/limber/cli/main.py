@@ -7,6 +7,7 @@ and, with ``--json``, print one JSON object as their last line.
 """
 
 import ast
+import contextlib
 import functools
 import importlib
 import json
@@ -197,17 +198,14 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
     state = Run(lines, functools.partial(click.echo, err=True))
     code = 0
     try:
-        if progress_style == "bar":
-            with BarSink(name) as bar:
+        with contextlib.ExitStack() as around:
+            if progress_style == "bar":
+                bar = around.enter_context(BarSink(name))
                 state = Run(bar, bar.say)
-                with damage_told_to(state.progress.warn):
-                    result = function(state, **options)
-        elif lines is not None:
-            with Heartbeat(lines.say), damage_told_to(state.progress.warn):
-                result = function(state, **options)
-        else:
-            with damage_told_to(state.progress.warn):
-                result = function(state, **options)
+            elif lines is not None:
+                around.enter_context(Heartbeat(lines.say))
+            around.enter_context(damage_told_to(state.progress.warn))
+            result = function(state, **options)
     except LimberError as error:
         code = error.exit_code
         if isinstance(error, SafetyStop):

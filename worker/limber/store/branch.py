@@ -36,8 +36,8 @@ from limber.store.folder_state import (
     finish_pending,
     inside,
     is_litter,
+    opening,
     refuse_links,
-    require_folder,
     settle,
 )
 from limber.store.growing_files import Stream
@@ -156,9 +156,7 @@ class Branch:
                 names that lead out of it.
         """
         folder = Path(folder)
-        with in_words(folder):
-            require_folder(folder)
-            refuse_links(folder)
+        with opening(folder):
             finish_pending(folder)
             branch = cls(folder, read_manifest(folder))
         if verify:
@@ -180,9 +178,7 @@ class Branch:
                 not set.
         """
         folder = Path(folder)
-        with in_words(folder):
-            require_folder(folder)
-            refuse_links(folder)
+        with opening(folder):
             settle(folder, unfinished=unfinished)
             return cls(folder, journal.current_manifest(folder), only_reads=True)
 

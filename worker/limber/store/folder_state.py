@@ -2,6 +2,8 @@
 
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from limber.core.errors import BranchFolderError, InputError
@@ -9,6 +11,7 @@ from limber.core.files import safe_names
 from limber.core.files.atomic import flush_folder, write_atomically
 from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
 from limber.store import journal
+from limber.store.disk import in_words
 from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, wait_for_commit
 from limber.store.manifest import MANIFEST, Manifest, read_manifest
 
@@ -55,12 +58,16 @@ def settled_manifest(folder: Path) -> Manifest:
     return read_manifest(folder)
 
 
-def require_folder(folder: Path) -> None:
-    """Refuse a folder that is not there."""
-    if not folder.is_dir():
-        raise BranchFolderError(
-            f"There is no folder {folder}.", "A branch folder was expected.",
-            "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+@contextmanager
+def opening(folder: Path) -> Iterator[None]:
+    """Refuse a folder that is not there or has links; say what a lost disk does meanwhile."""
+    with in_words(folder):
+        if not folder.is_dir():
+            raise BranchFolderError(
+                f"There is no folder {folder}.", "A branch folder was expected.",
+                "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+        refuse_links(folder)
+        yield
 
 
 def refuse_links(folder: Path) -> None:

@@ -2,12 +2,14 @@
 
 import glob
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from limber.batch.addresses import checked_address, is_address, matching, plain_name
 from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.toml_positions import Place
-from limber.core.errors import InputError, LimberError
+from limber.core.errors import LimberError
 from limber.store.manifest import MANIFEST
 
 
@@ -36,7 +38,7 @@ class JobPaths:
             self._problems.add(
                 ("work",), "work is a folder here, for results that go to an address.")
         elif is_address(out):
-            self.home = self._checked(out, ("out",))
+            self.home = self._tried(checked_address, out, ("out",)) or ""
             self.out = self._folder / (work or otherwise)
         elif out:
             self.out = self._folder / out
@@ -46,7 +48,7 @@ class JobPaths:
         if not is_address(pattern):
             return [self._folder / name for name in sorted(
                 glob.glob(pattern, root_dir=self._folder, recursive=True))]
-        found = self._listed(pattern, place)
+        found = self._tried(matching, pattern, place)
         return None if found is None else [self._file(each, place) for each in found]
 
     def folders(self, pattern: str, place: Place) -> list[Path] | None:
@@ -54,7 +56,7 @@ class JobPaths:
         if not is_address(pattern):
             return [path for path in self.files(pattern, place) or ()
                     if (path / MANIFEST).is_file()]
-        found = self._listed(f"{pattern.rstrip('/')}/{MANIFEST}", place)
+        found = self._tried(matching, f"{pattern.rstrip('/')}/{MANIFEST}", place)
         return None if found is None else [
             self._here(each.removesuffix(f"/{MANIFEST}"), self.out, place) for each in found]
 
@@ -62,14 +64,14 @@ class JobPaths:
         """Return the path of one file or folder."""
         if not is_address(name):
             return self._folder / name
-        address = self._checked(name, place)
+        address = self._tried(checked_address, name, place)
         return self._file(address, place) if address else self.out
 
     def written(self, name: str, place: Place) -> Path:
         """Return where a stage writes a file: never outside ``out``."""
         path = (self.out / name).resolve()
         if is_address(name):
-            if self._checked(name, place):
+            if self._tried(checked_address, name, place):
                 self._problems.add(
                     place, f"{name!r} is an address; what stages write goes to `out`.")
         elif not path.is_relative_to(self.out.resolve()):
@@ -85,13 +87,13 @@ class JobPaths:
         return tuple((self._known[path], path) for path in dict.fromkeys(paths)
                      if path in self._known)
 
-    def _checked(self, text: str, place: Place) -> str:
-        """Return an address as it is used; nothing if it is refused."""
+    def _tried(self, function: Callable[[str], Any], address: str, place: Place) -> Any:
+        """Return ``function(address)``; None where it refuses the address."""
         try:
-            return checked_address(text)
-        except InputError as error:
+            return function(address)
+        except LimberError as error:
             self._problems.add(place, str(error))
-            return ""
+            return None
 
     def _file(self, address: str, place: Place) -> Path:
         """Return where one file, or folder, goes: beside what stands beside it there."""
@@ -99,18 +101,9 @@ class JobPaths:
         own = hashlib.sha256(around.encode("utf-8")).hexdigest()[:12]
         return self._here(address, self.out / ".inputs" / own, place)
 
-    def _listed(self, pattern: str, place: Place) -> list[str] | None:
-        try:
-            return matching(pattern)
-        except LimberError as error:
-            self._problems.add(place, str(error))
-            return None
-
     def _here(self, address: str, folder: Path, place: Place) -> Path:
-        try:
-            path = folder / plain_name(address)
-        except InputError as error:
-            self._problems.add(place, str(error))
+        name = self._tried(plain_name, address, place)
+        if name is None:
             return folder / "refused"
-        self._known[path] = address
-        return path
+        self._known[folder / name] = address
+        return folder / name

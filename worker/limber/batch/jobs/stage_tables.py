@@ -69,10 +69,9 @@ class StageTables:
                 for task in self._tasks_of(table, (*place, "stage", number))]
 
     def _tasks_of(self, table: dict[str, Any], place: Place) -> list[StageTask]:
-        name = table.get("run")
-        trouble = _trouble(name)
-        if trouble:
-            self.problems.add((*place, "run"), f"run = {name!r}: {trouble}")
+        name = str(table.get("run"))
+        if trouble := _trouble(name):
+            self.problems.add((*place, "run"), f"run = {table.get('run')!r}: {trouble}")
             return []
         given = {key: (value, (*place, key)) for key, value in table.items() if key != "run"}
         for swept, value in self.sweep.items():
@@ -189,13 +188,13 @@ class _StageValues:
                            + (f" [{unit}]." if unit else "."))
 
 
-def _trouble(name: Any) -> str:
+def _trouble(name: str) -> str:
     """Return why ``run = name`` cannot be; nothing where it can."""
     known = stage_summaries()
-    if isinstance(name, str) and name in known:
+    if name in known:
         return why_not_in_batches(name)
     return "there is no such stage. " + nearest(
-        str(name), [each for each in known if not why_not_in_batches(each)])
+        name, [each for each in known if not why_not_in_batches(each)])
 
 
 def _said_of(about: dict[str, Any], key: str) -> set[str]:

@@ -1,6 +1,6 @@
 """What the report's pictures share: charts with their labels, and two views of a branch."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -48,7 +48,7 @@ def draw_faces(axis: "Axes", corners: np.ndarray, colours: np.ndarray, across: i
     from matplotlib.collections import PolyCollection
 
     order = np.argsort(corners[:, :, depth].mean(axis=1) * (1 if across else -1))
-    axis.add_collection(PolyCollection(
-        corners[order][:, :, [across, 2]], facecolors=colours[order], edgecolors="face",
-        linewidths=0.1))
+    flat: Any = corners[order][:, :, [across, 2]]
+    axis.add_collection(PolyCollection(flat, facecolors=colours[order], edgecolors="face",
+                                       linewidths=0.1))
     axis.autoscale_view()
