@@ -61,8 +61,10 @@ class InPool:
             future = pool.submit(getattr(behaviours, behaviour), progress=Progress(hear),
                                  limits=limits or Limits())
             while not future.done():
-                outcome.processes += [psutil.Process(i) for i in pool.process_ids
-                                      if i not in {p.pid for p in outcome.processes}]
+                known = {process.pid for process in outcome.processes}
+                outcome.processes += [psutil.Process(worker.process_id)
+                                      for worker in tuple(pool._workers)
+                                      if worker.process_id not in known]
                 time.sleep(0.02)
             try:
                 outcome.result = future.result()

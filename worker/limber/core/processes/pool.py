@@ -134,12 +134,6 @@ class Pool:
     def __exit__(self, *_error: object) -> None:
         self.close()
 
-    @property
-    def process_ids(self) -> list[int]:
-        """Of the processes that run now."""
-        with self._guard:
-            return [worker.process_id for worker in self._workers]
-
     def _ring(self) -> None:
         try:
             self._bell_button.send_bytes(b"!")
@@ -265,9 +259,12 @@ class _Course:
         self._progress, self._message = progress, message
         self._started = time.monotonic()
 
-    def part(self, number: int) -> Progress:
+    def part(self, number: int, *, is_here: bool = False) -> Progress:
+        """Progress of a call; in this process it is passed on at once: a cancel reaches it so."""
         def hear(fraction: float, _message: str, _numbers: dict[str, Any]) -> None:
             self._fractions[number] = fraction
+            if is_here:
+                self.report(number)
         return Progress(hear, self._progress.warn)
 
     def report(self, done_count: int) -> None:
@@ -302,17 +299,6 @@ def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None
     course = _Course(len(tasks), progress, message)
     results = []
     for number, task in enumerate(tasks):
-        part = _Here(course, course.part(number), number)
-        results.append(Task(function, task).run(part.progress))
+        results.append(Task(function, task).run(course.part(number, is_here=True)))
         course.report(number + 1)
     return results
-
-
-class _Here:
-    """Progress of a call in this process: passes on at once, so that cancelling reaches it."""
-
-    def __init__(self, course: _Course, part: Progress, done_count: int):
-        def hear(fraction: float, message: str, numbers: dict[str, Any]) -> None:
-            part(fraction, message, **numbers)
-            course.report(done_count)
-        self.progress = Progress(hear, part.warn)
