@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from limber.core.json_values import plain
 from limber.session.protocol import (
     LINE_LIMIT,
     PROTOCOL,
     Lines,
     Move,
     NotUnderstood,
-    finite,
     parse_command,
 )
 
@@ -116,5 +116,5 @@ def test_what_is_not_finite_becomes_null():
     """Events are JSON for every reader: NaN and infinity are not."""
     import numpy as np
 
-    line = finite({"a": np.array([1.0, np.nan]), "b": [np.inf, {"c": np.float32(2)}]})
+    line = plain({"a": np.array([1.0, np.nan]), "b": [np.inf, {"c": np.float32(2)}]})
     assert json.dumps(line, allow_nan=False) == '{"a": [1.0, null], "b": [null, {"c": 2.0}]}'

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from limber.session.protocol import finite
+from limber.core.json_values import plain
 
 _WAITING_LIMIT = 1000
 
@@ -29,7 +29,7 @@ class Events:
     def say(self, **line: Any) -> None:
         """Write one event."""
         try:
-            self._lines.put_nowait(json.dumps(finite(line), default=str))
+            self._lines.put_nowait(json.dumps(plain(line), default=str))
         except queue.Full:
             return  # nobody reads
 

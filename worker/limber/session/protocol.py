@@ -6,9 +6,8 @@ client sends ends the session but ``close`` and the end of the input.
 """
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from limber.core.errors import InputError
@@ -243,18 +242,3 @@ class Lines:
             self._is_dropping = True
         else:
             self._part += rest
-
-
-def finite(value: Any) -> Any:
-    """Return a value as JSON takes it: arrays as lists, what is not finite as None."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {name: finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

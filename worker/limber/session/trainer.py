@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import Cancelled, LimberError
+from limber.core.json_values import plain
 from limber.core.progress import JsonSink, Progress
 from limber.mechanics.grasp import Grasp
 from limber.reduced.model_cache import (
@@ -44,7 +45,7 @@ from limber.session.settings import SessionSettings
 
 def say(**line: Any) -> None:
     """Print one JSON line."""
-    print(json.dumps(line, default=float), flush=True)
+    print(json.dumps(plain(line)), flush=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -126,9 +127,8 @@ def _check(refreshing: RefreshingModel, request: dict[str, Any]) -> None:
     estimate = refreshing.check(state)
     good = refreshing.accepts(state, estimate)
     learned = not good and refreshing.learn(pose, young, estimate).converged
-    say(event="check", position_error=_finite(estimate.position),
-        energy_error=_finite(estimate.energy), certain=estimate.certain, good=good,
-        learned=learned)
+    say(event="check", position_error=estimate.position, energy_error=estimate.energy,
+        certain=estimate.certain, good=good, learned=learned)
 
 
 def _announce(cache: ReducedCache, key: str, refreshing: RefreshingModel, began: float,
@@ -137,10 +137,6 @@ def _announce(cache: ReducedCache, key: str, refreshing: RefreshingModel, began:
         snapshots=len(refreshing.snapshots), refreshes=refreshing.refresh_count,
         from_cache=bool(learnt and learnt.was_known),
         seconds=round(time.perf_counter() - began, 3))
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 if __name__ == "__main__":

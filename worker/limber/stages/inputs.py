@@ -31,16 +31,16 @@ def by_name(function: Callable[..., dict[str, Any]], **fields: str) -> Run:
     """Return how a stage is run by a function whose parameters are called as its fields.
 
     Args:
-        function: Takes fields of inputs, settings and options, and ``settings``, ``options`` or
-            ``progress`` whole.
+        function: Takes fields of inputs, settings and options, or ``inputs``, ``settings`` and
+            ``options`` whole, and ``progress``.
         fields: Of a parameter with a name of its own, the field that it takes.
     """
     taken = {name: fields.get(name, name) for name in inspect.signature(function).parameters}
 
     def run(inputs: Settings, settings: Settings, options: Settings, progress: Progress,
             ) -> dict[str, Any]:
-        values = {**dict(inputs), **dict(settings), **dict(options), "settings": settings,
-                  "options": options, "progress": progress}
+        values = {**dict(inputs), **dict(settings), **dict(options), "inputs": inputs,
+                  "settings": settings, "options": options, "progress": progress}
         return function(**{name: values[field] for name, field in taken.items()})
 
     return run

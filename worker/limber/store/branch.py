@@ -119,10 +119,12 @@ class Branch:
     @property
     def gravity(self) -> tuple[float, float, float]:
         """Gravity [m/s^2] in the branch's frame: the upright turn of a scan turns it too."""
-        for key in ("reconstruct", "mesh"):
-            if key in self.manifest.stages:
-                return tuple(self.manifest.stages[key].result.get("gravity_m_s2", GRAVITY))
-        return GRAVITY
+        return tuple(self.made.result.get("gravity_m_s2", GRAVITY)) if self.made else GRAVITY
+
+    @property
+    def made(self) -> StageEntry | None:
+        """The entry of the stage that made the mesh; None before it."""
+        return self.manifest.stages.get("reconstruct") or self.manifest.stages.get("mesh")
 
     @classmethod
     def create(cls, folder: str | os.PathLike) -> "Branch":

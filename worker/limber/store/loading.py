@@ -138,9 +138,7 @@ def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
 
 def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
     """Return the place of the grasp that the mesh marks [m], None where it is not known."""
-    made = next((branch.manifest.stages[key] for key in ("reconstruct", "mesh")
-                 if key in branch.manifest.stages), None)
-    fraction = made.settings.get("grasp_fraction") if made else None
+    fraction = branch.made.settings.get("grasp_fraction") if branch.made else None
     if fraction is None or not branch.has("skeleton.swc"):
         return None
     x, y, z = map(float, load_skeleton(branch).point_at(float(fraction)))

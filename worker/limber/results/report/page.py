@@ -22,7 +22,6 @@ from limber.results.report.section import Section, inline_png, read_png
 from limber.results.report.shape_sections import (
     cylinders_section,
     mesh_section,
-    reconstruction_of,
     scan_section,
 )
 from limber.results.report.tables import (
@@ -108,7 +107,7 @@ def _summary(branch: Branch, picture: Path | None) -> Section:
         section.pictures.append((inline_png(read_png(picture)), "The scene, rendered."))
     if is_assumed(_virtual_result(branch)):
         section.text.append(ASSUMED)
-    result = reconstruction_of(branch)
+    result = branch.made.result if branch.made else {}
     rows = [["what", "value"]]
     source = branch.manifest.source
     rows += [[_SOURCE_LABELS.get(key, key.replace("_", " ")), str(value)]

@@ -33,14 +33,6 @@ _QUALITY_LABELS = {
     "fork_distance_max": "largest distance at forks [local radii]"}
 
 
-def reconstruction_of(branch: Branch) -> dict[str, Any]:
-    """Return what the stage that made the mesh told; nothing without one."""
-    for key in ("reconstruct", "mesh"):
-        if key in branch.manifest.stages:
-            return branch.manifest.stages[key].result
-    return {}
-
-
 def scan_section(branch: Branch) -> Section:
     section = Section("Scan and skeleton")
     if not (branch.has("cloud.ply") and branch.has("skeleton.swc")):
@@ -58,7 +50,7 @@ def scan_section(branch: Branch) -> Section:
                f"{target['mass_kg']:.4g}"] for target in targets)]))
     section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
                                         "it is known, one colour an order.")
-    result = reconstruction_of(branch)
+    result = branch.made.result if branch.made else {}
     section.text += result.get("warnings") or []
     doubtful = doubtful_parts(load_skeleton(branch))
     if doubtful:
@@ -85,7 +77,7 @@ def cylinders_section(branch: Branch, calipers: Sequence[Caliper]) -> Section:
         return section
     skeleton = load_skeleton(branch)
     compared = qsm_tables.against_calipers(skeleton, list(calipers))
-    shares = reconstruction_of(branch).get("length_shares")
+    shares = branch.made and branch.made.result.get("length_shares")
     if shares:
         section.tables.append(("How the radii are known", share_rows(shares)))
     section.tables.append(("By branching order (0 is the main axis)",
@@ -111,7 +103,7 @@ def mesh_section(branch: Branch) -> Section:
         return section
     section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
                                                   "modulus; base in black, grasp patch in red.")
-    result = reconstruction_of(branch)
+    result = branch.made.result if branch.made else {}
     quality = result.get("mesh_quality") or {}
     rows = [["what", "value"]]
     for key in ("surface_volume_m3", "mesh_volume_m3"):

@@ -132,7 +132,6 @@ def _origin(branch: Branch) -> str:
 
 
 def _size_note(branch: Branch, mesh: TetMesh) -> str:
-    entry = branch.manifest.stages.get("reconstruct") or branch.manifest.stages.get("mesh")
-    length = (entry.result if entry else {}).get("length_m")
+    length = (branch.made.result if branch.made else {}).get("length_m")
     extent = f"{length:.2f} m of centreline" if length else f"{np.ptp(mesh.nodes[:, 2]):.2f} m high"
     return f"{extent}, {mesh.tet_count} tetrahedra"

@@ -1,8 +1,10 @@
 """A Blender scene with the branch, its motion and paths."""
 
+from __future__ import annotations
+
 import tempfile
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -13,6 +15,9 @@ from limber.core.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.results.scene.arrays import SceneData
 
 _MOVING = (".webp", ".gif", ".png")
 _TURN_SECONDS = 6.0
@@ -57,71 +62,62 @@ class SceneSettings(Settings):
             "Default: 0.6 % of Young's modulus, as of green wood (0.5 to 0.7 %)."))
 
 
-def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | None = None,
-          turntable: Path | None = None, width: int = 1120, sides: int = 48,
-          color: str = "young", plan: str | None = None, motion: str | None = None,
-          strength: float | None = None, data_path: Path | None = None,
-          progress: Progress = SILENT) -> dict[str, Any]:
+def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = SILENT,
+          ) -> dict[str, Any]:
     """Make a Blender scene of a branch, or only what it shows, as arrays.
-
-    Args:
-        branch_folder: With a mesh.
-        output: The .blend to write.
-        picture: A PNG to render of the end of the path, or None.
-        turntable: A moving picture of it from ``sides`` sides, or None.
-        width: Of the picture [pixels].
-        color: What the branch's colours mean: ``young``, or the worst of all frames:
-            ``strain_energy``, ``strain``, ``stress``, ``stress_over_strength``, ``det_f``; or
-            ``residual``.
-        plan: Which path to show; default the newest.
-        motion: Which frames to play; default the plan's, else the newest.
-        strength: Stress that breaks the wood [Pa]; assumed where it is not given.
-        data_path: The .npz to write instead of ``output``.
 
     Raises:
         InputError: not one of output and data, or nothing to show.
         WorkError: Blender failed.
     """
-    from limber.results.scene.blender_process import make_scene
     from limber.results.scene.contents import scene_data
     from limber.store.loading import load_targets
 
-    if (output is None) == (data_path is None):
+    if (inputs.output is None) == (inputs.data is None):
         raise InputError("Exactly one of --output and --data must be given.",
                          "It states what to write.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
-    branch = Branch.read(branch_folder)
-    data = scene_data(branch, plan, motion, load_targets(branch), strength)
-    if color not in data.info["scalars"]:
-        raise InputError(f"The branch has no {color} to show.",
+    branch = Branch.read(inputs.branch_folder)
+    data = scene_data(branch, settings.plan, settings.motion, load_targets(branch),
+                      settings.strength)
+    if settings.color not in data.info["scalars"]:
+        raise InputError(f"The branch has no {settings.color} to show.",
                          f"It has: {', '.join(data.info['scalars'])}.",
                          "Run `limber plan` or `limber simulate` first.")
-    if output is None:
-        target = present(data_path, "file for the data")
-        data.write(_writable(target))
-        return {"data": target, "vertex_count": len(data.arrays["vertices"])}
+    if inputs.data is not None:
+        data.write(_writable(inputs.data))
+        return {"data": inputs.data, "vertex_count": len(data.arrays["vertices"])}
+    turntable, output = inputs.turntable, present(inputs.output, "file for the scene")
     if turntable is not None and turntable.suffix.lower() not in _MOVING:
         raise InputError(f"{turntable.name} has no suffix of an animation.", "",
                          f"Name it {' or '.join(_MOVING)}.")
-    with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
-        prepared = Path(temporary) / "scene.npz"
-        data.write(prepared)
-        arguments = ["--data", prepared, "--scene", _writable(output), "--color", color,
-                     "--width", width]
-        if picture is not None:
-            arguments += ["--picture", _writable(picture)]
-        if turntable is not None:
-            _writable(turntable)
-            frames = Path(temporary) / "round"
-            frames.mkdir()
-            arguments += ["--round", frames, "--sides", sides]
-        result = make_scene(arguments, progress.part(0.1, 1.0))
-        if turntable is not None:
-            _write_moving(turntable, sorted(frames.glob("*.png")))
+    result = _made(data, output, inputs, settings, progress.part(0.1, 1.0))
     if not output.is_file():
         raise WorkError(f"Blender ended without an error but did not write {output}.", "",
                         "`limber doctor` states which Blender was used.")
-    return result | {"scene": output, "picture": picture, "turntable": turntable}
+    return result | {"scene": output, "picture": inputs.render, "turntable": turntable}
+
+
+def _made(data: SceneData, output: Path, inputs: SceneInputs, settings: SceneSettings,
+          progress: Progress) -> dict[str, Any]:
+    """Have Blender make the scene, and what is rendered of it; returns what it told."""
+    from limber.results.scene.blender_process import make_scene
+
+    with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
+        prepared, frames = Path(temporary) / "scene.npz", Path(temporary) / "round"
+        data.write(prepared)
+        arguments = ["--data", prepared, "--scene", _writable(output), "--color", settings.color,
+                     "--width", settings.width]
+        if inputs.render is not None:
+            arguments += ["--picture", _writable(inputs.render)]
+        if inputs.turntable is not None:
+            _writable(inputs.turntable)
+            frames.mkdir()
+            arguments += ["--round", frames, "--sides", settings.sides]
+        result = make_scene(arguments, progress)
+        if inputs.turntable is not None:
+            _write_moving(inputs.turntable, sorted(frames.glob("*.png")))
+    return result
 
 
 def _write_moving(path: Path, pictures: list[Path]) -> None:
@@ -153,5 +149,4 @@ def _writable(path: Path) -> Path:
 
 
 STAGE = StageDescription(
-    "scene", 120, by_name(scene, picture="render", data_path="data"), SceneInputs, SceneSettings,
-    NoOptions, reads=("mesh.vtu",))
+    "scene", 120, by_name(scene), SceneInputs, SceneSettings, NoOptions, reads=("mesh.vtu",))
