@@ -161,7 +161,10 @@ def test_a_module_that_is_registered(monkeypatch):
         registry._stages.cache_clear()
 
 
-def test_a_package_that_is_half_there_is_named(package):
+@pytest.mark.parametrize("content", [None, '"""Nothing."""\n'])
+def test_a_package_that_is_half_there_is_named(package, content):
     (package / "counting" / "count.py").unlink()
+    if content is not None:
+        (package / "counting" / "count.py").write_text(content)
     with pytest.raises(InputError, match=r"stage count should be in counting\.count"):
         registry.stage_summaries()

@@ -101,9 +101,8 @@ def register(module: ModuleType) -> None:
 @cache
 def _stages() -> dict[str, tuple[str, str]]:
     """Return the module and the summary of each stage, in the order in which they run."""
-    found = [(*about, module) for module, path in _stage_files() if (about := _described(path))]
-    found += [(module.STAGE.position, module.STAGE.name, _summary(module.__doc__),
-               module.__name__) for module in _registered]
+    found = {(module.STAGE.position, module.STAGE.name, _summary(module.__doc__), module.__name__)
+             for module in _registered} | {*_in_files()}
     stages: dict[str, tuple[str, str]] = {}
     for _position, name, summary, module in sorted(found):
         if name in stages:
@@ -113,20 +112,23 @@ def _stages() -> dict[str, tuple[str, str]]:
     return stages
 
 
-def _stage_files() -> Iterator[tuple[str, Path]]:
-    """The modules that may hold a stage, and their files."""
+def _in_files() -> Iterator[tuple[int, str, str, str]]:
+    """Position, name, summary and module of the stages below this folder and of other packages."""
     folder = Path(__file__).parent
     for path in folder.rglob("*.py"):
-        yield ".".join((__package__, *path.relative_to(folder).with_suffix("").parts)), path
+        if about := _described(path):
+            yield *about, ".".join((__package__, *path.relative_to(folder).with_suffix("").parts))
     for entry in importlib.metadata.entry_points(group="limber.stages"):
         try:
             spec = importlib.util.find_spec(entry.module)
         except ImportError:
             spec = None
-        if spec is None or spec.origin is None:
+        about = _described(Path(spec.origin)) if spec and spec.origin else None
+        if about is None:
             raise InputError(f"The stage {entry.name} should be in {entry.module}, which is not "
-                             "there.", "", "Install its package again, or uninstall it.")
-        yield entry.module, Path(spec.origin)
+                             "there or assigns no STAGE.", "",
+                             "Install its package again, or uninstall it.")
+        yield *about, entry.module
 
 
 def _described(path: Path) -> tuple[int, str, str] | None:
