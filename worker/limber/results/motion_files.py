@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
-from limber.core.files.reading import read_json_as
+from limber.core.files.reading import FileContent, read_json_as
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import StrainState, strain_state
@@ -62,10 +62,8 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
     return body.reshape(frames, count, 3), start, rate
 
 
-class FramesFile(BaseModel):
+class FramesFile(FileContent):
     """Content of ``frames/NAME.json`` as far as it is read: lists with a number a frame."""
-
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     frame_count: int | None = Field(None, ge=1)
     rate: float = Field(24.0, gt=0, le=1e6)

@@ -11,12 +11,12 @@ from dataclasses import replace
 from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON, UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.reading import read_json_as
+from limber.core.files.reading import FileContent, read_json_as
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
@@ -40,24 +40,20 @@ _Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Vector = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
-
-
-class _Mass(_Entry):
+class _Mass(FileContent):
     mass_kg: float = Field(ge=0)
     attached_m: _Vector
     centre_m: _Vector | None = None
     inertia_kg_m2: tuple[_Vector, _Vector, _Vector] | None = None
 
 
-class _Target(_Entry):
+class _Target(FileContent):
     name: str
     position_m: _Vector
     mass_kg: float = Field(ge=0)
 
 
-class _Targets(_Entry):
+class _Targets(FileContent):
     format_version: int
     targets: list[_Target]
 

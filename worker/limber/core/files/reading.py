@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO, Any, NoReturn, TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from limber.core.errors import InputError
 
@@ -29,6 +29,12 @@ LARGEST_EXPANSION = 100.0
 """Array bytes for a byte of a compressed file, from which on ``HARMLESS_BYTES`` is the limit:
 real measurements compress ten times at best."""
 HARMLESS_BYTES = 256e6
+
+
+class FileContent(BaseModel):
+    """Content of a file as far as it is read: what else it says is passed over."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
 
 def read_text(path: str | os.PathLike, what: str) -> str:

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from limber.core.files.reading import read_arrays, read_json_as, require_shapes
+from limber.core.files.reading import FileContent, read_arrays, read_json_as, require_shapes
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.motion_files import read_pc2
 from limber.results.report.charts import draw_faces, two_views
@@ -18,10 +18,8 @@ _Interval = tuple[float, float]
 _Way = tuple[float, float, float]
 
 
-class Gusts(BaseModel):
+class Gusts(FileContent):
     """Of ``loads/NAME.json``: how far gusts go beyond the mean."""
-
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     factor: float
     peak_factor: float
@@ -31,10 +29,8 @@ class Gusts(BaseModel):
     mean_tip_displacement_m: _Way
 
 
-class LoadFile(BaseModel):
+class LoadFile(FileContent):
     """Content of ``loads/NAME.json`` as far as it is shown."""
-
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     tip_displacement_m: _Way
     sag_m: float

@@ -2,15 +2,13 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from limber.core.files.reading import read_json_as
+from limber.core.files.reading import FileContent, read_json_as
 
 
-class VibrationFile(BaseModel):
+class VibrationFile(FileContent):
     """Content of ``vibration.json`` as far as it is shown."""
-
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     young_pa: float = Field(gt=0)
     young_interval_pa: tuple[float, float]

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_json_as
+from limber.core.files.reading import FileContent, read_json_as
 from limber.results.report.charts import chart
 
 if TYPE_CHECKING:
@@ -18,10 +18,8 @@ _Track = list[list[tuple[float | None, float | None, float | None]]]
 """Of each time, each marker's place [m]; None where it was not seen."""
 
 
-class SwingFile(BaseModel):
+class SwingFile(FileContent):
     """Content of ``swing.json`` as far as it is shown."""
-
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     pull: str
     young_pa: float = Field(gt=0)
@@ -32,7 +30,7 @@ class SwingFile(BaseModel):
     release_deviation_s: float
     frequency_hz: float
     relative_residual: float
-    warnings: list[str] = []
+    warnings: list[str] = Field([])
     times_s: list[float] = Field(min_length=2)
     seen_m: _Track
     simulated_m: _Track

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from limber.core.errors import InputError, SafetyStop
-from limber.core.files.reading import read_columns, read_json_as
+from limber.core.files.reading import FileContent, read_columns, read_json_as
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.recordings.recording import POSE_COLUMNS
@@ -28,17 +28,13 @@ _NEAR_M = 0.005  # from the gripper, where given places begin
 _Vector = tuple[float, float, float]
 
 
-class _Pull(BaseModel):
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
-
+class _Pull(FileContent):
     grasp_point_m: _Vector
     end_m: _Vector
     travel_m: float = Field(gt=0, le=0.5)
 
 
-class _Suggested(BaseModel):
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
-
+class _Suggested(FileContent):
     best: _Pull
 
 
