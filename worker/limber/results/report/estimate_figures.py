@@ -156,10 +156,11 @@ def simulated_over_observed(pull: dict[str, Any], estimate: dict[str, Any]) -> A
     for number in range(len(observed)):
         shade = 0.3 + 0.7 * (number + 1) / len(observed)
         seen, model = (observed[number] - centre) @ plane, (simulated[number] - centre) @ plane
-        label = {"label": "simulated"} if number == len(observed) - 1 else {}
-        axes.plot(*model.T, "-", color=SIMULATED, alpha=shade, lw=2, **label)
-        label = {"label": "observed"} if label else {}
-        axes.plot(*seen.T, "o", color=OBSERVED, alpha=shade, ms=4, **label)
+        is_last = number == len(observed) - 1
+        axes.plot(*model.T, "-", color=SIMULATED, alpha=shade, lw=2,
+                  label="simulated" if is_last else None)
+        axes.plot(*seen.T, "o", color=OBSERVED, alpha=shade, ms=4,
+                  label="observed" if is_last else None)
         for start, end in zip(model, model + 10 * (seen - model), strict=True):
             axes.plot([start[0], end[0]], [start[1], end[1]], color=TRUE, alpha=shade, lw=0.8)
     axes.set_aspect("equal", adjustable="datalim")
