@@ -28,9 +28,9 @@ from benchmarks.table import Asked, Part, Row, Setting
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT
 from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit import Estimate
 from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.optimise import gauss_newton, nelder_mead
+from limber.estimation.judgement import Estimate
 from limber.estimation.online.filter import OnlineFrame
 from limber.estimation.online.follow import begin
 from limber.estimation.online.full_model import Beside

@@ -28,10 +28,11 @@ from benchmarks.truth_branch import (
 from limber.core.errors import Cancelled, LimberError
 from limber.core.json_values import plain
 from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit import Estimate, fit_branch, judge_model, require_result
+from limber.estimation.fit import fit_branch
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.interpolation_prior import open_field
+from limber.estimation.judgement import Estimate, judge_model, require_result
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings

@@ -14,7 +14,7 @@ pydantic_core._pydantic_core.ValidationError: ...
 from limber.core.lazy import exports
 
 _PLACES = {
-    "Estimate": "fit",
+    "Estimate": "judgement",
     "EstimateSettings": "settings",
     "EvaluationLog": "fitting.evaluations",
     "OnlineEstimator": "online.filter",

@@ -1,11 +1,11 @@
-"""Young's modulus along a branch from its pulls: fit, judgement and what it is sure of.
+"""Young's modulus along a branch from its pulls: where the fit starts, and how it is fitted.
 
-What of it is written is in :mod:`limber.estimation.summary`.
+:mod:`limber.estimation.judgement` has what was found and how sure it is, what of it is written
+:mod:`limber.estimation.summary`.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,149 +21,28 @@ from limber.estimation.fit_preparation import (
 )
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.initial_modulus import led_start, scaled_start, standing_start
-from limber.estimation.fitting.nuisances import in_words, told, unlikely
-from limber.estimation.fitting.objective import Objective, Stopped, held_out, without
+from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
-from limber.estimation.forward.forward_model import Forward, under_its_weight
+from limber.estimation.forward.forward_model import under_its_weight
+from limber.estimation.judgement import MISFIT_FACTOR, Estimate, hold_out, judge_fit
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.covariance import Uncertainty, outliers, uncertainty
-from limber.estimation.uncertainty.grip_error import grip_error
+from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.identifiability import (
-    SCALE_DEVIATION,
-    Identifiability,
     identifiability,
     link_unresolved,
     require_scale,
 )
 from limber.estimation.uncertainty.marginal import averaged
-from limber.estimation.uncertainty.model_error import (
-    ModelError,
-    geometry_error,
-    mesh_error,
-    observer,
-    steady_loads,
-)
-from limber.estimation.uncertainty.path_error import led_by_path, path_error
 from limber.estimation.uncertainty.profile_likelihood import profiled
-from limber.estimation.uncertainty.shape_error import hung_error, shape_error
-from limber.estimation.uncertainty.variance_parts import largest, variance_parts
 from limber.recordings.cell_errors import calibration_of
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry, Pull
+from limber.recordings.recording import Pull
 from limber.recordings.sensor_checks import force_unit_suspicion
-
-MISFIT_FACTOR = 4.0
-"""Mean squared residual over the expected one from which model and pull do not belong together:
-twice the stated noise. Of 10 branches reconstructed from scans, all sound ones stayed under 1.3,
-and the one whose axis ran into a twig and back came to 13, with moduli threefold off."""
-
-UNEXPLAINED_FACTOR = 1.5
-"""The same, from which something acts that is not in the model."""
-WIDE = 0.15
-"""Standard deviation of a log E from which it is worth a word what would narrow it."""
-
 
 
 class _ForceLeadsNowhereError(WorkError):
     """No equilibrium under a pull's measured force; its path may still lead."""
-
-
-@dataclass
-class Estimate:
-    """What an estimate found.
-
-    Attributes:
-        fit: The optimiser's end.
-        objective: What it minimised; its parameter space tells what was linked.
-        uncertainty: Covariance and intervals.
-        identifiability: Judged before the fit.
-        warnings: What the user should know.
-        held_out: Per pull, how a fit that did not see it foretells it: RMS distance [m] and RMS
-            force error [N], also over the pull's own travel and peak force.
-        model_error: What residuals cannot show: of the branch's shape and of its mesh.
-        is_weightless: Whether the branch's weight was left out, since it could not carry it.
-    """
-
-    fit: Fit
-    objective: Objective
-    uncertainty: Uncertainty
-    identifiability: Identifiability
-    warnings: list[str] = field(default_factory=list)
-    held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
-    model_error: ModelError = field(default_factory=ModelError)
-    is_weightless: bool = False
-
-    @property
-    def stopped(self) -> bool:
-        """Whether it was stopped before its end."""
-        return self.fit.status is FitStatus.stopped
-
-    @property
-    def values(self) -> Values:
-        """Of the model on its mesh."""
-        return self.objective.space.unpack(self.fit.evaluation.free)
-
-    @property
-    def deviations(self) -> dict[str, Any]:
-        """Relative standard deviations of the moduli by where they come from."""
-        groups = list(self.objective.space.groups)
-        sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
-        error = self.model_error
-        return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-                "path": error.path, "hung": error.hung, "grip": error.grip,
-                "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
-
-    @property
-    def young(self) -> np.ndarray:
-        """Of the material [Pa], shape [K]: without what the mesh is known to be too stiff by."""
-        return self.values.young * self.model_error.mesh_factor
-
-    @property
-    def cell_errors(self) -> list[dict[str, Any]]:
-        """Each error of cell and sensors with its value and interval."""
-        errors = self.fit.evaluation.errors
-        return [] if errors is None else told(self.objective.cell_errors.nuisances, errors,
-                                              self.uncertainty.covariance)
-
-    @property
-    def causes(self) -> dict[str, np.ndarray]:
-        """Variance of log E at the control points by where it comes from, each of shape [K]."""
-        sure = self.uncertainty
-        parts = variance_parts(self.fit.evaluation, self.objective,
-                               sure.variance_factor * sure.repetition)
-        if self.model_error.geometry is not None:
-            parts["shape of the scan"] = self.model_error.geometry**2
-        if self.model_error.mesh is not None:
-            parts["mesh"] = self.model_error.mesh**2
-        if self.model_error.hung is not None:
-            parts["mass of twigs and leaves"] = self.model_error.hung**2
-        if self.model_error.grip is not None:
-            parts["length in the gripper"] = self.model_error.grip**2
-        if self.model_error.path is not None:
-            parts["gripper frame"] = parts.get("gripper frame", 0.0) + self.model_error.path**2
-        return parts
-
-    @property
-    def is_bad(self) -> str | None:
-        """Why there is no result to pass on; None: there is one."""
-        space = self.objective.space
-        bound = [name for name in space.on_bound(self.fit.evaluation.free)
-                 if name not in {prior for prior, _, _ in space.priors}]
-        if bound:
-            return (f"{', '.join(bound)} ran to a bound: the data ask for a value beyond it, as "
-                    "they do with a wrong unit, grasp point or frame of reference, or with "
-                    "markers that are mirrored or mistaken for each other.")
-        if error := unlikely(self.cell_errors):
-            return error
-        scale = identifiability(self.fit.evaluation, space).scale_deviation
-        if not np.isfinite(scale) or scale > SCALE_DEVIATION:
-            return ("The data do not tell the moduli: all of them together are known only to "
-                    f"within a factor of {np.exp(min(2 * scale, 20)):.2g}.")
-        if not self.fit.converged:
-            return f"The optimiser did not converge: {self.fit.reason}"
-        return None
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
@@ -203,9 +82,14 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
             except WorkError as second:
                 raise error from second
 
-    if not (subject.hangs and any(under_its_weight(subject.model, pull.entry).hanging is not None
-                                  for pull in pulls)):
-        return fitted(subject)
+    hangs = subject.hangs and any(under_its_weight(subject.model, pull.entry).hanging is not None
+                                  for pull in pulls)
+    return _as_it_hangs(subject, fitted, progress) if hangs else fitted(subject)
+
+
+def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
+                 progress: Progress) -> Estimate:
+    """Return the estimate with the weight; without it where it cannot be carried."""
     heavy: Estimate | None = None
     failure: Exception | None = None
     try:
@@ -243,26 +127,9 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
             :class:`limber.estimation.fitting.reduced_fit.Reduction`.
     """
     require_scale_in_principle(objective.forwards)
-    reduction = None
-    if settings.forward == "reduced":
-        reduction = Reduction(objective.forwards, cache, digest)
-    judged_on = objective
-    if reduction is not None and reduction.is_built:
-        start = reduction.around(start)
-        judged_on = reduction.objective(objective, start)
-    elif settings.young is None:
-        start = scaled_start(objective, start)
-        if any(forward.uses_force for forward in objective.forwards):
-            suspicion = force_unit_suspicion(float(np.mean(start.young)))
-            if suspicion:
-                progress.warn(suspicion)
-    uniform, explains = start, True
-    if settings.method == "gauss-newton" and reduction is None:
-        start, explains = led_start(judged_on, uniform)
-    standing = standing_start(judged_on, start, uniform, explains=explains)
-    if standing is None:
-        raise _without_equilibrium(judged_on)
-    start, first = standing
+    reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"
+                 else None)
+    start, first = _standing(objective, start, settings, progress, reduction)
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
@@ -284,10 +151,32 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     if not stopped:
         sure = profiled(sure, fit.evaluation, objective, progress)
     found = Estimate(fit, objective, sure, judged)
-    _judge(found, progress)
+    judge_fit(found, progress)
     if settings.hold_out and len(objective.forwards) > 1 and not stopped:
-        found.held_out = _held_out(found, settings)
+        hold_out(found, settings)
     return found
+
+
+def _standing(objective: Objective, start: Values, settings: EstimateSettings, progress: Progress,
+              reduction: Reduction | None) -> tuple[Values, Evaluation]:
+    """Return values to start from for which there are equilibria, and what they give."""
+    judged_on = objective
+    if reduction is not None and reduction.is_built:
+        start = reduction.around(start)
+        judged_on = reduction.objective(objective, start)
+    elif settings.young is None:
+        start = scaled_start(objective, start)
+        if any(forward.uses_force for forward in objective.forwards):
+            suspicion = force_unit_suspicion(float(np.mean(start.young)))
+            if suspicion:
+                progress.warn(suspicion)
+    uniform, explains = start, True
+    if settings.method == "gauss-newton" and reduction is None:
+        start, explains = led_start(judged_on, uniform)
+    standing = standing_start(judged_on, start, uniform, explains=explains)
+    if standing is None:
+        raise _without_equilibrium(judged_on)
+    return standing
 
 
 def _force_is_measured(objective: Objective) -> bool:
@@ -416,152 +305,3 @@ def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSetting
     return fit, objective
 
 
-def _judge(found: Estimate, progress: Progress) -> None:
-    if found.uncertainty.variance_factor > MISFIT_FACTOR:
-        progress.warn(
-            f"The fit is poor: residuals are {found.uncertainty.variance_factor**0.5:.1f} times "
-            "the stated noise, and the intervals do not hold. Is this a pull of this branch, in "
-            "its frame of reference? Does the skeleton run where the branch does?")
-    elif found.uncertainty.variance_factor > UNEXPLAINED_FACTOR:
-        progress.warn(
-            f"Residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated noise: "
-            "something acts that is not in the model, or the sensors are worse than stated. The "
-            "intervals were widened by as much.")
-    for sentence in in_words(found.cell_errors):
-        progress.warn(sentence)
-    named = outliers(found.fit.evaluation, found.objective)
-    if named:
-        worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "
-                          f"({entry['deviations']:.0f} deviations)" for entry in named[:4])
-        progress.warn(f"Outliers: {worst}{' ...' if len(named) > 4 else ''}.")
-
-
-def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str, Any]]:
-    scores = {}
-    for index, forward in enumerate(found.objective.forwards):
-        rest = without(found.objective, index)
-        fit = gauss_newton(rest, found.fit.evaluation.free, robust=settings.robust,
-                           evaluation_limit=15)
-        distance, force = held_out(found.objective, fit.evaluation.free, index)
-        scores[forward.name] = _score(forward, distance, force, in_fit=True)
-    return scores
-
-
-def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> dict[str, Any]:
-    """How a fit that did not see a pull foretells it.
-
-    ``in_fit``: the pull is one of the estimate's, left out for this score alone.
-    """
-    moved = forward.frames.positions - forward.rest_points
-    size = float(np.sqrt(np.nanmean(np.sum(moved**2, axis=2)))) if (
-        np.isfinite(moved).any()) else np.nan
-    pull = np.linalg.norm(forward.frames.wrenches[:, :3], axis=1)
-    peak = float(np.nanmax(pull)) if np.isfinite(pull).any() else np.nan
-    return {"rms_m": distance, "rms_force_n": force, "in_fit": in_fit,
-            "relative_distance": distance / size if size > 0 else np.nan,
-            "relative_force": force / peak if peak > 0 else np.nan}
-
-
-def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSettings) -> None:
-    """Score a pull that the estimate was not asked to use; enters ``found.held_out``.
-
-    Raises:
-        LimberError: it has nothing that could be compared.
-    """
-    forward = forwards_of([pull], subject, settings)
-    alone = Objective(forward, found.objective.space,
-                      force_sigma=[pull.entry.sensor.force_sigma_n])
-    distance, force = held_out(alone, found.fit.evaluation.free, 0)
-    found.held_out[pull.name] = _score(forward[0], distance, force, in_fit=False)
-
-
-def require_result(found: Estimate) -> None:
-    """Refuse a fit that ended at no result.
-
-    Raises:
-        WorkError: with the reason.
-    """
-    reason = found.is_bad
-    if reason is not None:
-        young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
-        raise WorkError("The pulls give no estimate.", reason,
-                        f"The fit stood at {young} MPa; nothing was written. Check what the "
-                        "warnings say of the recording, or use more pulls.")
-
-
-def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,
-                *, axes: Path | None, cloud: np.ndarray | None,
-                progress: Progress = SILENT) -> None:
-    """Find what residuals cannot show of an estimate: errors of the branch's shape and mesh.
-
-    Args:
-        axes: The table of cylinders that were fitted to the scan, or None.
-        cloud: The scan's points [m], shape [n, 3], or None.
-    """
-    subject = subject.without_weight() if found.is_weightless else subject
-    error = _geometry_error(subject, found, settings, axes, cloud, progress)
-    if settings.mesh_check:
-        progress(1.0, "how much the mesh is too stiff")
-        held = grasp_on(subject.mesh, grasp)
-        model = subject.model.with_parameters(poisson=found.values.poisson,
-                                              density=found.values.density)
-        forwards = found.objective.forwards
-        seen = observer(subject.mesh, forwards, held, subject.control_points)
-        stiff = mesh_error(model, held, seen, subject.weights, found.values.young,
-                           steady_loads(forwards))
-        if stiff is not None:
-            error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
-    found.model_error = replace(
-        error, path=_path_error(found, progress),
-        hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma),
-        grip=grip_error(found.fit.evaluation, found.objective))
-    _tell_largest_part(found.causes, progress)
-
-
-def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
-    """From the gripper's frame where its path leads; said where the user reads it."""
-    led = led_by_path(found.objective.forwards)
-    if not led:
-        return None
-    error = path_error(found.fit.evaluation, found.objective)
-    grown = ("how much that matters could not be found, and is NOT in the intervals"
-             if error is None else
-             f"that adds up to {100 * error.max():.0f} % to the standard deviations")
-    progress.warn(
-        f"{', '.join(forward.name for forward in led)}: the gripper's recorded path leads the fit, "
-        "where its frame counts as exact. By its calibration it may be off: "
-        f"{grown}. Record the force (of a clamped grasp also the torque, with torque_sigma_nm) and "
-        "let it lead, or state a better [calibration] in pull.toml.")
-    return error
-
-
-def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
-                    axes: Path | None, cloud: np.ndarray | None, progress: Progress) -> ModelError:
-    """From the scan's axis and radii; none for a skeleton that was not fitted to a scan."""
-    if axes is None:
-        return ModelError()
-    radii = geometry_error(axes, subject.mesh, subject.weights)
-    if radii is None or cloud is None:
-        return ModelError(radii)
-    drawn = shape_error(found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
-                        progress=progress)
-    return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
-
-
-def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None:
-    """Say what would narrow a wide interval: what makes up most of its variance.
-
-    Args:
-        parts: Variance of log E at the control points by cause, each of shape [K].
-    """
-    total = np.sqrt(np.sum(list(parts.values()), axis=0))
-    worst = int(np.argmax(total))
-    if total[worst] < WIDE:
-        return
-    each = "; ".join(f"{cause['cause']} {100 * cause['deviation']:.0f} % ({cause['advice']})"
-                     for cause in largest({name: part[worst:worst + 1]
-                                           for name, part in parts.items()}))
-    progress.warn(
-        f"E at control point {worst + 1} has a standard deviation of "
-        f"{100 * min(total[worst], 99.0):.0f} %. Most of it comes from, and would be less with: "
-        f"{each}.")

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -151,59 +152,71 @@ class QuasiStaticForward(Forward):
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
         model = self.model_with(values)
-        log_young = np.log(values.young)
-        jump = None if self._values is None else log_young - np.log(self._values.young)
-        shape = (len(self.keys), len(self.rest_points), 3)
-        count = len(values.young) + len(extra)
-        points, forces = np.empty(shape), np.empty((len(self.keys), 3))
-        d_points = np.empty((*shape, count)) if sensitivities else None
-        d_forces = np.empty((len(self.keys), 3, count)) if sensitivities else None
-        with_torque = self.uses_torque
-        torques = np.empty((len(self.keys), 3)) if with_torque else None
-        d_torques = np.empty((len(self.keys), 3, count)) if with_torque and sensitivities else None
+        jump = None if self._values is None else np.log(values.young) - np.log(self._values.young)
+        found = self._room(len(values.young) + len(extra) if sensitivities else 0)
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
         is_asked = (sensitivities or self.watches_pose) and self.response is None and (
             self.has_force_unknowns)
         self.iteration_count = 0
         compliances: list[np.ndarray] = []
-        for key, drive in enumerate(self._drives):
-            memory = self._memory[key]
-            hint = None if self._hints is None else self._hints[key]
+        for key, memory in enumerate(self._memory):
             is_known = memory is not None and equal_values(self._values, values)
             result = memory.result if memory is not None and is_known else self._solved(
-                model, self.load_at(key), memory, jump, before, hint)
+                model, key, jump, before)
             if result is None:
                 return None
             before = result.displacement
             # An old derivative still foretells most of a small change.
             slope = None if memory is None else memory.slope
-            points[key] = self.rest_points + self._observed(before)
-            forces[key] = result.reaction_force if self.drive == "pose" else drive[:3]
-            if torques is not None and self.drive == "force":
-                torques[key] = drive[3:]
-            elif torques is not None:
-                # About the recorded grasp point, which the patch's centre lies beside.
-                arm = drive[:3] - self.frames.poses[self.keys[key], :3]
-                torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
+            self._enter(found, key, result)
             # While the factor of this state is at hand.
             if is_asked:
                 compliances.append(compliance(model, before, self._loads[key]))
-            if d_points is not None and d_forces is not None:
-                slope, d_forces[key] = self._slopes(model, values, extra, result)
-                for column in range(count):
-                    d_points[key, ..., column] = self._observed(slope[..., column])
-                if d_torques is not None and self.drive == "force":
-                    d_torques[key] = 0.0
-                elif d_torques is not None:
-                    d_torques[key] = self._torque_slopes(model, values, extra, result, slope,
-                                                         self.frames.poses[self.keys[key], :3])
+            if sensitivities:
+                slope = self._enter_slopes(found, key, model, values, extra, result)
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
         if is_asked:
             self.response = self._response(compliances)
-        return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques,
-                                   *self._held(sensitivities))
+        grasps, d_grasps = self._held(sensitivities)
+        at_frames: dict[str, Any] = {
+            name: None if each is None else np.tensordot(self.spread, each, axes=1)
+            for name, each in vars(replace(found, grasps=grasps, d_grasps=d_grasps)).items()}
+        return Simulated(**at_frames)
+
+    def _room(self, count: int) -> Simulated:
+        """For the key frames, with derivatives to ``count`` parameters."""
+        keys, shape = len(self.keys), (len(self.keys), len(self.rest_points), 3)
+        return Simulated(
+            np.empty(shape), np.empty((keys, 3)),
+            np.empty((*shape, count)) if count else None,
+            np.empty((keys, 3, count)) if count else None,
+            np.empty((keys, 3)) if self.uses_torque else None,
+            np.empty((keys, 3, count)) if self.uses_torque and count else None)
+
+    def _enter(self, found: Simulated, key: int, result: StaticResult) -> None:
+        drive = self._drives[key]
+        found.positions[key] = self.rest_points + self._observed(result.displacement)
+        found.forces[key] = result.reaction_force if self.drive == "pose" else drive[:3]
+        if found.torques is not None and self.drive == "force":
+            found.torques[key] = drive[3:]
+        elif found.torques is not None:
+            # About the recorded grasp point, which the patch's centre lies beside.
+            arm = drive[:3] - self.frames.poses[self.keys[key], :3]
+            found.torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
+
+    def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
+                      extra: tuple[str, ...], result: StaticResult) -> np.ndarray:
+        """Enter the derivatives; returns that of the displacement [n, 3, p]."""
+        points, forces = present(found.d_positions, "slopes"), present(found.d_forces, "slopes")
+        slope, forces[key] = self._slopes(model, values, extra, result)
+        for column in range(slope.shape[-1]):
+            points[key, ..., column] = self._observed(slope[..., column])
+        if found.d_torques is not None:
+            found.d_torques[key] = 0.0 if self.drive == "force" else self._torque_slopes(
+                model, values, extra, result, slope, self.frames.poses[self.keys[key], :3])
+        return slope
 
     def _held(self, _sensitivities: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The grasp point at the key frames and its derivatives, where they are compared."""
@@ -386,10 +399,10 @@ class QuasiStaticForward(Forward):
         self.iteration_count += result.iterations
         return result if result.converged else None
 
-    def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
-                jump: np.ndarray | None, before: np.ndarray | None,
-                hint: np.ndarray | None) -> StaticResult | None:
-        starts: list[np.ndarray | None] = [] if hint is None else [hint]
+    def _solved(self, model: BranchModel, key: int, jump: np.ndarray | None,
+                before: np.ndarray | None) -> StaticResult | None:
+        memory, drive = self._memory[key], self.load_at(key)
+        starts: list[np.ndarray | None] = [] if self._hints is None else [self._hints[key]]
         if memory is not None:
             start = memory.displacement
             if (memory.slope is not None and jump is not None and not self.watches_pose
@@ -429,12 +442,6 @@ class QuasiStaticForward(Forward):
                                                 np.ascontiguousarray(slope[..., column]))
             columns.append(np.cross(arm, out[held]).sum(axis=0))
         return np.array(columns).T
-
-    def _at_all_frames(self, points: np.ndarray, forces: np.ndarray,
-                       *others: np.ndarray | None) -> Simulated:
-        points, forces = (np.tensordot(self.spread, each, axes=1) for each in (points, forces))
-        return Simulated(points, forces, *(
-            None if each is None else np.tensordot(self.spread, each, axes=1) for each in others))
 
 
 def uses_torque(entry: PullEntry, frames: Frames) -> bool:

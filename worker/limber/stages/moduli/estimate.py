@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from limber.estimation.estimated_branch import Subject
-    from limber.estimation.fit import Estimate
+    from limber.estimation.judgement import Estimate
 
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
@@ -84,8 +84,9 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 
 def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
               progress: Progress) -> dict[str, Any]:
-    from limber.estimation.fit import fit_branch, judge_model, require_result
+    from limber.estimation.fit import fit_branch
     from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.estimation.judgement import judge_model, require_result
     from limber.estimation.summary import details, summary
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
 
@@ -216,7 +217,7 @@ def _cloud(branch: Branch) -> np.ndarray | None:
 def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
                      settings: EstimateSettings, progress: Progress) -> None:
     """Score the branch's pulls that this estimate was not asked to use."""
-    from limber.estimation.fit import foretell
+    from limber.estimation.judgement import foretell
     from limber.store.loading import known_pulls, load_pulls
 
     for name in [name for name in known_pulls(branch) if name not in names]:
