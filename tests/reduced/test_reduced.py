@@ -9,14 +9,10 @@ from limber.core.errors import InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics import BranchModel, Grasp, solve_static, young_weights
 from limber.reduced.basis import GraspCoordinates, gradient_metric
-from limber.reduced.reduced_model import (
-    ReducedModel,
-    ReducedSettings,
-    as_control_points,
-    build_reduced,
-    reduce_snapshots,
-)
-from limber.reduced.state import ReducedStaticSettings
+from limber.reduced.building import as_control_points, build_reduced, reduce_snapshots
+from limber.reduced.model_file import read_model, write_model
+from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.state import ReducedSettings, ReducedStaticSettings
 from limber.reduced.training import TrainingSettings
 
 YOUNG = np.array([1.2e8, 0.8e8])
@@ -263,12 +259,12 @@ def test_file_holds_the_model(trained, grasp, tmp_path):
     """Written and read again it gives the same answer; another file is refused."""
     reduced, _ = trained
     pose = grasp.rest_pose + [0.02, 0.0, -0.004, 0, 0, 0]
-    reduced.write(tmp_path / "model.npz")
-    again = ReducedModel.read(tmp_path / "model.npz").solve_static(pose)
+    write_model(reduced, tmp_path / "model.npz")
+    again = read_model(tmp_path / "model.npz").solve_static(pose)
     assert again.strain_energy == reduced.solve_static(pose).strain_energy
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     with pytest.raises(InputError, match="format"):
-        ReducedModel.read(tmp_path / "other.npz")
+        read_model(tmp_path / "other.npz")
 
 
 def test_other_materials_are_refused(model, grasp, weights, trained):

@@ -8,10 +8,7 @@ import pytest
 
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices
-from limber.core.numerics.rigid_kernels import (
-    turned_wrench,
-    weight_wrench,
-)
+from limber.core.numerics.rigid_kernels import turned_wrench, weight_wrench
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.force_sensors import (
     FT300_PORT,

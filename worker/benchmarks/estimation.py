@@ -16,14 +16,7 @@ from benchmarks.estimation_force import FORCE_ROWS, force_rows
 from benchmarks.estimation_noise import NOISE_ROWS, noise_rows
 from benchmarks.estimation_scans import SCAN_ROWS, scan_rows
 from benchmarks.kept_trials import Numbers, numbers_of, source_digest
-from benchmarks.paper_branches import (
-    BRANCHES,
-    FRACTIONS,
-    Bench,
-    PaperBranch,
-    exact_pull,
-    measured,
-)
+from benchmarks.paper_branches import BRANCHES, FRACTIONS, Bench, PaperBranch, exact_pull, measured
 from benchmarks.table import Asked, Part, Row, Setting
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT

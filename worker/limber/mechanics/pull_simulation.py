@@ -17,11 +17,7 @@ from limber.mechanics.dynamics.load_case import (
     dynamic_motion,
     static_motion,
 )
-from limber.mechanics.dynamics.motion import (
-    EnergyMomentumSettings,
-    MotionSettings,
-    NewmarkSettings,
-)
+from limber.mechanics.dynamics.motion import EnergyMomentumSettings, MotionSettings, NewmarkSettings
 from limber.mechanics.dynamics.pose_table import PoseTable
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel

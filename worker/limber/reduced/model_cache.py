@@ -28,7 +28,9 @@ from limber.core.files.reading import read_arrays
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.reduced.reduced_model import FORMAT, ReducedModel, build_reduced
+from limber.reduced.building import build_reduced
+from limber.reduced.model_file import FORMAT, read_model, write_model
+from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Snapshots, TrainingSettings
 
@@ -77,7 +79,7 @@ class ReducedCache:
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def path(self, key: str) -> Path:
-        """Return the file of a model; :meth:`ReducedModel.read` reads it."""
+        """Return the file of a model; :func:`read_model` reads it."""
         return self.folder / f"{key}.npz"
 
     def load(self, key: str) -> tuple[ReducedModel, Snapshots] | None:
@@ -92,7 +94,7 @@ class ReducedCache:
             held = {name.removeprefix(SNAPSHOT_PREFIX): values
                     for name, values in read_arrays(path, "a reduced model").items()
                     if name.startswith(SNAPSHOT_PREFIX)}
-            found = ReducedModel.read(path), Snapshots.from_arrays(held)
+            found = read_model(path), Snapshots.from_arrays(held)
         except (InputError, OSError, ValueError, KeyError, TypeError) as error:
             self._progress.warn(f"{path.name} in the cache of reduced models was damaged"
                       f" ({type(error).__name__}); it is removed, and the model learnt again")
@@ -108,8 +110,8 @@ class ReducedCache:
         path = self.path(key)
         part = path.with_suffix(f".{os.getpid()}.part")
         try:
-            reduced.write(part, {SNAPSHOT_PREFIX + name: array
-                                 for name, array in snapshots.arrays().items()})
+            write_model(reduced, part, {SNAPSHOT_PREFIX + name: array
+                                        for name, array in snapshots.arrays().items()})
             os.replace(part, path)
         finally:
             part.unlink(missing_ok=True)

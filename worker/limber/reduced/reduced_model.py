@@ -3,7 +3,7 @@
 Full solutions span a subspace (limber.reduced.basis) in which the StVK force is a cubic
 polynomial (limber.reduced.strain_polynomial). ::
 
-    reduced = build_reduced(model, grasp, weights, control_young)
+    reduced = build_reduced(model, grasp, weights, control_young)  # limber.reduced.building
     state = reduced.with_young(young).solve_static(pose)
     state.strain_energy, state.reaction_force, reduced.displacement(state)
 
@@ -12,40 +12,21 @@ How far to trust it: :mod:`limber.reduced.refresh`.
 
 import copy
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_arrays
 from limber.core.numerics.rigid import pose_between
 from limber.core.present import present
-from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.materials.materials import RayleighDamping
-from limber.mechanics.model import BranchModel
-from limber.reduced.basis import Basis, GraspCoordinates, make_basis
-from limber.reduced.state import (
-    ReducedSensitivities,
-    ReducedSettings,
-    ReducedState,
-    ReducedStaticSettings,
-)
-from limber.reduced.strain_polynomial import (
-    StrainPolynomial,
-    evaluate_strain,
-    make_polynomial,
-    reduced_mass,
-    strain_only,
-)
-from limber.reduced.training import Snapshots, Trainer, sample_poses, sample_young
+from limber.reduced.basis import Basis, GraspCoordinates
+from limber.reduced.state import ReducedSensitivities, ReducedState, ReducedStaticSettings
+from limber.reduced.strain_polynomial import StrainPolynomial, evaluate_strain, strain_only
 from limber.reduced.training_poses import TrainingPoses
 
-FORMAT = 4
 _STATIC = ReducedStaticSettings()
-_DEFAULT = ReducedSettings()
 _NO_INCREMENT = np.empty(0)
 _LOST = 0.25
 """Part of the potential's change in a step that its work may leave open before the step is taken
@@ -408,54 +389,6 @@ class ReducedModel:
         wrench = self.held.by_pose(pose).T @ out[:self.basis.lift_count]
         return wrench[:3], wrench[3:] if len(wrench) == 6 else np.zeros(3)
 
-    def write(self, path: Path, beside: Mapping[str, np.ndarray] | None = None) -> None:
-        """Write the model as plain arrays (npz, nothing pickled); ``beside`` goes into the file
-        too, under names that begin with ``snapshot_``, which :meth:`read` leaves alone."""
-        arrays = {
-            "format": FORMAT, "grasp_nodes": self.grasp.nodes, "grasp_weights": self.grasp.weights,
-            "grasp_centre": self.grasp.centre, "grasp_mode": self.grasp.mode, "rest": self.rest,
-            "columns": self.basis.columns, "lift_count": self.basis.lift_count,
-            "states": self.basis.states, "captured": self.basis.captured, "reach": self.basis.reach,
-            **{f"polynomial_{k}": v for k, v in vars(self.polynomial).items()},
-            "load": self.load, "weight_stiffness": self.weight_stiffness, "mass": self.mass,
-            "damping": [self.damping.mass, self.damping.stiffness],
-            "control_young": self.control_young, "poses": self.poses,
-            "training_young": self.training_young, "energies": self.energies,
-            "young_spread": self.young_spread, "extent": self.extent,
-            "error_names": list(self.error), "error_values": list(self.error.values())}
-        if self.strain_fields is not None:
-            arrays["strain_fields"] = self.strain_fields
-        with open(path, "wb") as stream:
-            np.savez(stream, **arrays, **(beside or {}))
-
-    @classmethod
-    def read(cls, path: Path) -> "ReducedModel":
-        """Read a model that :meth:`write` wrote.
-
-        Raises:
-            InputError: it is not one, or of another format.
-        """
-        arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
-                  if not name.startswith("snapshot_")}
-        if int(arrays.get("format", -1)) != FORMAT:
-            raise InputError(f"{path} has another format.", "", "Build it again.")
-        grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
-                      "pinned" if str(arrays["grasp_mode"]) == "pinned" else "clamped")
-        basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
-                      float(arrays["captured"]), arrays["reach"])
-        linear, quadratic, by_lambda, by_mu = (
-            arrays[f"polynomial_{name}"] for name in ("linear", "quadratic", "by_lambda", "by_mu"))
-        polynomial = StrainPolynomial(linear, quadratic, by_lambda, by_mu,
-                                      float(arrays["polynomial_poisson"]))
-        error = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
-                         strict=True))
-        return cls(grasp, arrays["rest"], basis, polynomial, arrays["load"],
-                   arrays["weight_stiffness"], arrays["mass"],
-                   RayleighDamping(*arrays["damping"]), arrays["control_young"],
-                   arrays["poses"], arrays["training_young"], arrays["energies"],
-                   float(arrays["young_spread"]), float(arrays["extent"]), error,
-                   strain_fields=arrays.get("strain_fields"))
-
 
 @dataclass(frozen=True)
 class _Found:
@@ -476,63 +409,6 @@ class _Found:
         return not self.converged, self.novelty >= settings.novelty_limit, self.potential
 
 
-def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
-                  control_young: np.ndarray,
-                  settings: ReducedSettings = _DEFAULT,
-                  progress: Progress = SILENT) -> tuple[ReducedModel, Snapshots]:
-    """Solve the full model at training grasps and make the reduced model of them.
-
-    Args:
-        model: The branch (St. Venant-Kirchhoff).
-        grasp: The patch that is held, clamped or pinned.
-        weights: From control points to tetrahedra, shape [tet_count, K]
-            (limber.mechanics.young_weights).
-        control_young: Young's modulus at the control points [Pa], shape [K].
-
-    Raises:
-        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
-    """
-    training = settings.training
-    rng = np.random.default_rng(training.seed)
-    trainer = Trainer(model, grasp, weights, control_young,
-                      young_tangents=training.young_spread > 1)
-    poses = sample_poses(model, grasp, training.grasp_count, rng, training)
-    young = sample_young(control_young, len(poses), rng, training.young_spread)
-    snapshots = trainer.take(poses, young, vibration_every=training.vibration_every,
-                             vibration_count=training.vibration_count,
-                             progress=progress.part(0.0, 0.9))
-    progress(0.9, "reducing", snapshots=len(snapshots))
-    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings,
-                               keeps_strain=True)
-    progress(1.0, "reduced model ready", size=reduced.size)
-    return reduced, snapshots
-
-
-def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
-                     control_young: np.ndarray, snapshots: Snapshots,
-                     settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
-    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`.
-
-    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is wanted, which doubles its size.
-    """
-    control_young = np.asarray(control_young, float)
-    if not settings.vibration_count:
-        snapshots = snapshots.without_vibrations()
-    basis = make_basis(model, grasp, snapshots, settings.size,
-                       settings.vibration_count if len(snapshots.vibrations) else 0)
-    polynomial, fields = make_polynomial(model, basis, weights, control_young, snapshots,
-                                         settings.field_count, keeps_fields=keeps_strain)
-    flat = basis.columns.reshape(basis.size, -1)
-    spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
-    weight = model.weight_stiffness
-    carried = np.zeros((basis.size, basis.size)) if weight is None else flat @ np.array(
-        [weight @ column for column in basis.columns]).reshape(basis.size, -1).T
-    return ReducedModel(
-        grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(), carried,
-        reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
-        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent, strain_fields=fields)
-
-
 def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:
     """Solve with the lower triangle; raise the diagonal until it is positive definite.
 
@@ -550,23 +426,3 @@ def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bo
             return solution, False
         shift *= 4
     return np.full(len(right), np.nan), False
-
-
-def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
-
-    Control points are the mesh's; where the field is not what they can give (or there are none)
-    it becomes one region with its own pattern, and only its level can change.
-    """
-    from limber.mechanics.materials.young_field import young_weights
-
-    marks = model.mesh.point_data.get("control_point")
-    if marks is not None and (marks >= 0).any():
-        order = np.argsort(marks[marks >= 0])
-        points = model.mesh.nodes[np.flatnonzero(marks >= 0)[order]]
-        weights = young_weights(model.mesh, points)
-        young = np.linalg.lstsq(weights, model.young, rcond=None)[0]
-        if (young > 0).all() and np.abs(weights @ young / model.young - 1).max() < 1e-6:
-            return weights, young
-    level = float(model.young.mean())
-    return (model.young / level)[:, None], np.array([level])

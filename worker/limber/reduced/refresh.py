@@ -18,13 +18,9 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.problem import StaticProblem, make_result
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult
 from limber.mechanics.status import Status
-from limber.reduced.reduced_model import (
-    ReducedModel,
-    ReducedSettings,
-    ReducedState,
-    build_reduced,
-    reduce_snapshots,
-)
+from limber.reduced.building import build_reduced, reduce_snapshots
+from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.state import ReducedSettings, ReducedState
 from limber.reduced.training import Snapshots, Trainer
 
 _CORRECTIONS = 4

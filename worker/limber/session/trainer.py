@@ -30,6 +30,7 @@ from limber.core.errors import Cancelled, LimberError
 from limber.core.json_values import plain
 from limber.core.progress import JsonSink, Progress
 from limber.mechanics.grasp import Grasp
+from limber.reduced.building import as_control_points
 from limber.reduced.model_cache import (
     LearntModel,
     ReducedCache,
@@ -37,7 +38,6 @@ from limber.reduced.model_cache import (
     learnt_model,
     model_key,
 )
-from limber.reduced.reduced_model import as_control_points
 from limber.reduced.refresh import RefreshingModel
 from limber.session.opening import load_held, reduced_settings
 from limber.session.settings import SessionSettings

@@ -16,6 +16,7 @@ from limber.core.errors import LimberError
 from limber.core.json_lines import json_objects
 from limber.core.present import present
 from limber.mechanics.grasp import Grasp
+from limber.reduced.model_file import read_model
 from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.state import ReducedState
 from limber.session.settings import SessionSettings
@@ -136,7 +137,7 @@ class Learning:
 
     def _adopt(self, content: dict[str, Any]) -> None:
         try:
-            model = ReducedModel.read(Path(content.pop("path")))
+            model = read_model(Path(content.pop("path")))
         except LimberError as error:
             self._say(event="warning", message=f"the reduced model was lost: {error}")
             return

@@ -28,7 +28,10 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.forward.reduced_pull import ReducedForward
 from limber.estimation.parameters import Values
 from limber.recordings.recorded_grasp import pose_on
-from limber.reduced.reduced_model import ReducedModel, ReducedSettings, reduce_snapshots
+from limber.reduced.building import reduce_snapshots
+from limber.reduced.model_file import read_model, write_model
+from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Trainer, TrainingSettings, sample_poses, sample_young
 
 # Sizes and limits are chosen; the model's error is measured by every fit and corrected, so that
@@ -111,7 +114,7 @@ class Reduction:
         for place, basis in zip(self.paths, self.bases, strict=True):
             if place is not None:
                 part = place.with_suffix(".part")
-                basis.write(part)
+                write_model(basis, part)
                 part.replace(place)
 
 
@@ -246,7 +249,7 @@ def _read(path: Path | None, forward: QuasiStaticForward) -> ReducedModel | None
     if path is None or not path.is_file():
         return None
     try:
-        found = ReducedModel.read(path)
+        found = read_model(path)
     except (InputError, KeyError):
         # Cut short, or of an older version: it is made anew.
         return None

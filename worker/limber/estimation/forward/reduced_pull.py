@@ -15,7 +15,8 @@ from limber.mechanics.points import point_operator
 from limber.recordings.recorded_grasp import pose_on
 from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
-from limber.reduced.reduced_model import ReducedModel, ReducedSensitivities, ReducedState
+from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.state import ReducedSensitivities, ReducedState
 
 STEPS = {"poisson": 2e-3, "density": 2e-2}
 """Steps of the central differences for what the reduced model has no derivatives to."""

@@ -24,7 +24,8 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
 from limber.recordings.recorded_grasp import pose_on
 from limber.recordings.recording import GraspEntry
-from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
+from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.state import ReducedState, ReducedStaticSettings
 
 STEP_LIMIT = 0.7
 """Largest change of a log E by one frame."""

@@ -25,7 +25,9 @@ from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import Observations, Pull, read_pull
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import frames_of
-from limber.reduced.reduced_model import ReducedModel, ReducedSettings, build_reduced
+from limber.reduced.building import build_reduced
+from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.state import ReducedSettings
 from limber.reduced.training import TrainingSettings
 
 SAID = {

@@ -9,13 +9,7 @@ from limber.core.constants import FOUND_SKELETON
 from limber.core.numerics.rigid import principal_axes
 from limber.geometry.io.clouds import read_cloud
 from limber.geometry.skeleton.edits import differing
-from limber.geometry.skeleton.skeleton import (
-    BRIDGED,
-    INTERPOLATED,
-    LIMITED,
-    UNRESOLVED,
-    Skeleton,
-)
+from limber.geometry.skeleton.skeleton import BRIDGED, INTERPOLATED, LIMITED, UNRESOLVED, Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loads.loaded_branch import NamedTarget
 from limber.results.scene.arrays import SceneData
