@@ -53,7 +53,7 @@ def test_elimination_equals_the_effective_variance(small_bench, noisy):
     objective = small_bench.objective([noisy], SETTINGS)
     evaluation = objective.evaluate(np.log(1.1 * TRUTH), jacobian=True)
     forward = objective.forwards[0]
-    rows, _ = objective._rows(0, evaluation.pulls[0])
+    rows, _ = objective._residuals[0].rows(evaluation.pulls[0])
     points = evaluation.pulls[0].positions.size
     sigma = noisy.entry.sensor.position_sigma_m
     through = forward.response.points.reshape(points, -1) / sigma

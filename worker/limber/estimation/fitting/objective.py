@@ -11,11 +11,10 @@ from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
+from limber.estimation.fitting.residuals import Residuals, seen_in
 from limber.estimation.forward.forward_model import Forward, Simulated
-from limber.estimation.forward.input_force import Response
 from limber.estimation.forward.observed_path import is_watched
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.recordings.synchronisation import Frames
 
 FAILED_OBJECTIVE = 1e12
 """Objective of parameters under which the simulation finds no equilibrium."""
@@ -118,8 +117,8 @@ class Objective:
         self._progress = progress
         self._expected = expected_count
         self._last: Evaluation | None = None
-        self._whitening = [_whitening(forward.frames) for forward in forwards]
-        self._spans: dict[int, tuple[Response, np.ndarray, np.ndarray]] = {}
+        self._residuals = [Residuals(*each) for each in zip(forwards, self.force_sigma,
+                                                            strict=True)]
         self.cell_errors = CellErrors(forwards)
 
     def with_space(self, space: ParameterSpace) -> "Objective":
@@ -178,17 +177,13 @@ class Objective:
 
     def standardised(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per pull: residuals over deviations of points [f, m, 3] and force [f, 3]; NaN: none."""
-        return [(self._points(index, simulated), self._forces(index, simulated))
-                for index, simulated in enumerate(evaluation.pulls)]
+        return [(each.points(simulated), each.forces(simulated))
+                for each, simulated in zip(self._residuals, evaluation.pulls, strict=True)]
 
     def scored(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per pull: standardised residual of each point [f, m] (RMS of axes) and force [f]."""
-        scored = []
-        for index, simulated in enumerate(evaluation.pulls):
-            points = self._points(index, simulated)
-            scored.append((np.sqrt(np.mean(points**2, axis=2)),
-                           np.sqrt(np.mean(self._forces(index, simulated)**2, axis=1))))
-        return scored
+        return [(np.sqrt(np.mean(points**2, axis=2)), np.sqrt(np.mean(forces**2, axis=1)))
+                for points, forces in self.standardised(evaluation)]
 
     def follow_forces(self, evaluation: Evaluation) -> bool:
         """Move measured input forces to where an evaluation says they were.
@@ -199,7 +194,7 @@ class Objective:
         for index, forward in enumerate(self.forwards):
             if forward.response is None or forward.watches_pose:
                 continue
-            forward.shift_force(self._force_change(index, evaluation.pulls[index]))
+            forward.shift_force(self._residuals[index].force_change(evaluation.pulls[index]))
             moved = True
         if moved:
             self.forget()
@@ -220,7 +215,8 @@ class Objective:
             if found is None:
                 break
             # Linear in what is left of the way, the comparison has it already.
-            changes = [self._force_change(index, found.pulls[index]) for index in settling]
+            changes = [self._residuals[index].force_change(found.pulls[index])
+                       for index in settling]
             moved = max(forward.moved_by(change)
                         for forward, change in zip(settling.values(), changes, strict=True))
             if moved < SETTLED_FORCE_M:
@@ -255,28 +251,20 @@ class Objective:
         pulls = [pull for pull in found if pull is not None]
         return None if len(pulls) < len(found) else self._compare(free, pulls)
 
-    def _force_change(self, index: int, simulated: Simulated) -> np.ndarray:
-        """How the unknowns of a pull's force would have to change to explain its residuals."""
-        columns, triangle = self._span(
-            index, present(self.forwards[index].response, "response of the pull to its force"))
-        residual, _ = self._rows(index, simulated)
-        return -np.linalg.lstsq(triangle, columns.T @ residual, rcond=1e-9)[0]
-
     def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
         residuals, jacobians, columns, slopes, unknown_count = [], [], [], [], 0
         with_errors = self.cell_errors.count > 0
         for index, simulated in enumerate(pulls):
-            residual, jacobian = self._rows(index, simulated)
-            # What another force would explain is no sign of the moduli.
-            response = self.forwards[index].response
-            span = None if response is None else self._span(index, response)[0]
-            unknown_count += 0 if span is None else span.shape[1]
-            residuals.append(_beside(residual, span))
+            compared = self._residuals[index]
+            residual, jacobian = compared.rows(simulated)
+            span = compared.span()
+            unknown_count += 0 if span is None else span[0].shape[1]
+            residuals.append(compared.beside(residual))
             if jacobian is not None:
-                jacobians.append(_beside(jacobian, span))
+                jacobians.append(compared.beside(jacobian))
             if with_errors:
                 of_errors, by_errors = self._by_errors(index, simulated)
-                columns.append(_beside(by_errors, span))
+                columns.append(compared.beside(by_errors))
                 slopes.append(of_errors)
         residual = np.concatenate(residuals)
         jacobian = self.on_free(np.vstack(jacobians)) if jacobians else None
@@ -291,7 +279,7 @@ class Objective:
         residual = np.concatenate([residual, rows @ free - offsets])
         jacobian = None if jacobian is None else np.vstack([jacobian, rows])
         loss = sum(float(np.sum((pull.positions - forward.frames.positions)[
-            _seen(forward.frames)]**2)) for pull, forward in zip(pulls, self.forwards,
+            seen_in(forward.frames)]**2)) for pull, forward in zip(pulls, self.forwards,
                                                                 strict=True))
         return Evaluation(free, residual, jacobian, loss, tuple(pulls), unknown_count, errors)
 
@@ -302,24 +290,15 @@ class Objective:
             evaluation: With derivatives.
         """
         found = []
-        for index, (forward, simulated) in enumerate(
-                zip(self.forwards, evaluation.pulls, strict=True)):
-            residual, jacobian = self._rows(index, simulated)
-            seen, force, torque = self._known(index, simulated.torques is not None)
-            kinds = ["noise of the points"] * (3 * int(seen.sum()))
-            kinds += ["noise of the force"] * (3 * sum(
-                int(known.sum()) for known in (force, torque) if known is not None))
-            if forward.compares_grasp:
-                kinds += ["single poses of the gripper"] * (3 * len(forward.frames))
+        for index, simulated in enumerate(evaluation.pulls):
+            residual, jacobian = self._residuals[index].rows(simulated)
             errors = (self._by_errors(index, simulated)[1] if self.cell_errors.count
-                      else np.zeros((len(kinds), 0)))
-            response = None
-            if forward.response is not None:
-                span, triangle = self._span(index, forward.response)
-                response = span @ triangle
+                      else np.zeros((len(residual), 0)))
+            span = self._residuals[index].span()
             found.append(RawSlopes(
-                self.on_free(present(jacobian, "derivative of this evaluation")), errors, response,
-                residual, kinds))
+                self.on_free(present(jacobian, "derivative of this evaluation")), errors,
+                None if span is None else span[0] @ span[1], residual,
+                self._residuals[index].kinds(simulated)))
         return found
 
     def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
@@ -333,15 +312,13 @@ class Objective:
             changes: Of each pull's predicted measurements.
         """
         rows, columns = [], []
-        for index, (piece, simulated, change) in enumerate(zip(
-                self.raw_slopes(evaluation), evaluation.pulls, changes, strict=True)):
-            row = self._standardised_slopes(
-                index, change.points, change.forces,
-                None if simulated.torques is None else change.torques, change.grasps)
-            response = self.forwards[index].response
-            span = None if response is None else self._span(index, response)[0]
-            rows.append(_beside(row, span))
-            columns.append(_beside(piece.errors, span))
+        for compared, piece, simulated, change in zip(
+                self._residuals, self.raw_slopes(evaluation), evaluation.pulls, changes,
+                strict=True):
+            rows.append(compared.beside(compared.slopes(
+                change.points, change.forces,
+                None if simulated.torques is None else change.torques, change.grasps)))
+            columns.append(compared.beside(piece.errors))
         found = np.vstack(rows)
         if self.cell_errors.count:
             _, left, _ = eliminated(np.zeros(len(found)), found, np.vstack(columns))
@@ -352,89 +329,13 @@ class Objective:
         """What errors of cell and sensors do to a pull, and to its standardised residuals."""
         found = self.cell_errors.slopes(index, simulated.positions, simulated.forces)
         torques = None if simulated.torques is None else found.torques
-        return found, self._standardised_slopes(index, found.points, found.forces, torques,
-                                                found.grasps)
-
-    def _rows(self, index: int, simulated: Simulated) -> tuple[np.ndarray, np.ndarray | None]:
-        """Standardised residuals of a pull's points, forces and torques, and their derivative."""
-        seen, force, torque = self._known(index, simulated.torques is not None)
-        forward = self.forwards[index]
-        residual = [self._points(index, simulated)[seen].ravel()]
-        if force is not None:
-            residual.append(self._forces(index, simulated)[force].ravel())
-        if torque is not None:
-            off = simulated.torques - forward.frames.wrenches[:, 3:]
-            residual.append((off / self._torque_sigma(index)[:, None])[torque].ravel())
-        if forward.compares_grasp:
-            off = simulated.grasps - forward.frames.poses[:, :3]
-            residual.append((off / forward.pose_sigma).ravel())
-        if simulated.d_positions is None:
-            return np.concatenate(residual), None
-        return np.concatenate(residual), self._standardised_slopes(
-            index, simulated.d_positions,
-            present(simulated.d_forces, "derivative of the force"), simulated.d_torques,
-            simulated.d_grasps)
-
-    def _standardised_slopes(self, index: int, points: np.ndarray, forces: np.ndarray,
-                             torques: np.ndarray | None, grasps: np.ndarray | None,
-                             ) -> np.ndarray:
-        seen, force, torque = self._known(index, torques is not None)
-        slope = np.einsum("fmij,fmjp->fmip", self._whitening[index], points)
-        rows = [slope[seen].reshape(-1, slope.shape[-1])]
-        if force is not None:
-            slope = forces / self._sigma(index)[:, None, None]
-            rows.append(slope[force].reshape(-1, slope.shape[-1]))
-        if torque is not None:
-            slope = torques / self._torque_sigma(index)[:, None, None]
-            rows.append(slope[torque].reshape(-1, slope.shape[-1]))
-        if self.forwards[index].compares_grasp:
-            slope = present(grasps, "derivative of the grasp's place") / (
-                self.forwards[index].pose_sigma)
-            rows.append(slope.reshape(-1, slope.shape[-1]))
-        return np.vstack(rows)
-
-    def _known(self, index: int, has_torque: bool,
-               ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-        """Which points, forces and torques were measured; None: they are not compared."""
-        forward = self.forwards[index]
-        measured = np.isfinite(forward.frames.wrenches)
-        return (_seen(forward.frames),
-                measured[:, :3].all(axis=1) if forward.uses_force else None,
-                measured[:, 3:].all(axis=1) if has_torque else None)
-
-    def _span(self, index: int, response: Response) -> tuple[np.ndarray, np.ndarray]:
-        """Orthonormal columns of all that a pull's input force can change, and their triangle."""
-        known = self._spans.get(index)
-        if known is None or known[0] is not response:
-            wrenches = response.wrenches
-            columns = self._standardised_slopes(
-                index, response.points, wrenches[:, :3],
-                wrenches[:, 3:] if wrenches.shape[1] == 6 else None, response.grasps)
-            known = self._spans[index] = (response, *np.linalg.qr(columns))
-        return known[1], known[2]
+        return found, self._residuals[index].slopes(found.points, found.forces, torques,
+                                                    found.grasps)
 
     def on_free(self, jacobian: np.ndarray) -> np.ndarray:
         """Derivatives to the free vector from those to the physical parameters, [r, p]."""
         count = len(self.space.groups)
         return np.hstack([jacobian[:, :count] @ self.space.membership, jacobian[:, count:]])
-
-    def _points(self, index: int, simulated: Simulated) -> np.ndarray:
-        off = simulated.positions - self.forwards[index].frames.positions
-        return np.einsum("fmij,fmj->fmi", self._whitening[index], off)
-
-    def _forces(self, index: int, simulated: Simulated) -> np.ndarray:
-        off = simulated.forces - self.forwards[index].frames.wrenches[:, :3]
-        return off / self._sigma(index)[:, None]
-
-    def _torque_sigma(self, index: int) -> np.ndarray:
-        forward = self.forwards[index]
-        counts = np.maximum(forward.frames.wrench_counts, 1)
-        return forward.entry.sensor.torque_sigma_nm / np.sqrt(counts)
-
-    def _sigma(self, index: int) -> np.ndarray:
-        counts = np.maximum(self.forwards[index].frames.wrench_counts, 1)
-        return self.force_sigma[index] / np.sqrt(counts)
-
 
 def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Simulated:
     """Return a pull as cell and sensors with these errors would show it."""
@@ -447,15 +348,6 @@ def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Sim
                    grasps=moved(simulated.grasps, slopes.grasps))
 
 
-def _beside(rows: np.ndarray, span: np.ndarray | None) -> np.ndarray:
-    """What a force's unknowns, whose orthonormal columns are ``span``, leave of rows."""
-    return rows if span is None else rows - span @ (span.T @ rows)
-
-
-def _seen(frames: Frames) -> np.ndarray:
-    return np.isfinite(frames.positions).all(axis=2)
-
-
 def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, str]:
     """By which factor each modulus may be wrong (95 %) if the fit ended here."""
     if found is None or found.jacobian is None:
@@ -465,12 +357,6 @@ def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, 
                                      for each in deviations)}
 
 
-def _whitening(frames: Frames) -> np.ndarray:
-    """Inverse square roots of the covariances, shape [f, m, 3, 3]."""
-    values, vectors = np.linalg.eigh(frames.covariance)
-    return np.einsum("fmij,fmj,fmkj->fmik", vectors, 1 / np.sqrt(values), vectors)
-
-
 def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
     """RMS distance [m] of points and RMS force error [N] of one pull that a fit did not see."""
     forward = objective.forwards[index]
@@ -478,7 +364,7 @@ def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float,
     if simulated is None:
         return np.inf, np.inf
     simulated = forward.under_readings(simulated)
-    off = (simulated.positions - forward.frames.positions)[_seen(forward.frames)]
+    off = (simulated.positions - forward.frames.positions)[seen_in(forward.frames)]
     force = simulated.forces - forward.frames.wrenches[:, :3]
     force = force[np.isfinite(force).all(axis=1)]
     return (float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan,
