@@ -12,13 +12,15 @@ average out as noise does.
 
 import time
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 
 from limber.core.present import present
-from limber.estimation.online.full_model import Beside, ExactFrame, Here
+from limber.estimation.online.corrections import COVERED, Corrections
+from limber.estimation.online.full_model import Beside, Here
+from limber.estimation.online.information import Information, Kept, OnlineFrame
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
@@ -35,10 +37,6 @@ intervals."""
 ENOUGH_DEVIATION = 0.02
 """Standard deviation of every log E at which another pull adds nothing that would matter: half a
 percent in a radius does as much."""
-UNCHECKED_ERROR = 0.3
-"""Error of the reduced model over the noise of a measurement, until it is measured."""
-COVERED = 0.1
-"""Part of the way that lies between frames of the full model at the end."""
 QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
 """A pose that takes more is out of the basis' reach, and another basis is on its way."""
 FRAME_ITERATIONS, NEAR_ITERATIONS = 12, 6
@@ -47,29 +45,10 @@ moduli a little different. Both take 4 as a rule; searches for a state that the 
 better took up to 41, longer than a frame."""
 FINAL_FRAMES = 300
 """So many frames at most are linearised again when the pull is over."""
-STALE = 0.25
-"""Change of a log E after which a frame of the full model is solved again at the end."""
 IDLE_DEVIATION = 0.3
 """Nothing is called idle before every log E is known to this: a pull begins slowly."""
 IDLE_GAIN = 0.01
 """Part by which the last tenth of the frames narrows an interval, below which it is idle."""
-
-
-@dataclass(frozen=True)
-class OnlineFrame:
-    """What was measured at one instant.
-
-    Attributes:
-        time: [s].
-        pose: Of the grasp point [m, rad], shape [6].
-        force: Gripper on branch [N], shape [3]; NaN where not measured.
-        positions: Observed points [m], shape [m, 3]; NaN where not seen.
-    """
-
-    time: float
-    pose: np.ndarray
-    force: np.ndarray
-    positions: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -95,36 +74,6 @@ class OnlineState:
     trusted: bool
     enough: bool
     idle: bool
-
-
-@dataclass
-class _Kept:
-    frame: OnlineFrame
-    state: ReducedState | None
-    centre: np.ndarray
-    normal: np.ndarray
-    gradient: np.ndarray
-    residual: float
-
-
-@dataclass
-class _Known:
-    normal: np.ndarray
-    gradient: np.ndarray
-    widths: list[np.ndarray] = field(default_factory=list)
-
-
-@dataclass
-class _Correction:
-    """Full model less reduced model at one frame; rows of points, then of the force."""
-
-    frame: OnlineFrame
-    centre: np.ndarray
-    rows: np.ndarray
-    slopes: np.ndarray
-
-    def at(self, log_young: np.ndarray) -> np.ndarray:
-        return self.rows + self.slopes @ (log_young - self.centre)
 
 
 class OnlineEstimator:
@@ -153,22 +102,17 @@ class OnlineEstimator:
         self._sigmas = np.r_[np.full(self.rest_points.size, position_sigma),
                              np.full(3, force_sigma)]
         self.log_young = np.log(reduced.control_young)
-        count = len(self.log_young)
-        self._prior = self.log_young.copy(), np.eye(count) / prior_deviation**2
-        self._kept: list[_Kept] = []
-        self._kept_count = kept_count
-        self._merged = _Known(np.zeros((count, count)), np.zeros(count))
+        self._information = Information(self.log_young, prior_deviation, kept_count)
+        self._widths: list[np.ndarray] = []
         self._turn = self.frame_count = self.refresh_count = 0
         self._last: ReducedState | None = None
         # What is compiled at its first call is not to hold up the first frame.
         reduced.solve_static(reduced.poses[0], settings=QUICK)
         self._exact = exact
-        self._corrections: list[_Correction] = []
-        self._asked: tuple[_Kept, Future] | None = None
+        self._corrections = Corrections(self._sigmas)
+        self._asked: tuple[Kept, Future] | None = None
         self._making: Future | None = None
-        self._surprises: list[float] = []
         self._lost: list[OnlineFrame] = []
-        self._past: list[OnlineFrame] = []
         self._retry: list[OnlineFrame] = []
         self._untrusted = self._since_basis = 0
 
@@ -180,16 +124,13 @@ class OnlineEstimator:
     @property
     def model_error(self) -> float:
         """Error of the model over the noise of a measurement, as the last full frames found it."""
-        if self._exact is None:
-            return 0.0
-        return float(np.sqrt(np.mean(np.square(self._surprises[-3:])))
-                     ) if self._surprises else UNCHECKED_ERROR
+        return 0.0 if self._exact is None else self._corrections.error
 
     @property
     def covariance(self) -> np.ndarray:
         """Of log E, shape [K, K]: of the noise, and of the model's error in all frames alike."""
         widened = 1 + self.frame_count * self.model_error**2
-        return widened * np.linalg.inv(self._normal_gradient()[0])
+        return widened * np.linalg.inv(self._information.normal_gradient(self.log_young)[0])
 
     @property
     def young(self) -> np.ndarray:
@@ -208,13 +149,13 @@ class OnlineEstimator:
         if kept is None:
             # Out of the basis' reach: a basis made again may know it.
             self._lost.append(frame)
-            if self._kept:
+            if self._information.kept:
                 self._ask()
             return self._state(frame.time, np.nan, False)
         state = present(kept.state, "state of the frame")
         self._untrusted += not state.trusted
         self._last = state
-        self._keep(kept)
+        self._information.add(kept)
         self._step()
         self._ask()
         # A second one takes as long as this very frame's, but for the iterations.
@@ -222,14 +163,14 @@ class OnlineEstimator:
         fitting = int(min(left / state.seconds * state.iterations, FRAME_ITERATIONS))
         if self._retry and fitting >= 2 * NEAR_ITERATIONS:
             self._try_again(_within(fitting))
-        elif len(self._kept) > 1 and fitting >= NEAR_ITERATIONS:
+        elif len(self._information.kept) > 1 and fitting >= NEAR_ITERATIONS:
             self._relinearise(_within(fitting))
             self._step()
         return self._state(frame.time, kept.residual, state.trusted)
 
     def settle(self) -> OnlineState | None:
         """Wait for the full model, linearise all frames again; None before any frame."""
-        if not self._kept:
+        if not self._information.kept:
             return None
         if self._exact is not None:
             self._await()
@@ -248,7 +189,7 @@ class OnlineEstimator:
                     break
                 self._await()
         self._linearise_all()
-        last = self._kept[-1]
+        last = self._information.kept[-1]
         return self._state(last.frame.time, last.residual,
                            present(last.state, "state of the last frame").trusted)
 
@@ -259,17 +200,18 @@ class OnlineEstimator:
         if found is None:
             self._lost.append(frame)
         else:
-            self._keep(found)
+            self._information.add(found)
             self._step()
 
     def _linearise_all(self) -> None:
         """Put in place of what was merged on the way the frames themselves, as seen from now."""
-        states = {id(kept.frame): kept.state for kept in self._kept}
-        frames = sorted([*(kept.frame for kept in self._kept), *self._past, *self._lost],
+        states = {id(kept.frame): kept.state for kept in self._information.kept}
+        known = self._information
+        frames = sorted([*(kept.frame for kept in known.kept), *known.past, *self._lost],
                         key=lambda frame: frame.time)
         chosen = np.unique(np.linspace(0, len(frames) - 1, FINAL_FRAMES).round().astype(int))
         weight = len(frames) / len(chosen)
-        kept: list[_Kept] = []
+        kept: list[Kept] = []
         for _ in range(6):
             before, kept, state = self.log_young.copy(), [], None
             for index in chosen:
@@ -279,8 +221,7 @@ class OnlineEstimator:
                     state = states[id(frame)] = found.state
                     kept.append(replace(found, normal=weight * found.normal,
                                         gradient=weight * found.gradient))
-            self._kept, self._past = kept, []
-            self._merged.normal[:], self._merged.gradient[:] = 0.0, 0.0
+            self._information.replace(kept)
             self._step()
             if np.abs(self.log_young - before).max() < 1e-3:
                 break
@@ -309,10 +250,10 @@ class OnlineEstimator:
             if making.exception() is None:
                 self._use(making.result())
                 self.refresh_count += 1
-                self._corrections.clear()
+                self._corrections.forget()
                 self._last, self._untrusted, self._since_basis = None, 0, 0
                 # What is known stays known; its coordinates belong to the old basis.
-                for old in self._kept:
+                for old in self._information.kept:
                     old.state = None
                 self._retry, self._lost = self._retry + self._lost, []
         if self._asked is None or not self._asked[1].done():
@@ -325,12 +266,7 @@ class OnlineEstimator:
         reduced = self._answer(kept.frame, kept.state, found.log_young, _within(FRAME_ITERATIONS))
         if reduced is None:
             return
-        rows, slopes = _stacked(found)
-        new = _Correction(kept.frame, found.log_young, rows - reduced[1], slopes - reduced[2])
-        foretold = self._correction(kept.frame, found.log_young)[0]
-        self._surprises.append(float(np.sqrt(np.mean(((new.rows - foretold) / self._sigmas)**2))))
-        self._corrections = [old for old in self._corrections if old.frame is not kept.frame]
-        self._corrections.append(new)
+        self._corrections.add(kept.frame, found, *reduced[1:])
 
     def _ask(self, whole: bool = False) -> bool:
         """Have the kept frame solved that lies farthest from those that were; whether one was."""
@@ -339,44 +275,19 @@ class OnlineEstimator:
         if not whole and self._is_strange():
             self._making = self._exact.basis(self._spread_poses(), self.log_young.copy())
             return True
-        poses = np.array([kept.frame.pose[:3] for kept in self._kept])
-        far = np.full(len(poses), np.inf)
-        for known in self._corrections:
-            near = np.linalg.norm(poses - known.frame.pose[:3], axis=1)
-            if np.abs(known.centre - self.log_young).max() < STALE:
-                far = np.minimum(far, near)
-        far[[kept.state is None for kept in self._kept]] = -1.0
-        index = int(np.argmax(far))
-        if far[index] < 0:
+        chosen = self._corrections.wanted(self._information.kept, self.log_young)
+        if chosen is None:
             return False
-        if far[index] < COVERED * np.linalg.norm(np.ptp(poses, axis=0)):
-            return False
-        chosen = self._kept[index]
         start = self.reduced.displacement(present(chosen.state, "state of the frame"))
         self._asked = chosen, self._exact.frame(chosen.frame.pose, self.log_young.copy(), start)
         return True
 
     def _spread_poses(self) -> np.ndarray:
         """Poses spread over what has been seen, the lost ones among them."""
-        frames = sorted([*(kept.frame for kept in self._kept), *self._lost],
+        frames = sorted([*(kept.frame for kept in self._information.kept), *self._lost],
                         key=lambda frame: frame.time)
         chosen = np.unique(np.linspace(0, len(frames) - 1, 24).round().astype(int))
         return np.array([frames[index].pose for index in chosen])
-
-    def _correction(self, frame: OnlineFrame,
-                    log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Full less reduced model at a frame, from the two nearest at which it is known."""
-        count = len(self._sigmas)
-        if not self._corrections:
-            return np.zeros(count), np.zeros((count, len(log_young)))
-        far = np.array([np.linalg.norm(known.frame.pose[:3] - frame.pose[:3])
-                        for known in self._corrections])
-        near = np.argsort(far)[:2]
-        share = 1 / np.maximum(far[near], 1e-9)
-        share /= share.sum()
-        chosen = [self._corrections[index] for index in near]
-        return (sum(part * known.at(log_young) for part, known in zip(share, chosen, strict=True)),
-                sum(part * known.slopes for part, known in zip(share, chosen, strict=True)))
 
     def _answer(self, frame: OnlineFrame, start: ReducedState | None, log_young: np.ndarray,
                 settings: ReducedStaticSettings,
@@ -392,12 +303,12 @@ class OnlineEstimator:
                 np.vstack([self._observe @ slopes.coordinates, slopes.reaction_force]))
 
     def _linearised(self, frame: OnlineFrame, start: ReducedState | None,
-                    settings: ReducedStaticSettings) -> _Kept | None:
+                    settings: ReducedStaticSettings) -> Kept | None:
         found = self._answer(frame, start, self.log_young, settings)
         if found is None:
             return None
         state, rows, slopes = found
-        more, steeper = self._correction(frame, self.log_young)
+        more, steeper = self._corrections.at(frame, self.log_young)
         measured = np.r_[(frame.positions - self.rest_points).ravel(), frame.force]
         seen = np.isfinite(measured)
         off = ((rows + more - measured) / self._sigmas)[seen]
@@ -406,42 +317,18 @@ class OnlineEstimator:
         typical = max(1.0, 1.4826 * float(np.median(np.abs(off))) if len(off) else 1.0)
         weight = 1.0 / np.maximum(np.abs(off) / (4.0 * typical), 1.0)
         scaled = jacobian.T * weight
-        return _Kept(frame, state, self.log_young.copy(), scaled @ jacobian, scaled @ off,
+        return Kept(frame, state, self.log_young.copy(), scaled @ jacobian, scaled @ off,
                      float(np.sqrt(np.mean(off**2))) if len(off) else 0.0)
 
-    def _keep(self, new: _Kept) -> None:
-        self._kept.append(new)
-        self._kept.sort(key=lambda kept: kept.frame.time)
-        if len(self._kept) <= self._kept_count:
-            return
-        # The frame whose pose is nearest to its neighbours' says least of its own: it is merged.
-        poses = np.array([kept.frame.pose for kept in self._kept])
-        steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
-        gone = self._kept.pop(int(np.argmin(steps[:-1] + steps[1:])) + 1)
-        self._past.append(gone.frame)
-        self._merged.normal += gone.normal
-        self._merged.gradient += gone.gradient - gone.normal @ gone.centre
-
     def _relinearise(self, settings: ReducedStaticSettings) -> None:
-        self._turn = (self._turn + 1) % (len(self._kept) - 1)
-        old = self._kept[self._turn]
+        self._turn = (self._turn + 1) % (len(self._information.kept) - 1)
+        old = self._information.kept[self._turn]
         again = self._linearised(old.frame, old.state, settings)
         if again is not None:
-            self._kept[self._turn] = again
-
-    def _normal_gradient(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of all that is known, at the moduli of now."""
-        centre, precision = self._prior
-        normal = precision + self._merged.normal
-        gradient = precision @ (self.log_young - centre)
-        gradient = gradient + self._merged.gradient + self._merged.normal @ self.log_young
-        for kept in self._kept:
-            normal = normal + kept.normal
-            gradient = gradient + kept.gradient + kept.normal @ (self.log_young - kept.centre)
-        return normal, gradient
+            self._information.kept[self._turn] = again
 
     def _step(self) -> None:
-        normal, gradient = self._normal_gradient()
+        normal, gradient = self._information.normal_gradient(self.log_young)
         step = -np.linalg.solve(normal, gradient)
         step *= min(1.0, STEP_LIMIT / max(np.abs(step).max(), 1e-12))
         self.log_young = np.clip(self.log_young + step, *np.log(YOUNG_BOUNDS_PA))
@@ -451,14 +338,14 @@ class OnlineEstimator:
         width = scipy.special.ndtri(0.975) * deviation
         interval = np.exp(self.log_young[:, None] + np.column_stack([-width, width]))
         # Nobody knows before the first frames of the full model how far off the reduced one is.
-        checked = self._exact is None or len(self._surprises) >= 3
+        checked = self._exact is None or self._corrections.is_checked
         enough = bool(checked and deviation.max() < ENOUGH_DEVIATION)
         return OnlineState(time, self.young, interval, residual, trusted, enough, self._idle())
 
     def _idle(self) -> bool:
         """By the noise alone: what the full model says now and then is no frame's doing."""
-        widths = self._merged.widths
-        widths.append(np.sqrt(np.diag(np.linalg.inv(self._normal_gradient()[0]))))
+        widths = self._widths
+        widths.append(np.sqrt(np.diag(np.linalg.inv(self._information.normal_gradient(self.log_young)[0]))))
         unknown = self._lost or self._retry or self._is_strange()
         if len(widths) < 30 or (self._exact is not None and unknown):
             return False
@@ -468,8 +355,3 @@ class OnlineEstimator:
 
 def _within(iterations: int) -> ReducedStaticSettings:
     return replace(QUICK, iteration_limit=iterations)
-
-
-def _stacked(found: ExactFrame) -> tuple[np.ndarray, np.ndarray]:
-    return (np.r_[found.moved.ravel(), found.force],
-            np.vstack([found.d_moved.reshape(-1, found.d_moved.shape[-1]), found.d_force]))

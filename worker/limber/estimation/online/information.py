@@ -1,0 +1,90 @@
+"""What the frames of a pull say of the moduli: linearised, summed, and which are kept."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.reduced.state import ReducedState
+
+
+@dataclass(frozen=True)
+class OnlineFrame:
+    """What was measured at one instant.
+
+    Attributes:
+        time: [s].
+        pose: Of the grasp point [m, rad], shape [6].
+        force: Gripper on branch [N], shape [3]; NaN where not measured.
+        positions: Observed points [m], shape [m, 3]; NaN where not seen.
+    """
+
+    time: float
+    pose: np.ndarray
+    force: np.ndarray
+    positions: np.ndarray
+
+
+@dataclass
+class Kept:
+    """A frame as linearised at ``centre``, log E of shape [K].
+
+    Attributes:
+        state: The reduced model's; None: it belongs to another basis.
+        normal, gradient: Of half its squared residuals, shapes [K, K] and [K].
+        residual: Root mean square of the standardised residuals.
+    """
+
+    frame: OnlineFrame
+    state: ReducedState | None
+    centre: np.ndarray
+    normal: np.ndarray
+    gradient: np.ndarray
+    residual: float
+
+
+class Information:
+    """What is known of log E: a prior, frames that are kept, and what others said.
+
+    Args:
+        centre: Mean of the prior, shape [K].
+        deviation: Its standard deviation.
+        kept_count: Frames that are kept at most, to be linearised again.
+    """
+
+    def __init__(self, centre: np.ndarray, deviation: float, kept_count: int):
+        count = len(centre)
+        self._prior = centre.copy(), np.eye(count) / deviation**2
+        self._kept_count = kept_count
+        self.kept: list[Kept] = []
+        self.past: list[OnlineFrame] = []
+        self._normal, self._gradient = np.zeros((count, count)), np.zeros(count)
+
+    def add(self, new: Kept) -> None:
+        """Keep a frame; one that says little of its own is merged where they are too many."""
+        self.kept.append(new)
+        self.kept.sort(key=lambda kept: kept.frame.time)
+        if len(self.kept) <= self._kept_count:
+            return
+        # The frame whose pose is nearest to its neighbours' says least of its own: it is merged.
+        poses = np.array([kept.frame.pose for kept in self.kept])
+        steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        gone = self.kept.pop(int(np.argmin(steps[:-1] + steps[1:])) + 1)
+        self.past.append(gone.frame)
+        self._normal += gone.normal
+        self._gradient += gone.gradient - gone.normal @ gone.centre
+
+    def replace(self, kept: list[Kept]) -> None:
+        """Put these in place of all that was kept and merged."""
+        self.kept, self.past = kept, []
+        self._normal[:], self._gradient[:] = 0.0, 0.0
+
+    def normal_gradient(self, log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of all that is known, at these moduli: shapes [K, K] and [K]."""
+        centre, precision = self._prior
+        normal = precision + self._normal
+        gradient = precision @ (log_young - centre)
+        gradient = gradient + self._gradient + self._normal @ log_young
+        for kept in self.kept:
+            normal = normal + kept.normal
+            gradient = gradient + kept.gradient + kept.normal @ (log_young - kept.centre)
+        return normal, gradient
