@@ -86,64 +86,78 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     Raises:
         WorkError: no equilibrium at the start.
     """
-    lower, upper = objective.space.bounds()
-    start = np.clip(start, lower + 1e-6, upper - 1e-6)
-    size = len(_required(objective, start).residual)
-    # scipy takes the length of its first vector for the first step's limit: a change of the
-    # moduli by about a factor of e in all, where log E itself would allow any.
-    shift = start - FIRST_STEP / np.sqrt(len(start))
-
-    def residual(moved: np.ndarray) -> np.ndarray:
-        # Nearly every step is taken, and its derivative is cheapest right after the solve.
-        found = objective.evaluate(moved + shift, jacobian=True)
-        if found is None:
-            # Farther off than anything: the trust region shrinks.
-            return np.full(size, np.sqrt(FAILED_OBJECTIVE / size))
-        return found.residual
-
     # Far from the solution all residuals are large, and a robust loss would only slow the way.
     phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
     if robust and is_near:
         phases = phases[1:]
-
-    settles = any(forward.watches_pose for forward in objective.forwards)
-    shortest = WANDERING_STEP if settles else SETTLED_STEP
-
-    def minimised(moved: np.ndarray, loss: str, ending: float) -> "scipy.optimize.OptimizeResult":
-        def jacobian(moved: np.ndarray) -> np.ndarray:
-            found = _required(objective, moved + shift)
-            step, length = _wanted_step(found, loss)
-            aim = moved + shift + step
-            if length < shortest and np.all((lower < aim) & (aim < upper)):
-                raise _SettledError(moved)
-            return found.slopes
-
-        try:
-            return scipy.optimize.least_squares(
-                residual, moved, jacobian, bounds=(lower - shift, upper - shift), method="trf",
-                loss=loss, f_scale=OUTLYING, ftol=ending, xtol=SHORTEST_STEP, gtol=1e-12,
-                max_nfev=evaluation_limit)
-        except _SettledError as end:
-            return scipy.optimize.OptimizeResult(
-                x=end.moved, status=1, message="The step that is still wanted is shorter than "
-                f"{shortest:g} standard deviations.")
-
-    moved = start - shift
-    for loss, ending in phases:
-        found = minimised(moved, loss, ending)
+    search = _Search(objective, start, evaluation_limit)
+    moved = search.begin
+    for phase in phases:
+        found = search.minimised(moved, *phase)
         moved = found.x
     for _ in range(force_rounds):
         # Measured input forces are known better now, and so is what they do to the points.
-        if not objective.follow_forces(_required(objective, moved + shift)):
+        if not objective.follow_forces(search.at(moved)):
             break
-        before = _required(objective, moved + shift)
-        found = minimised(moved, *phases[-1])
+        before = search.at(moved)
+        found = search.minimised(moved, *phases[-1])
         away = before.jacobian @ (found.x - moved)
         moved = found.x
         if np.linalg.norm(away) < FORCE_SETTLED:
             break
     status = FitStatus.converged if found.status > 0 else FitStatus.out_of_evaluations
-    return Fit(_required(objective, found.x + shift), status, str(found.message))
+    return Fit(search.at(found.x), status, str(found.message))
+
+
+class _Search:
+    """Searches by scipy from vectors that are moved: it takes the length of the first for the
+    first step's limit, a change of the moduli by about a factor of e in all, where log E itself
+    would allow any.
+    """
+
+    def __init__(self, objective: Objective, start: np.ndarray, evaluation_limit: int):
+        self._objective, self._limit = objective, evaluation_limit
+        self._lower, self._upper = objective.space.bounds()
+        start = np.clip(start, self._lower + 1e-6, self._upper - 1e-6)
+        self._size = len(_required(objective, start).residual)
+        self._shift = start - FIRST_STEP / np.sqrt(len(start))
+        self.begin = start - self._shift
+        settles = any(forward.watches_pose for forward in objective.forwards)
+        self._shortest = WANDERING_STEP if settles else SETTLED_STEP
+
+    def at(self, moved: np.ndarray) -> Evaluation:
+        """Evaluate with derivatives."""
+        return _required(self._objective, moved + self._shift)
+
+    def minimised(self, moved: np.ndarray, loss: str,
+                  ending: float) -> "scipy.optimize.OptimizeResult":
+        """Return scipy's result from ``moved`` with a loss, to a relative change of cost."""
+        def jacobian(moved: np.ndarray) -> np.ndarray:
+            found = self.at(moved)
+            step, length = _wanted_step(found, loss)
+            aim = moved + self._shift + step
+            if length < self._shortest and np.all((self._lower < aim) & (aim < self._upper)):
+                raise _SettledError(moved)
+            return found.slopes
+
+        try:
+            return scipy.optimize.least_squares(
+                self._residual, moved, jacobian,
+                bounds=(self._lower - self._shift, self._upper - self._shift), method="trf",
+                loss=loss, f_scale=OUTLYING, ftol=ending, xtol=SHORTEST_STEP, gtol=1e-12,
+                max_nfev=self._limit)
+        except _SettledError as end:
+            return scipy.optimize.OptimizeResult(
+                x=end.moved, status=1, message="The step that is still wanted is shorter than "
+                f"{self._shortest:g} standard deviations.")
+
+    def _residual(self, moved: np.ndarray) -> np.ndarray:
+        # Nearly every step is taken, and its derivative is cheapest right after the solve.
+        found = self._objective.evaluate(moved + self._shift, jacobian=True)
+        if found is None:
+            # Farther off than anything: the trust region shrinks.
+            return np.full(self._size, np.sqrt(FAILED_OBJECTIVE / self._size))
+        return found.residual
 
 
 class _SettledError(Exception):

@@ -75,7 +75,8 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
         # It is being recorded now: what has been missed is caught up with.
         pace = np.inf
     states: list[OnlineState] = []
-    slowest, told, stopped = 0.0, set(), False
+    told: set[str] = set()
+    slowest, stopped = 0.0, False
     with Beside(begun.branch) as beside:
         estimator = begun.estimator(beside)
         try:
@@ -83,16 +84,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
                 started = time.perf_counter()
                 states.append(estimator.update(frame))
                 slowest = max(slowest, time.perf_counter() - started)
-                latest = states[-1]
-                progress(0.5 + 0.45 * share, "following", time_s=frame.time,
-                         young_mpa=" ".join(f"{young / 1e6:.4g}" for young in latest.young),
-                         young_factor=" ".join(
-                             f"{np.sqrt(high / low):.3g}" for low, high in latest.interval),
-                         enough=latest.enough)
-                for kind, is_so in (("enough", latest.enough), ("idle", latest.idle)):
-                    if is_so and kind not in told:
-                        progress.warn(f"{name}: {frame.time:.2f} s: {SAID[kind]}")
-                        told.add(kind)
+                _report(name, states[-1], share, told, progress)
             progress(0.95, "waiting for the full model")
             settled = estimator.settle()
             states += [settled] if settled is not None else []
@@ -110,6 +102,19 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
         "frame_count": estimator.frame_count, "stopped": stopped,
         "model_error": estimator.model_error, "refresh_count": estimator.refresh_count}
     return result, _history(states)
+
+
+def _report(name: str, state: OnlineState, share: float, told: set[str],
+            progress: Progress) -> None:
+    """Report how far a pull is known; ``told`` are the sentences that were said already."""
+    progress(0.5 + 0.45 * share, "following", time_s=state.time,
+             young_mpa=" ".join(f"{young / 1e6:.4g}" for young in state.young),
+             young_factor=" ".join(f"{np.sqrt(high / low):.3g}" for low, high in state.interval),
+             enough=state.enough)
+    for kind, is_so in (("enough", state.enough), ("idle", state.idle)):
+        if is_so and kind not in told:
+            progress.warn(f"{name}: {state.time:.2f} s: {SAID[kind]}")
+            told.add(kind)
 
 
 def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[str, Any]:
