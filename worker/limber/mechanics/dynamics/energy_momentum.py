@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.core.present import present
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.dynamics.stepper import Stepper
@@ -90,8 +89,7 @@ class EnergyMomentumStepper(Stepper):
                     and norms[-1] > 0.9 * min(norms[:-1])):
                 self._failed("the iteration does not converge")
                 return None
-            if increment is not None and norm <= max(settings.tolerance * reference,
-                                                     self._floor()):
+            if increment is not None and self._is_balanced(norm, reference):
                 return self._accepted(new, old, out)
             first = increment is None
             if first or (norm > _GOOD_TANGENT * norms[-1] and made < _FRESH):
@@ -104,9 +102,7 @@ class EnergyMomentumStepper(Stepper):
             if first and moved is not None:
                 residual = equations.free_part(
                     out - self._bearing.tangent_times(middle, moved))
-            increment = present(self.tangent, "tangent").solve(residual, pins)
-            if moved is not None and equations.held.any():
-                increment = increment + moved
+            increment = self._change(residual, moved, pins)
             moved, pins = None, np.zeros_like(pins)
             new.displacement = new.displacement + 2 * increment
         self._failed(f"no convergence in {settings.max_iterations} iterations")
@@ -174,18 +170,10 @@ class EnergyMomentumStepper(Stepper):
             return False
         return True
 
-    def _floor(self) -> float:
-        # Differences of displacements in an element carry round-off of about one unit each.
-        tangent = present(self.tangent, "tangent")
-        return 8 * float(np.finfo(float).eps) * tangent.diagonal_norm * self.model.mean_edge
-
-    def _failed(self, trouble: str) -> None:
-        self.trouble, self.status = trouble, Status.stalled
-
     def _accepted(self, new: MotionState, old: MotionState,
                   out: np.ndarray) -> MotionState | None:
         if self.model.internal(new.displacement).min_det_f <= 0:
-            self.trouble, self.status = "an element would turn inside out", Status.inverted
+            self._failed("an element would turn inside out", Status.inverted)
             return None
         self.status = Status.converged
         new.acceleration = (new.velocity - old.velocity) / new.step_before

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.core.present import present
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.dynamics.stepper import Stepper
@@ -60,10 +59,9 @@ class NewmarkStepper(Stepper):
                               + np.linalg.norm(out - residual))
             if not np.isfinite(norm) or (len(norms) > 4 and norm > 0.9 * min(norms)
                                          and norms[-1] > 0.9 * min(norms[:-1])):
-                self.trouble, self.status = "the iteration does not converge", Status.stalled
+                self._failed("the iteration does not converge")
                 return None
-            if increment is not None and norm <= max(settings.tolerance * reference,
-                                                     self._floor()):
+            if increment is not None and self._is_balanced(norm, reference):
                 if fresh:
                     self._tangent_error = norm / norms[-1] if norms[-1] else 0.0
                 return self._accepted(new, min_det_f)
@@ -81,14 +79,11 @@ class NewmarkStepper(Stepper):
             if first and moved is not None:
                 residual = equations.free_part(
                     out - model.tangent_times(old.displacement, moved, viscous))
-            increment = present(self.tangent, "tangent").solve(residual, pins)
-            if moved is not None and equations.held.any():
-                increment = increment + moved
+            increment = self._change(residual, moved, pins)
             moved, pins = None, np.zeros_like(pins)
             new.displacement = new.displacement + increment
             self._follow(old, new, dt)
-        self.trouble = f"no convergence in {settings.max_iterations} iterations"
-        self.status = Status.stalled
+        self._failed(f"no convergence in {settings.max_iterations} iterations")
         return None
 
     def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
@@ -119,8 +114,7 @@ class NewmarkStepper(Stepper):
                 self.model, new.displacement, increment=increment, viscous=viscous,
                 mass_factor=inertia + damping.mass * rate)
         except NotPositiveDefiniteError:
-            self.trouble = "the stiffness has no positive pivots"
-            self.status = Status.stalled
+            self._failed("the stiffness has no positive pivots")
             return False
         self._tangent_step = dt
         return True
@@ -133,14 +127,9 @@ class NewmarkStepper(Stepper):
             new.acceleration + self.model.damping.mass * new.velocity)
         return load - internal.force - inertial, inertial, internal.min_det_f
 
-    def _floor(self) -> float:
-        # Differences of displacements in an element carry round-off of about one unit each.
-        tangent = present(self.tangent, "tangent")
-        return 8 * float(np.finfo(float).eps) * tangent.diagonal_norm * self.model.mean_edge
-
     def _accepted(self, new: MotionState, min_det_f: float) -> MotionState | None:
         if min_det_f <= 0:
-            self.trouble, self.status = "an element would turn inside out", Status.inverted
+            self._failed("an element would turn inside out", Status.inverted)
             return None
         self.status = Status.converged
         return new
