@@ -14,9 +14,7 @@ from limber.core.numerics.compiled import for_kernels
 from limber.geometry.tets.mesh_checks import check_mesh, fixed_mask
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass, Tied, mass_entries, nodal_masses, tied
-from limber.mechanics.elements import shapes as elements
 from limber.mechanics.elements.forces import (
-    ForceLayout,
     internal_force,
     largest_stretch,
     sparse_times,
@@ -37,6 +35,7 @@ from limber.mechanics.materials.materials import (
     per_tet,
 )
 from limber.mechanics.materials.registry import material_named
+from limber.mechanics.mesh_data import MeshData
 from limber.mechanics.prestress import Hanging, carried
 
 _NO_MEMORY = np.zeros((0, 0, 6))
@@ -67,38 +66,6 @@ class InternalState:
     def energy(self) -> float:
         """Potential above the mesh's shape [J]: strain and, where it hangs so, its weight."""
         return self.strain_energy + self.weight_energy
-
-
-class _MeshData:
-    """What depends on the mesh alone; shared by all models of it."""
-
-    def __init__(self, mesh: TetMesh, fixed: np.ndarray):
-        self.fixed = fixed
-        self.equations: dict[tuple, Equations] = {}
-        self._place(mesh)
-
-    def _place(self, mesh: TetMesh) -> None:
-        self.mesh = mesh
-        self.tets = np.ascontiguousarray(mesh.tets, np.int32)
-        self.rule = elements.stiffness_quadrature(mesh)
-        self.gradients, self.weights = elements.element_gradients(mesh, self.rule)
-        self.layout = ForceLayout(self.tets, self.gradients, self.weights)
-        self.volume_weights = elements.volume_weights(mesh)
-        edge = mesh.nodes[mesh.tets[:, 1]] - mesh.nodes[mesh.tets[:, 0]]
-        self.edge = float(np.linalg.norm(edge, axis=1).mean())
-        self.extent = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
-
-    def __getstate__(self) -> dict[str, object]:
-        # Another process makes its own equations: their factors hold compiled memory.
-        return {**vars(self), "equations": {}}
-
-    def moved(self, nodes: np.ndarray) -> "_MeshData":
-        """Return the data of the mesh with other node positions; patterns are shared."""
-        other = copy.copy(self)
-        other._place(replace(self.mesh, nodes=nodes))
-        other.equations = {key: equations.placed(other.tets, other.gradients, other.weights)
-                           for key, equations in self.equations.items()}
-        return other
 
 
 class BranchModel:
@@ -138,7 +105,7 @@ class BranchModel:
                  damping: RayleighDamping = DEFAULT_DAMPING,
                  point_masses: Iterable[PointMass] = (), lumped_mass: bool = False):
         check_mesh(mesh)
-        self._data = _MeshData(mesh, fixed_mask(mesh, fixed))
+        self._data = MeshData(mesh, fixed_mask(mesh, fixed))
         self.gravity = np.zeros(3) if gravity is None else np.asarray(gravity, float)
         self.material = material_named(material)
         self.damping = damping
@@ -285,13 +252,7 @@ class BranchModel:
         Raises:
             InputError: a grasp lies in the fixed base, or two overlap.
         """
-        key = tuple(grasp.key() for grasp in grasps)
-        if key not in self._data.equations:
-            self._check_grasps(grasps)
-            data = self._data
-            data.equations[key] = Equations(data.tets, data.gradients, data.weights, data.fixed,
-                                            grasps)
-        return self._data.equations[key]
+        return self._data.equations_of(grasps)
 
     def internal(self, displacement: np.ndarray, *, viscous: Viscous | None = None,
                  lame_pair: tuple[np.ndarray, np.ndarray] | None = None) -> InternalState:
@@ -457,7 +418,9 @@ class BranchModel:
     def mass_matrix(self) -> sp.csr_matrix:
         """Mass matrix [kg] for each axis, shape [node_count, node_count]."""
         if "matrix" not in self._mass:
-            self._mass["matrix"] = self._make_mass_matrix()
+            matrix = self._data.mass_matrix(self.density, lumped=self.lumped_mass)
+            self._mass["matrix"] = (matrix + mass_entries(self._ties, self.mesh.node_count)
+                                    ).tocsr() if self.point_masses else matrix
         return self._mass["matrix"]
 
     def mass_times(self, field: np.ndarray) -> np.ndarray:
@@ -471,20 +434,6 @@ class BranchModel:
             self._mass["ties"] = tied(self.mesh, self.point_masses, data.gradients, data.weights,
                                       data.volume_weights)
         return self._mass["ties"]
-
-    def _make_mass_matrix(self) -> sp.csr_matrix:
-        consistent, lumped = elements.node_weights(self.mesh)
-        tets, n = self.mesh.tets, self.mesh.node_count
-        if self.lumped_mass:
-            diagonal = np.bincount(tets.ravel(), (lumped * self.density[:, None]).ravel(), n)
-            matrix = sp.diags(diagonal).tocsr()
-        else:
-            per_tet_count = tets.shape[1]
-            rows = np.repeat(tets, per_tet_count, axis=1).ravel()
-            columns = np.tile(tets, (1, per_tet_count)).ravel()
-            matrix = sp.csr_matrix(
-                ((consistent * self.density[:, None, None]).ravel(), (rows, columns)), (n, n))
-        return (matrix + mass_entries(self._ties, n)).tocsr() if self.point_masses else matrix
 
     def _set(self, young: float | np.ndarray, poisson: float | np.ndarray,
              density: float | np.ndarray) -> None:
@@ -507,20 +456,6 @@ class BranchModel:
             ratio = self.density / before
             self.hanging = (self.hanging.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
                             else carried(self))
-
-    def _check_grasps(self, grasps: Sequence[Grasp]) -> None:
-        taken = self.fixed.copy()
-        for grasp in grasps:
-            if taken[grasp.nodes].any():
-                where = "the fixed base" if self.fixed[grasp.nodes].any() else "another grasp"
-                raise InputError(f"A grasp overlaps {where}.",
-                                 "A node cannot follow two masters.",
-                                 "Move the grasp, or make its radius smaller.")
-            taken[grasp.nodes] = True
-        if taken.all():
-            raise InputError("Every node is fixed or grasped.", "Nothing is left to compute.",
-                             "Use a smaller grasp or a finer mesh.")
-
 
 def product_with(matrix: sp.csr_matrix, field: np.ndarray) -> np.ndarray:
     """Return a matrix of each axis times a nodal field of shape [node_count, 3]."""
