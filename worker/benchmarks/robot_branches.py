@@ -1,7 +1,7 @@
 """The virtual robot with random branches in its gripper: forces as predicted, slip, break.
 
 Young's modulus is known here, so that what differs is mesh, grasp, arm and sensor alone; what an
-estimate adds is measured by the closed loop (:mod:`limber.closed_loop`).
+estimate adds is measured by the closed loop (:mod:`limber.cli.closed_loop`).
 """
 
 import tempfile
