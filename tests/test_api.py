@@ -126,9 +126,7 @@ def test_results_become_tables_and_pictures(example, key, columns):
     table = result.table()
     assert len(table) == columns and len({len(column) for column in table.values()}) == 1
     assert all(column.ndim == 1 and column.dtype == float for column in table.values())
-    picture = io.BytesIO()
-    result.plot().savefig(picture, dpi=30)
-    assert picture.getvalue().startswith(b"\x89PNG")
+    assert result.plot()._repr_png_().startswith(b"\x89PNG")
     assert not plt.get_fignums() and plt.get_backend() == before
 
 
@@ -252,6 +250,7 @@ def test_a_line_shows_progress_where_a_bar_cannot():
     stream = io.StringIO()
     with LineSink("plan", stream, interval_seconds=0.0) as sink:
         sink(0.25, "searching", {})
+        sink(0.251, "searching", {"cost": 1.0})
         sink(0.5, "far", {})
     first, second, last, end = stream.getvalue().split("\r")[1:]
     assert first == "plan  25 % searching"
@@ -325,6 +324,7 @@ def test_a_session_follows(branch_folder):
 def test_arrays_give_the_branch_of_their_file(tmp_path):
     """Points as an array, as columns and as a file become the same tetrahedra."""
     scan = limber.generate(tmp_path / "scan", length=0.3, fork_count=0, seed=1)
+    assert repr(scan).startswith("Generated(points 3,049, length 0.300 m")
     cloud = read_cloud(scan.cloud)
     known = limber.reconstruct(scan.cloud, tmp_path / "file.branch", mesh_spacing=4)
     columns = dict(zip("xyz", cloud.points.T, strict=True)) | cloud.attributes

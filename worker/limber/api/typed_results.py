@@ -4,7 +4,9 @@ Arrays are read-only. ``table()`` gives columns by name, as ``pandas.DataFrame(.
 ``plot()`` gives a figure of matplotlib, which a notebook shows and ``savefig`` writes.
 """
 
+import functools
 import html
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -540,10 +542,18 @@ def _yes(value: bool) -> str:
 
 
 def drawn(draw: "Callable[[], Figure]") -> "Figure":
-    """Draw; a notebook shows what a cell ends with, and would show an open figure once more."""
+    """Draw a figure that a notebook shows once, whatever its settings for figures are."""
     require_extra("report", ("matplotlib",), "A picture")
     import matplotlib.pyplot as plt
 
     figure = draw()
+    # One that stays open is shown when the cell ends, and again as what the cell ends with.
     plt.close(figure)
+    vars(figure)["_repr_png_"] = functools.partial(_png, figure)
     return figure
+
+
+def _png(figure: "Figure") -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=100, bbox_inches="tight")
+    return stream.getvalue()

@@ -163,7 +163,7 @@ class LineSink:
         self._stream = stream or sys.stderr
         self._interval = interval_seconds
         self._last = -interval_seconds
-        self._width = 0
+        self._shown = ""
 
     def __enter__(self) -> "LineSink":
         return self
@@ -173,16 +173,16 @@ class LineSink:
         self._stream.write("\r")
 
     def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
-        now = time.perf_counter()
-        if now - self._last >= self._interval:
+        now, text = time.perf_counter(), f"{self._title} {100 * fraction:3.0f} % {message}"
+        if text != self._shown and now - self._last >= self._interval:
             self._last = now
-            self._write(f"{self._title} {100 * fraction:3.0f} % {message}")
+            self._write(text)
 
     def _write(self, text: str) -> None:
         """Write over what stood there."""
-        self._stream.write("\r" + text.ljust(self._width))
+        self._stream.write("\r" + text.ljust(len(self._shown)))
         self._stream.flush()
-        self._width = len(text)
+        self._shown = text
 
 
 def _short(value: Any) -> str:
