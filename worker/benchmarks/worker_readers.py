@@ -16,6 +16,9 @@ import numpy as np
 from benchmarks.worker_bag_readers import BAG_READERS
 from benchmarks.worker_branch_readers import BRANCH_READERS, Reader, template_file
 from limber.core.errors import InputError
+from limber.geometry.io.formats import Registry
+from limber.geometry.io.skeletons import SKELETONS
+from limber.geometry.io.surfaces import SURFACES
 from limber.store import Branch
 
 
@@ -347,10 +350,8 @@ def _cylinder_models(suffix: str, template: Path, folder: Path) -> list[Path]:
     return files
 
 
-def _skeleton(_template: Path, path: Path) -> Any:
-    from limber.geometry.io.skeletons import read_skeleton
-
-    return read_skeleton(path)
+def _read(registry: Registry, _template: Path, path: Path) -> Any:
+    return registry.read(path)
 
 
 @cache
@@ -419,18 +420,6 @@ def _log(_template: Path, path: Path) -> Any:
         path)
 
 
-def _swc(_template: Path, path: Path) -> Any:
-    from limber.geometry.io.skeletons import read_swc
-
-    return read_swc(path)
-
-
-def _surface(_template: Path, path: Path) -> Any:
-    from limber.geometry.surface.surface import Surface
-
-    return Surface.read(path)
-
-
 READERS: dict[str, Reader] = {
     "PLY": Reader("binary", _ply, _cloud), "PCD": Reader("binary", _pcd, _cloud),
     "XYZ": Reader("text", _texts, _cloud),
@@ -450,20 +439,21 @@ READERS: dict[str, Reader] = {
     "tables CSV": Reader("text", _tables, _table, True),
     "nominal CSV": Reader("text", _nominal, _read_nominal),
     "calipers CSV": Reader("text", _calipers, _read_calipers),
-    "MAT v7.3": Reader("binary", _matlab_73, _skeleton),
+    "MAT v7.3": Reader("binary", _matlab_73, partial(_read, SKELETONS)),
     "RTDE CSV": Reader("text", _rtde, _log, True),
-    "MAT": Reader("binary", partial(_cylinder_models, ".mat"), _skeleton),
-    "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), _skeleton),
+    "MAT": Reader("binary", partial(_cylinder_models, ".mat"), partial(_read, SKELETONS)),
+    "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), partial(_read, SKELETONS)),
     "ring CSV": Reader("text", partial(_decay, "ring.csv", "a_m_s2"), _ring),
     "wind CSV": Reader("text", partial(_decay, "wind.csv", "speed_m_s"), _wind),
-    "MTG": Reader("text", partial(_cylinder_models, ".mtg"), _skeleton),
+    "MTG": Reader("text", partial(_cylinder_models, ".mtg"), partial(_read, SKELETONS)),
     "add-on clouds": Reader("binary", lambda template, folder: [
         *_ply(template, folder), *_texts(template, folder)],
         partial(_addon_read, "clouds", "read_points")),
     "add-on scene data": Reader("npz", _scene_file, partial(
         _addon_read, "scene_data", "read_scene_data"), True),
-    "SWC": Reader("text", partial(template_file, "skeleton.swc"), _swc),
-    "surface PLY": Reader("binary", partial(template_file, "surface.ply"), _surface),
+    "SWC": Reader("text", partial(template_file, "skeleton.swc"), partial(_read, SKELETONS)),
+    "surface PLY": Reader("binary", partial(template_file, "surface.ply"),
+                          partial(_read, SURFACES)),
     "edits JSON": Reader("json", _edits, _read_edits),
     "job TOML": Reader("text", _jobs, _read_jobs),
     "cell TOML": Reader("text", _cell, _read_cell),

@@ -184,7 +184,9 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     warnings = list(stream.warnings)
     if ignored:
         warnings.append(f"{Path(path).name}: columns not used: {', '.join(ignored)}.")
-    positions = (stream.values[:, used] * scales).reshape(len(stream), -1, 3)
+    # In C order: sums over what chosen columns give would differ in their last digits.
+    values = np.ascontiguousarray(stream.values[:, used]) * scales
+    positions = values.reshape(len(stream), -1, 3)
     return marker_tracks(stream.times, positions, warnings), list(whole)
 
 
@@ -209,7 +211,8 @@ def marker_tracks(times: np.ndarray, positions: np.ndarray, warnings: Sequence[s
             not see, or NaN.
         warnings: What was wrong with the file.
     """
-    seen = np.where(np.all(positions == 0.0, axis=2)[..., None], np.nan, positions)
+    seen = positions.copy(order="K")
+    seen[np.all(positions == 0.0, axis=2)] = np.nan
     columns = tuple(f"m{k}_{axis}_m" for k in range(positions.shape[1]) for axis in "xyz")
     return Stream(times, seen.reshape(len(times), -1), columns, tuple(warnings))
 

@@ -82,10 +82,10 @@ def _read_text(path: Path) -> Cloud:
 def _read_vertices(path: Path) -> Cloud:
     import trimesh
 
-    mesh = trimesh.load(path, process=False)
+    mesh: Any = trimesh.load(path, process=False)
     if isinstance(mesh, trimesh.Scene):
-        parts: list[Any] = list(mesh.geometry.values())
-        points = np.vstack([part.vertices for part in parts] or [np.empty((0, 3))]).astype(float)
+        parts = [part.vertices for part in mesh.geometry.values()]
+        points = np.vstack(parts or [np.empty((0, 3))]).astype(float)
     else:
         points = np.asarray(mesh.vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:

@@ -11,6 +11,7 @@
 ======================  ===========================================================================
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -149,24 +150,25 @@ def write_rtwig(skeleton: Skeleton, path: Path) -> None:
     lines = ["id,parent,start_x,start_y,start_z,end_x,end_y,end_z,radius,branch,branch_order"]
     for node in range(1, skeleton.node_count):
         up = int(skeleton.parent[node])
-        ends = (*skeleton.nodes[up], *skeleton.nodes[node])
-        lines.append(",".join([str(node), str(up), *(f"{value:.9g}" for value in ends),
-                               f"{skeleton.radius[node]:.9g}", str(skeleton.branch[node] + 1),
-                               str(skeleton.order[node])]))
+        numbers = (*skeleton.nodes[up], *skeleton.nodes[node], skeleton.radius[node])
+        lines.append(_row(node, up, numbers, skeleton.branch[node] + 1, skeleton.order[node]))
     write_lines(path, lines)
 
 
 def write_simpleforest(skeleton: Skeleton, path: Path) -> None:
     """Write a table with SimpleForest's names [m]."""
-    head = ("ID,parentID,startX,startY,startZ,endX,endY,endZ,axisX,axisY,axisZ,radius,length,"
-            "branchID,branchOrder")
-    lines = [head]
+    lines = ["ID,parentID,startX,startY,startZ,endX,endY,endZ,axisX,axisY,axisZ,radius,length,"
+             "branchID,branchOrder"]
     for node in range(1, skeleton.node_count):
         up = int(skeleton.parent[node])
         start, end = skeleton.nodes[up], skeleton.nodes[node]
         length = float(np.linalg.norm(end - start))
-        numbers = (*start, *end, *((end - start) / max(length, 1e-300)),
-                   skeleton.radius[node], length)
-        lines.append(",".join([str(node - 1), str(up - 1), *(f"{v:.9g}" for v in numbers),
-                               str(skeleton.branch[node]), str(skeleton.order[node])]))
+        numbers = (*start, *end, *((end - start) / max(length, 1e-300)), skeleton.radius[node],
+                   length)
+        lines.append(_row(node - 1, up - 1, numbers, skeleton.branch[node], skeleton.order[node]))
     write_lines(path, lines)
+
+
+def _row(number: int, parent: int, numbers: Iterable[float], branch: int, order: int) -> str:
+    cells = (number, parent, *(f"{value:.9g}" for value in numbers), branch, order)
+    return ",".join(map(str, cells))

@@ -100,15 +100,8 @@ class ImportRequest:
 
     def entry(self, observation: Any, rest: np.ndarray | None, *, drive: Any, mode: Any,
               sigma: float, grasp: tuple[float, float, float]) -> PullEntry:
-        """Return the description of the pull.
-
-        Args:
-            observation: As in the pull format.
-            rest: Markers at rest in the branch's frame [m], shape [m, 3], where they are known.
-            drive: As in the pull format.
-            mode: Of the grasp.
-            sigma: Standard deviation of positions [m].
-            grasp: Where it is, in the branch's frame [m].
+        """Return the description of the pull: markers at rest [m, 3] and the grasp in the
+        branch's frame [m], and the standard deviation of positions [m].
         """
         settings = self.settings
         return PullEntry(
