@@ -9,6 +9,7 @@ from limber.cli.main import call
 from limber.recordings.importing.formats import RECORDINGS, RecordingFormat
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.time_series import Stream
+from limber.stages.registry import stage_description
 
 
 class Tracks:
@@ -30,6 +31,8 @@ class Tracks:
 
 @pytest.fixture
 def tracks(tmp_path, plain_pull):
+    # A stage's help lists the formats that there are when it is loaded: other tests' as well.
+    stage_description("import-pull")
     RECORDINGS.register(RecordingFormat("tracks", (".foo",), Tracks.read, holds="markers"))
     Tracks.write(plain_pull.observations, tmp_path / "a.foo")
     write_pull(tmp_path / "made", plain_pull)

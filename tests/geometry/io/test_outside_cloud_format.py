@@ -11,6 +11,7 @@ from limber.geometry.generated import generate_branch
 from limber.geometry.io import formats
 from limber.geometry.io.clouds import CLOUDS, read_points
 from limber.geometry.io.formats import Format, starts_with
+from limber.stages.registry import stage_description
 
 
 class Dots:
@@ -28,6 +29,8 @@ class Dots:
 
 @pytest.fixture(params=[False, True], ids=["here", "isolated"])
 def dots(request):
+    # A stage's help lists the formats that there are when it is loaded: other tests' as well.
+    stage_description("reconstruct")
     CLOUDS.register(Format("dots", (".foo",), Dots.read, recognises=starts_with(b"dots"),
                            isolated=request.param))
     yield

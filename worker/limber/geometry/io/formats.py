@@ -7,7 +7,7 @@ A format is an entry of a registry. Other packages add theirs by a call::
     CLOUDS.register(Format("FOO", (".foo",), read_foo))
 
 or by an entry point of the registry's group whose value is a :class:`Format`; it is loaded when the
-registry is first asked.
+registry is first asked. The help of a command lists the formats that there are when it is loaded.
 """
 
 import warnings
