@@ -21,7 +21,8 @@ _MOST_ARRAYS = 500
 # Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
 # points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
 # seen, p points of a path (each path has its own), q nodes of a search tree, u vertices and x
-# faces of rods (likewise), y colours of a palette. i: whole numbers, b: truth values, r: real.
+# faces of rods (likewise), y colours of a palette, l places along an arm. i: whole numbers, b:
+# truth values, r: real.
 _SHAPES = {
     "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
     "frame_level": "sv i", "palette": "y4 r",
@@ -40,7 +41,7 @@ _SHAPES = {
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
     "observation_motion": "sm3 r", "observation_seen": "sm b",
     "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
-    "robot_links": "s83 r", "robot_radius": "1 r",
+    "robot_links": "sl3 r", "robot_radius": "1 r",
     "view_points": "w3 r", "view_direction": "3 r"}
 _NEEDED = ("vertices", "faces", "view_points", "view_direction")
 _NEEDED_INFO = {"name": str, "folder": str, "scalars": dict, "paths": dict, "notes": list,

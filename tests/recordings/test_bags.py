@@ -192,6 +192,36 @@ def test_joint_angles_need_the_cell(tmp_path, bare_folder):
     assert np.allclose(pull.poses[0, :3], expected[:3] + [0.4, 0.2, 0.0])
 
 
+@pytest.mark.slow
+def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, recorded_data):
+    """The arm of a URDF file whose first joint has a name of its own."""
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.poses import pose_vectors
+
+    text = (recorded_data / "ur5_urdf" / "ur5.urdf").read_text(encoding="utf-8")
+    (tmp_path / "own.urdf").write_text(text.replace("shoulder_pan_joint", "waist"),
+                                       encoding="utf-8")
+    path = tmp_path / "cell.toml"
+    path.write_text('[robot]\nmodel = "own.urdf"\n[base]\npose = [0, 0, 0, 0, 0, 0]\n',
+                    encoding="utf-8")
+    names = ["elbow_joint", "shoulder_lift_joint", "waist", "wrist_1_joint", "wrist_2_joint",
+             "wrist_3_joint"]
+    for called in (names, [*names[:2], "shoulder_pan_joint", *names[3:]]):
+        with Written(tmp_path / "joints.mcap") as bag:
+            for time in np.linspace(1.0, 3.0, 21):
+                bag.joints(time, called, [1.4, -1.5, 0.1 * time, -1.2, -1.5, 0.2])
+                bag.wrench("/wrench", time, [time - 1, 0, 0])
+        settings = ImportSettings(cell=str(path))
+        if called is names:
+            import_pull(bare_folder, tmp_path / "joints.mcap", "j", settings)
+            pull = read_pull(bare_folder / "pulls" / "j")
+            place = read_cell(path).arm.forward(np.array([0.1, -1.5, 1.4, -1.2, -1.5, 0.2]))
+            assert np.allclose(pull.poses[0, :3], pose_vectors(place)[:3])
+        else:
+            with pytest.raises(InputError, match=r"Joints are called.*waist, shoulder_lift_joint"):
+                import_pull(bare_folder, tmp_path / "joints.mcap", "k", settings)
+
+
 @pytest.mark.parametrize("made, told", [
     (lambda bag: pulled(bag, wrench=None), "no wrench.*Its topics: /pose"),
     (lambda bag: pulled(bag, pose=None), "no pose"),

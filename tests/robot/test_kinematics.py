@@ -1,6 +1,5 @@
-"""Kinematics against an independent library, a URDF of others, finite differences and itself."""
+"""Kinematics against an independent library, finite differences and itself."""
 
-import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
@@ -41,24 +40,6 @@ def test_forward_and_every_inverse_branch_as_an_independent_library(name):
         for other in library.inverse_kinematics(frames[row]):
             assert np.nanmin(turns_apart(solutions[row], np.asarray(other))) < 1e-6
         assert exist[row].sum() == len(library.inverse_kinematics(frames[row]))
-
-
-def test_forward_as_the_urdf_of_others(recorded_data):
-    """The chain of joint origins in a UR5's URDF, multiplied out; its base is turned by half."""
-    root = ElementTree.parse(recorded_data / "ur5_urdf" / "ur5.urdf").getroot()
-    origins = {joint.get("name"): joint.find("origin") for joint in root.findall("joint")}
-    names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-    for joints in random_joints(200):
-        frame = np.eye(4)
-        for name, angle in zip(names, joints, strict=True):
-            origin = origins[f"{name}_joint"]
-            step = np.eye(4)
-            step[:3, 3] = np.array(origin.get("xyz").split(), float)
-            step[:3, :3] = (Rotation.from_euler("xyz", np.array(origin.get("rpy").split(), float))
-                            * Rotation.from_rotvec([0, 0, angle])).as_matrix()
-            frame = frame @ step
-        # Rotations are written with nine digits there.
-        assert np.abs(frame - ARMS["ur5"].forward(joints)).max() < 1e-8
 
 
 @pytest.mark.parametrize("name", ["ur5", "ur10e"])

@@ -54,6 +54,7 @@ class PieperArm:
     measures_force: bool = True
     payload: float = 4.0
     joint_names: tuple[str, ...] = ("waist", "shoulder", "elbow", "roll", "pitch", "screw")
+    ros_joints: tuple[str, ...] = tuple(f"pieper_joint_{number}" for number in range(6))
     joint_speed: tuple[float, ...] = (2.0,) * 6
     home: tuple[float, ...] = (0.0, -1.0, 1.6, 0.0, 0.9, 0.0)
     reach: float = UPPER + FORE

@@ -438,10 +438,10 @@ def _preview(joints, base, arm):
         ",".join(f"{x:.9g}" for x in row) for row in rows) + "\n"
 
 
-@pytest.mark.parametrize("away", [0.0, 0.1])
-def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away):
+@pytest.mark.parametrize("away, model", [(0.0, "ur5e"), (0.1, "ur5e"), (0.0, "gone.urdf")])
+def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, model):
     """In each frame: base, six origins with the arm's own distances, grasp at the branch's; an
-    arm that is elsewhere than the grasp is not shown."""
+    arm that is elsewhere than the grasp, or not known here, is not shown."""
     from limber.robot.known_arms import arm_named
 
     arm = arm_named("ur5e")
@@ -456,9 +456,9 @@ def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away):
         "frames/p.pc2": _pc2(np.repeat(surface[None], len(points), axis=0))})
     with branch.stage("execute-preview:p", reads=["plans/p.csv"]) as stage:
         stage.path("executions/p-preview.csv").write_text(table)
-        stage.result.update(model="ur5e", base_pose=base)
+        stage.result.update(model=model, base_pose=base)
     data = scene_data(Branch.open(tmp_path / "a.branch"))
-    if away:
+    if away or model != "ur5e":
         assert "robot_links" not in data.arrays
         return
     links = data.arrays["robot_links"]

@@ -44,6 +44,7 @@ class Arm(Protocol):
             for the guard.
         payload: Greatest mass at the flange [kg].
         joint_names: One a joint, for a person.
+        ros_joints: What the names have in them under which ROS sends the joints.
         joint_limits: Least and greatest angles [rad], infinite where a joint turns without end,
             shape [n, 2].
         joint_speed: Greatest speeds [rad/s], shape [n].
@@ -66,6 +67,8 @@ class Arm(Protocol):
     def payload(self) -> float: ...
     @property
     def joint_names(self) -> tuple[str, ...]: ...
+    @property
+    def ros_joints(self) -> tuple[str, ...]: ...
     @property
     def joint_limits(self) -> np.ndarray: ...
     @property

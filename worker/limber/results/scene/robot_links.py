@@ -1,5 +1,7 @@
 """The robot along a path: where its links are in each frame, from the joints of a dry run."""
 
+from pathlib import Path
+
 import numpy as np
 
 from limber.core.errors import InputError
@@ -45,7 +47,7 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     start = np.broadcast_to(base[:3, 3], (len(rows), 1, 3))
     data.arrays["robot_links"] = np.concatenate([start, links, places[rows][:, None]], axis=1)
     data.arrays["robot_radius"] = np.array([arm.link_radius])
-    data.info["robot"] = arm.name
+    data.info["robot"] = Path(arm.name).stem
 
 
 def _rows(places: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:

@@ -60,6 +60,7 @@ class UrArm:
 
     controller = "ur"
     joint_names = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+    ros_joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     home = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
     singularity_names = ("wrist", "elbow", "shoulder")
 

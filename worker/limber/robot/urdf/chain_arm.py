@@ -43,6 +43,10 @@ class UrdfArm:
     def joint_names(self) -> tuple[str, ...]:
         return tuple(joint.name for joint in self.chain.joints)
 
+    @property
+    def ros_joints(self) -> tuple[str, ...]:
+        return self.joint_names
+
     @cached_property
     def joint_limits(self) -> np.ndarray:
         return np.array([joint.limits for joint in self.chain.joints])

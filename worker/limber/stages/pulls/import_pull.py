@@ -23,7 +23,6 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.recordings.importing.import_request import BranchFrame, RobotKnown
 
-_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 class ImportInputs(BranchInputs):
@@ -90,14 +89,15 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     from limber.robot.recorder import known_errors, known_noise
 
     cell = read_cell(Path(settings.cell))
+    wanted = cell.arm.ros_joints
     tool = matrices(np.array(cell.tool.grasp_pose))
 
     def joint_poses(names: tuple[str, ...], angles: np.ndarray) -> np.ndarray:
         # ROS sends joints in any order, UR's with names like left_shoulder_pan_joint.
-        order = [[k for k, name in enumerate(names) if part in name] for part in _JOINTS]
+        order = [[k for k, name in enumerate(names) if part in name] for part in wanted]
         if any(len(found) != 1 for found in order):
             raise InputError(f"The joints are named {', '.join(names)}.",
-                             f"A UR arm's joints are {', '.join(_JOINTS)}.",
+                             f"A {cell.arm.name}'s are {', '.join(wanted)}.",
                              "Record poses or TF, or rename the joints.")
         return pose_vectors(cell.arm.forward(angles[:, [found[0] for found in order]]) @ tool)
 
