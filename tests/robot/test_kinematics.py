@@ -1,6 +1,5 @@
 """Kinematics against an independent library, finite differences and itself."""
 
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
