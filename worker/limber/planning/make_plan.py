@@ -88,17 +88,16 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         NoPathError: no path, or none that keeps the limits on the full model; says why and where.
         ConvergenceError: the branch cannot be solved along the shortest path.
     """
-    goal = goal_of(GoalRequest(field, grasp_model, settings, Limits.of(settings).on(field),
-                               cell or {}))
-    start = start_of(field, goal, settings)
-    limits = limits or Limits.of(settings)
+    own = Limits.of(settings)
+    goal = goal_of(GoalRequest(field, grasp_model, settings, own.on(field), cell or {}))
+    start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
         field = _knowing(field, grasp_model, limits, workers, progress)
     rounds = _Rounds(grasp_model, settings, limits, goal, start, doubt, workers, field, goal,
                      limits, pace or Pace(settings.speed, settings.acceleration), progress)
-    for number in range(settings.replans + 1):
-        ahead = rounds.progress.part(number / (settings.replans + 1),
-                                     (number + 1) / (settings.replans + 1))
+    count = settings.replans + 1
+    for number in range(count):
+        ahead = rounds.progress.part(number / count, (number + 1) / count)
         if rounds.plan_once(ahead, is_last=number == settings.replans):
             break
     return rounds.found()
