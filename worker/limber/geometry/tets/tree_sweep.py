@@ -53,18 +53,17 @@ def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
     Raises:
         MeshingError: the main run cannot be swept, since it bends more sharply than it is thick.
     """
-    best, least = None, np.inf
+    tried: list[tuple[float, SweptTree]] = []
     for turn in _TURNS if skeleton.branch_count <= _TURNED_MOST else _TURNS[:1]:
         sweep = _TreeSweep(skeleton, spacing, turn)
         for run in range(skeleton.branch_count):
             sweep.add_run(run)
         found = sweep.result()
         lost = float(skeleton.radius[np.isin(skeleton.branch, found.left_out)].sum())
-        if lost < least:
-            best, least = found, lost
+        tried.append((lost, found))
         if not found.left_out:
             break
-    return best
+    return min(tried, key=lambda one: one[0])[1]
 
 
 @dataclass
