@@ -195,8 +195,8 @@ def test_joint_angles_need_the_cell(tmp_path, bare_folder):
 @pytest.mark.slow
 def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, recorded_data):
     """The arm of a URDF file whose first joint has a name of its own."""
+    from limber.core.numerics.rigid import pose_vectors
     from limber.robot.cell.cell import read_cell
-    from limber.robot.poses import pose_vectors
 
     text = (recorded_data / "ur5_urdf" / "ur5.urdf").read_text(encoding="utf-8")
     (tmp_path / "own.urdf").write_text(text.replace("shoulder_pan_joint", "waist"),

@@ -15,13 +15,13 @@ from tests.robot.conftest import Registers
 
 from benchmarks.robot_cells import cell_file, standing_at
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import control_of, register_control
 from limber.robot.interface import Rods
 from limber.robot.known_arms import arm_named, register_arm
 from limber.robot.motion.joint_path import follow
 from limber.robot.motion.trajectory import densely
-from limber.robot.poses import inverted, matrices, pose_vectors
 from limber.robot.virtual.controller import Controller
 from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
 from limber.store import Branch

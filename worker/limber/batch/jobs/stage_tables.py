@@ -103,7 +103,7 @@ class _StageValues:
                 self._problems.add(self._places[key], f"{key!r} is given by the batch.")
             elif key not in self._fields:
                 self._problems.add(self._places[key], f"{self._stage.name} has no {key!r}. "
-                                   f"{nearest(key, self._fields)}")
+                                   f"{nearest(key, list(self._fields))}")
             else:
                 values[key] = self._value(key, value)
         return [task for each in self._runs(values)
