@@ -239,7 +239,7 @@ def test_settings_are_listed():
     known = limber.settings("energy_field")
     assert set(known) == {"samples", "field_error", "deflection", "gravity", "seed", "forward",
                           "force", "workers"}
-    assert known["samples"].default == 225 and "  samples = 225: Grasp" in repr(known)
+    assert known["samples"].default == 225 and "  samples = 225: Number" in repr(known)
     assert known._repr_html_().count("<tr>") == len(known) + 1
     assert limber.settings("add_pull")["source"].default == "required"
     assert list(limber.settings("energy")) == list(known)
@@ -273,7 +273,7 @@ def test_quiet_shows_nothing(own, capfd):
 
 def test_warnings_are_pythons_at_the_users_line(branch_folder, tmp_path):
     """They name the line that called the verb, and stand in the result."""
-    with pytest.warns(UserWarning, match="No swing has told the damping") as seen:
+    with pytest.warns(UserWarning, match="No swing has been fitted") as seen:
         written = limber.open(branch_folder).export(tmp_path / "a.urdf")
     assert seen[0].filename == __file__
     assert written.warnings == (str(seen[0].message),)

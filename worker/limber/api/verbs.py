@@ -289,7 +289,7 @@ class Branch:
             name: Of the pull.
             quiet: Show no progress.
             settings: ``unit``, ``cell`` (the robot's cell file), ``grasp_point`` [m], ``weight``
-                [kg] and those that ``limber.settings("add_pull")`` lists.
+                [N] and those that ``limber.settings("add_pull")`` lists.
 
         Raises:
             InputError: the recording or a setting cannot be used.
