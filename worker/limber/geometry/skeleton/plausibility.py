@@ -110,6 +110,20 @@ def warnings(result: Any, where: Where) -> list[str]:
             texts.append(f"{100 * far:.0f} % of the points are far from the given skeleton: is it "
                          "in the cloud's coordinates and unit?")
         return texts
+    texts += _joining_texts(result, where) + _doubt_texts(result, where)
+    misfit = unexplained_share(result)
+    if misfit > 0.15:
+        texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
+                     "pixels or a second plant? Radii there mean little.")
+    elif not shows_round(result):
+        texts.append(f"Points scatter by {1000 * result.noise:.2g} mm, over {_ROUND:.0%} of their "
+                     "axes' radius: leaves among them, which lie on no round axis, would not show.")
+    return texts
+
+
+def _joining_texts(result: Any, where: Where) -> list[str]:
+    """What to tell of bridges, pieces left away and loops."""
+    texts = []
     longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
     for bridge in longest[:_NAMED]:
         texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
@@ -129,6 +143,12 @@ def warnings(result: Any, where: Where) -> list[str]:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
     if len(result.loops) > _NAMED:
         texts.append(f"{len(result.loops) - _NAMED} shorter closed loops were opened too.")
+    return texts
+
+
+def _doubt_texts(result: Any, where: Where) -> list[str]:
+    """What to tell of twigs dropped, and of the root."""
+    texts = []
     if result.unlikely:
         longest = max(twig["length"] for twig in result.unlikely)
         texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were dropped: "
@@ -141,13 +161,6 @@ def warnings(result: Any, where: Where) -> list[str]:
         texts.append(f"The end at {_place(where(result.other_root))} is about as likely the root "
                      f"as that at {_place(where(result.skeleton.nodes[0]))}: name it (--root) if "
                      "it is.")
-    misfit = unexplained_share(result)
-    if misfit > 0.15:
-        texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
-                     "pixels or a second plant? Radii there mean little.")
-    elif not shows_round(result):
-        texts.append(f"Points scatter by {1000 * result.noise:.2g} mm, over {_ROUND:.0%} of their "
-                     "axes' radius: leaves among them, which lie on no round axis, would not show.")
     return texts
 
 
