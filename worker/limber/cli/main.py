@@ -71,7 +71,7 @@ class _Commands(click.Group):
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(VERSION, prog_name="limber")
 def main() -> None:
-    """From the scan of a plant branch to a simulation that behaves like it, and to gentle motion.
+    """Turn the scan of a plant branch into a simulation that behaves like it, and move it gently.
 
     Exit codes: 0 done, 2 wrong usage or input, 3 the work failed, 4 stopped for safety,
     130 cancelled.

@@ -1,4 +1,4 @@
-"""Many branches at once: the stages that a job file names, resumed where it was left."""
+"""Run the stages of a job file on many branches; continues where it stopped."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Gather what a report of a bug needs in one file."""
+"""Collect what a report of a bug needs in one file."""
 
 import json
 import os

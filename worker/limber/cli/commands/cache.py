@@ -1,4 +1,4 @@
-"""What is kept to be quicker the next time, and how much room it takes."""
+"""Show or trim what is cached to be faster the next time."""
 
 from typing import Any
 

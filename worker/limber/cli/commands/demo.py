@@ -1,4 +1,4 @@
-"""The whole pipeline on one branch: every stage as a process, and a closing table."""
+"""Run the whole pipeline on one branch."""
 
 import functools
 import time

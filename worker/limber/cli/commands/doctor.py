@@ -1,4 +1,4 @@
-"""What is installed, what is missing and what then does not work."""
+"""Show what is installed, what is missing, and what does not work without it."""
 
 import importlib
 import importlib.util

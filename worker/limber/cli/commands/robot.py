@@ -1,4 +1,4 @@
-"""Check a robot and calibrate where it stands: `limber robot check`, `limber robot calibrate`."""
+"""Check and calibrate a robot: `limber robot check`, `limber robot calibrate`."""
 
 import csv
 import sys

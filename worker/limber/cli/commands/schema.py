@@ -1,4 +1,4 @@
-"""What every stage takes and makes, as JSON schemas for programs that run them."""
+"""Print the inputs and outputs of all stages as JSON schemas."""
 
 import json
 

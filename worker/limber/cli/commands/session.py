@@ -1,4 +1,4 @@
-"""A branch held in a process that other programs bend, by JSON lines."""
+"""Hold a branch in a process that other programs bend through JSON lines."""
 
 import sys
 from pathlib import Path

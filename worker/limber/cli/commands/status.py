@@ -1,4 +1,4 @@
-"""How far a batch is: what is done, failed, running and waiting."""
+"""Show what a batch has done, and what failed, runs or waits."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Whether a branch folder's files are as they were written."""
+"""Check whether a branch folder's files are as they were written."""
 
 from pathlib import Path
 from typing import Any

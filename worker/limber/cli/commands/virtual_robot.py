@@ -1,4 +1,4 @@
-"""A UR controller in software, for dry runs and tests; it can hold a branch."""
+"""Run a UR controller in software, for dry runs and tests; it can hold a branch."""
 
 import tempfile
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Young's modulus along the branch, from pulls."""
+"""Estimate Young's modulus along the branch from pulls."""
 
 from __future__ import annotations
 

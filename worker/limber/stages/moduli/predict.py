@@ -1,4 +1,4 @@
-"""Where a branch rests under another load, with its estimated modulus."""
+"""Predict where the branch comes to rest under another load."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Young's modulus and damping from a free swing; no robot."""
+"""Estimate Young's modulus and damping from a free swing, without a robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Young's modulus and damping from how a branch rings: accelerometer, strain gauge or video track.
+"""Estimate Young's modulus and damping from ringing (accelerometer, strain gauge, video).
 
 RECORD is a table of times and one column or more of accelerations, strains or displacements in any
 unit, or a C3D file of markers. The branch is plucked and left to itself. Its frequencies tell one

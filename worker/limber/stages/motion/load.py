@@ -1,4 +1,4 @@
-"""What wind and gusts, snow, fruit or a pruning cut do to the branch: sag, strain, frequencies."""
+"""Compute sag, strain and frequencies under wind, gusts, snow, fruit or pruning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pull a branch by a pose or a force; writes motion, energy and forces."""
+"""Simulate a pull by a pose or a force; writes motion, energy and forces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Energy field over grasp poses."""
+"""Sample the deformation energy over grasp poses, and fit a field to it."""
 
 from pathlib import Path
 from typing import Any

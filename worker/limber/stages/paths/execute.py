@@ -1,4 +1,4 @@
-"""Follow a planned path with a robot; without --arm a dry run that moves nothing."""
+"""Follow a planned path with a robot; a dry run unless --arm is given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths to a goal: RRT* and deformation-aware D-RRT*, compared.
+"""Plan the shortest and the gentlest path to a goal, and compare them.
 
 The field serves to search. Every energy, force and strain that is reported comes from the finite
 elements along the found paths; how far the field was off is reported beside them.

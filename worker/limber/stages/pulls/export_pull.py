@@ -1,4 +1,4 @@
-"""Write a recorded pull for other programs: an MCAP file, which Foxglove opens."""
+"""Export a recorded pull as an MCAP file, which Foxglove opens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bring a recording of a pull into the branch folder."""
+"""Import a recording of a pull into the branch folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Record a pull with a robot, under the guard, into a recording that survives a kill."""
+"""Record a pull with a robot, under the guard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Suggest the next pull: where to hold and how far to pull to learn most for the strain it risks.
+"""Suggest where to hold and how far to pull next to learn most.
 
 Pulls of several places, directions and lengths are made on the branch as it is estimated. What each
 would tell of Young's modulus, with the errors of cell and sensors that the last pull stated, is

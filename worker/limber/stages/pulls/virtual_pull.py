@@ -1,4 +1,4 @@
-"""Simulate a pull with a known Young's modulus and sensor noise."""
+"""Simulate a recorded pull with a known Young's modulus and sensor noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write the branch for other programs: robot simulators, finite elements, cylinder models.
+"""Export the branch for robot simulators, finite element programs and others.
 
 What is written goes by OUTPUT's suffix. Links and cylinders are in the branch's frame, in metres.
 Modulus and damping are those that the folder knows: of the last estimate or swing.

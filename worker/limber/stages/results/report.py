@@ -1,4 +1,4 @@
-"""One self-contained HTML page with figures and tables of all results."""
+"""Write one HTML page with figures and tables of all results."""
 
 from pathlib import Path
 from typing import Any, ClassVar

@@ -1,4 +1,4 @@
-"""A Blender scene with the branch, its motion and paths."""
+"""Write a Blender scene with the branch, its motion and paths."""
 
 from __future__ import annotations
 

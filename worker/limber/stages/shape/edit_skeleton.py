@@ -1,4 +1,4 @@
-"""List the doubtful parts of the skeleton, and edit it: the mesh follows.
+"""List doubtful parts of the skeleton, and edit it; the mesh follows.
 
 EDITS is a JSON list, one object an edit, its places in the coordinates and the unit of the scan's
 file, as the list of doubtful parts gives them:

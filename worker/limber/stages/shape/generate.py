@@ -1,4 +1,4 @@
-"""A generated branch with known truth, scanned as a scanner would."""
+"""Generate a branch with known truth, and scan it as a scanner would."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closed surface, a table of sections or a cylinder model to tetrahedra."""
+"""Mesh a closed surface, a table of sections or a cylinder model."""
 
 import json
 from pathlib import Path

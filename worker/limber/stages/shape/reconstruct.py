@@ -1,4 +1,4 @@
-"""Scan to tetrahedra: skeleton, radii, surface, mesh."""
+"""Reconstruct a scan: skeleton, radii, surface and tetrahedra."""
 
 from __future__ import annotations
 

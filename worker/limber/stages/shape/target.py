@@ -1,4 +1,4 @@
-"""Name a place on the branch (a flower, a fruit) that is followed wherever the branch is moved."""
+"""Name a place on the branch, such as a flower, that all stages follow."""
 
 from __future__ import annotations
 
