@@ -81,13 +81,14 @@ def test_the_notebook(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_readmes_python(tmp_path):
-    """Its blocks run as they stand, in a folder that has the branch they name."""
-    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"),
-                        re.MULTILINE | re.DOTALL)
+def test_the_python_of_readme_and_guide(tmp_path):
+    """Its block is the notebook's, run above; the guide's run in a folder with their branch."""
+    def blocks_of(path):
+        return re.findall(r"^```python\n(.*?)^```", (ROOT / path).read_text(encoding="utf-8"),
+                          re.MULTILINE | re.DOTALL)
+    assert [block.strip() for block in blocks_of("README.md")] == [notebook_code()[0].strip()]
+    blocks = blocks_of("worker/docs/reference/python.md")
     assert blocks
-    # That of the notebook is run above.
-    blocks = [block for block in blocks if block.strip() != notebook_code()[0].strip()]
     shutil.copytree(EXAMPLE, tmp_path / "apple.branch")
     script = tmp_path / "readme.py"
     script.write_text("if __name__ == '__main__':\n" + "\n".join(

@@ -105,7 +105,7 @@ def test_poses_are_asked_where_a_limit_may_break(bent):
 @pytest.mark.slow
 @pytest.mark.parametrize(("settings", "words"), [
     ({"confidence": 0.95}, "without a limit"),
-    ({"confidence": 0.95, "max_force": 5.0}, "nothing is estimated"),
+    ({"confidence": 0.95, "max_force": 5.0}, "there is no estimate"),
 ])
 def test_a_confidence_needs_a_limit_and_an_estimate(planned_branch, settings, words):
     with pytest.raises(InputError, match=words):

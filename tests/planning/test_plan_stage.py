@@ -198,7 +198,7 @@ def test_stopped_while_the_bound_closes_the_best_so_far_is_kept(copied, monkeypa
             raise KeyboardInterrupt
 
     settings = PlanSettings(iterations=100)
-    with pytest.raises(Cancelled, match=r"above the best possible.* is plan early"):
+    with pytest.raises(Cancelled, match=r"above the best possible.* stored as plan early"):
         plan_paths(copied, settings, name="early", workers=1, progress=Progress(interrupt))
     early = read_plan(copied, "early")
     assert early["stopped"] and early["plan"]["unsolved_count"] == 0

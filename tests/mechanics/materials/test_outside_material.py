@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from scipy.optimize import brentq
 from tests.subjects.meshes import box_mesh
 
+from benchmarks.prescribed import solve_prescribed
 from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.settings import checked_settings
@@ -33,7 +34,6 @@ from limber.mechanics.materials import law as law_module
 from limber.mechanics.materials import registry
 from limber.mechanics.materials.law import contracted, determinant, right_cauchy_green
 from limber.mechanics.pull_simulation import SimulateSettings
-from limber.mechanics.statics.solve import solve_prescribed
 from limber.mechanics.strain import peak_load, strain_state
 from limber.reduced.strain_polynomial import make_polynomial
 from limber.results.exports.abaqus import inp_text

@@ -133,7 +133,7 @@ def settings(verb: str) -> "SettingsTable":
         InputError: there is no such verb.
 
     >>> limber.settings("plan")["max_force"]
-    Setting(meaning='Force of the gripper that no pose may exceed [N].', default=None)
+    Setting(meaning='Largest force of the gripper at any pose [N].', default=None)
     """
     from limber.stages.registry import stage_description
 
