@@ -131,7 +131,7 @@ def test_lists_of_a_recording_stay_in_its_folder(tmp_path):
     source = tmp_path / "in"
     (source / "calibration.txt").write_text("40 40 3 2")
     (source / "depth.txt").write_text("1.0 depth/1.png\n2.0 ../secret.png\n")
-    with pytest.raises(InputError, match="out of the recording's folder"):
+    with pytest.raises(InputError, match="outside the recording's folder"):
         copy_rgbd(source, tmp_path / "out", ImportSettings())
     (source / "depth.txt").unlink()
     (source / "groundtruth.txt").write_text("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 1\n")

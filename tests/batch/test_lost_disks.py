@@ -115,7 +115,7 @@ def test_lost_results_stop_the_batch(orchard, batch, here, monkeypatch, trouble)
         assert not out.exists()
         (orchard / "away").rename(out)
     else:
-        assert "could not be written" in told["error"] and "Make room" in told["error"], told
+        assert "could not be written" in told["error"] and "Free some space" in told["error"], told
     before = Branch.open(orchard / "one.branch", verify=True).manifest.stages
     assert "target:flower" in before
     assert targets(orchard, "two") in ([], ["flower"], ["flower", "fruit"])

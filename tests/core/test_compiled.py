@@ -128,7 +128,7 @@ def test_a_damaged_file_is_renewed_and_told_once(kept, suffix, damage):
         DAMAGES[damage](file)
     results, compiled_count, told = run()
     assert results == (3.0, 4) and compiled_count == 2
-    assert len(told) == 1 and str(files[0].parent) in told[0] and "compiled anew" in told[0]
+    assert len(told) == 1 and str(files[0].parent) in told[0] and "compiled again" in told[0]
     assert run() == ((3.0, 4), 0, [])
 
 
@@ -189,4 +189,4 @@ def test_processes_of_a_pool_warn_through_the_command():
     told = []
     with damage_told_to(told.append), Pool(2) as pool:
         assert sorted(pool.map(_damaged, [(0,), (1,)])) == [0, 1]
-    assert len(told) == 1 and "was damaged" in told[0]
+    assert len(told) == 1 and "is damaged" in told[0]

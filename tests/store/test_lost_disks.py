@@ -136,7 +136,7 @@ def test_a_native_writer_on_a_full_disk(tmp_path):
     """It says in its own words what happened; others of its errors stay what they are."""
     branch = Branch.create(tmp_path / "a.branch")
     for said in ("8 requested and 0 written", "Not enough free space to write 8 bytes"):
-        with pytest.raises(WorkError, match=r"full.*Make room"), branch.stage("a"):
+        with pytest.raises(WorkError, match=r"full.*Free some space"), branch.stage("a"):
             raise OSError(said)
     with pytest.raises(OSError, match="no such dataset"), branch.stage("a"):
         raise OSError("no such dataset")

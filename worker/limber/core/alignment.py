@@ -24,7 +24,7 @@ class Alignment(BaseModel):
     def _is_a_turn(cls, rows: tuple[_Row, _Row, _Row]) -> tuple[_Row, _Row, _Row]:
         turn = np.array(rows)
         if not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3:
-            raise ValueError("a turn has rows of length 1 at right angles")
+            raise ValueError("a rotation matrix must have orthogonal rows of length 1")
         return rows
 
     def apply(self, points: np.ndarray) -> np.ndarray:

@@ -39,16 +39,16 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
     told = error.strerror or str(error) or type(error).__name__
     if error.errno in _FULL or (error.errno is None and _FULL_IN_WORDS.search(told)):
         return WorkError(f"{name} cannot be written ({told}).",
-                         "The disk is full, or your share of it.",
-                         "Make room (`limber cache --clear` frees some), and run this again: what "
-                         "was stored before is kept.")
+                         "The disk is full, or your quota is used up.",
+                         "Free some space (`limber cache --clear` helps), and run this again. "
+                         "Earlier results are kept.")
     if (error.errno in _LOST or (error.filename and error.errno in _UNREACHABLE)
             or getattr(error, "winerror", None) in _LOST_ON_WINDOWS):
         return WorkError(f"{name} does not answer ({told}).",
-                         "The disk or the network folder that it is on was lost.",
-                         "Restore it, and run this again. Earlier results are kept.")
+                         "The connection to its disk or network folder was lost.",
+                         "Restore the connection, and run this again. Earlier results are kept.")
     if error.errno in _FORBIDDEN:
         return InputError(f"{name} cannot be used ({told}).",
-                          "It is read-only, or belongs to somebody else.",
+                          "It is read-only, or belongs to another user.",
                           "Change its permissions, or work on a copy.")
     return None

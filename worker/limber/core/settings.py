@@ -23,7 +23,7 @@ Model = TypeVar("Model", bound=BaseModel)
 def _with_length(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     length = math.hypot(*vector)
     if not 1e-9 < length < math.inf:
-        raise ValueError("a direction has a length")
+        raise ValueError("a direction must not be zero")
     return vector
 
 
@@ -125,7 +125,7 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
         # It is about several values together, and names them.
         return InputError(f"{message}.", "", "See the options' help.")
     return InputError(f"{_flag(str(first['loc'][0]))} {first.get('input')!r}: {message}.",
-                      "It is outside what the stage can work with.",
+                      "The stage cannot use this value.",
                       "See the option's help for its range.")
 
 

@@ -32,6 +32,7 @@ def in_unit(value: Any, unit: str) -> Any:
     number, given = match.groups()
     known = UNITS.get(unit, {unit: 1.0} if unit else {})
     if given not in known:
-        wanted = f"It is in {unit}; known are {', '.join(known)}." if unit else "It has no unit."
+        wanted = (f"It must be in {unit}. Known units: {', '.join(known)}." if unit
+                  else "This value has no unit.")
         raise ValueError(f"{value!r} is in {given!r}. {wanted}")
     return float(number) * known[given]

@@ -85,7 +85,7 @@ def check_las(path: Path) -> None:
     with open(path, "rb") as stream:
         head = stream.read(375)
     if len(head) < 227 or head[:4] != b"LASF":
-        raise InputError(f"{path} is not a LAS file.", "It does not begin as one.",
+        raise InputError(f"{path} is not a LAS file.", "It does not begin with the LAS signature.",
                          "Export it again.")
     minor = head[25]
     start, record_count = struct.unpack_from("<II", head, 96)
@@ -94,7 +94,7 @@ def check_las(path: Path) -> None:
         extended_start, extended = struct.unpack_from("<QI", head, 235)
         count = max(count, struct.unpack_from("<Q", head, 247)[0])
         require_size(path, 60.0 * extended, max(size - extended_start, 0), "extended records")
-    require_size(path, start, size, "where its points begin")
+    require_size(path, start, size, "an offset to its points")
     require_size(path, 54.0 * record_count, start, "its variable records")
     is_packed = bool(form & 0xC0)
     held = (size - start) * (_LAZ_EXPANSION if is_packed else 1.0)
@@ -120,13 +120,14 @@ def header_bytes(path: Path, end: bytes) -> tuple[bytes, int]:
     at = head.find(end)
     stop = head.find(b"\n", at + 1) if at >= 0 else -1
     if stop < 0:
-        raise InputError(f"{path} has no header.", "It is cut short, or not what its suffix says.",
+        raise InputError(f"{path} has no header.",
+                         "It is cut short, or its suffix does not match its content.",
                          "Export it again.")
     return head[:stop + 1], stop + 1
 
 
 def _count(path: str | os.PathLike, word: str) -> int:
     if not re.fullmatch(r"\d{1,18}", word):
-        raise InputError(f"{path} says {word[:30]!r} where a count was expected.",
+        raise InputError(f"{path} has {word[:30]!r} where a count was expected.",
                          "Its header is damaged.", "Export it again.")
     return int(word)

@@ -84,7 +84,7 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
         place = ".".join(str(part) for part in first["loc"])
         raise InputError(f"{path}: {place + ': ' if place else ''}{first['msg']}.",
                          f"{what[0].upper()}{what[1:]} was expected.",
-                         "It is damaged, or was written by another program; make it anew.",
+                         "It is damaged, or was written by another program. Make it again.",
                          ) from error
 
 
@@ -149,7 +149,7 @@ def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
     if missing:
         raise InputError(f"{path} has no column {missing[0]} of finite numbers.",
                          f"{what[0].upper()}{what[1:]} was expected.",
-                         "It is damaged, or was written by another program; make it anew.")
+                         "It is damaged, or was written by another program. Make it again.")
     return columns
 
 
@@ -163,7 +163,7 @@ def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], wh
         if values.dtype.kind in "fc" and not np.isfinite(values).all():
             raise InputError(f"{path}: {name} has values that are not finite.",
                              f"{what[0].upper()}{what[1:]} holds numbers.",
-                             "It is damaged; make it anew.")
+                             "It is damaged. Make it again.")
 
 
 def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
@@ -185,11 +185,11 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
             for wanted, length in zip(shape, array.shape, strict=True))
         if not fits:
             found = "is missing" if array is None else (
-                f"has shape {list(array.shape)} of {array.dtype}")
+                f"has shape {list(array.shape)} and type {array.dtype}")
             raise InputError(f"{path}: {name} {found}.",
                              f"{what[0].upper()}{what[1:]} was expected, with numbers of shape "
-                             f"[{', '.join(map(str, shape))}] there.",
-                             "It is damaged, or of another program; make it anew.")
+                             f"[{', '.join(map(str, shape))}] in this array.",
+                             "It is damaged, or was written by another program. Make it again.")
     require_finite(path, {name: arrays[name] for name in shapes}, what)
 
 
@@ -204,8 +204,8 @@ def require_size(path: str | os.PathLike, announced: float, held: float, what: s
         InputError: it does.
     """
     if announced > held:
-        raise InputError(f"{path} announces {what}: at least {announced:.3g} bytes, of which "
-                         f"{max(held, 0):.3g} are there.",
+        raise InputError(f"{path} announces {what}: at least {announced:.3g} bytes. It contains "
+                         f"only {max(held, 0):.3g}.",
                          "It is cut short, or its header is damaged.", "Export it again.")
 
 
@@ -221,7 +221,8 @@ def _array(stream: IO[bytes], size: int) -> np.ndarray:
         raise ValueError("it holds Python objects, which are never loaded")
     count = math.prod(shape)
     if count * kind.itemsize > size or any(length < 0 for length in shape):
-        raise ValueError(f"an array of shape {shape} is announced, and {size} bytes are there")
+        raise ValueError(f"an array of shape {shape} is announced, but there are only {size} "
+                         "bytes")
     content = stream.read(count * kind.itemsize)
     if len(content) != count * kind.itemsize:
         raise ValueError("it is cut short")
@@ -231,7 +232,7 @@ def _array(stream: IO[bytes], size: int) -> np.ndarray:
 
 def _require_modest(expanded: float, size: float) -> None:
     if expanded > max(LARGEST_EXPANSION * size, HARMLESS_BYTES):
-        raise ValueError(f"{size} bytes that would expand to {expanded:.3g}")
+        raise ValueError(f"its {size} bytes would expand to {expanded:.3g} bytes")
 
 
 def _finite(text: str) -> float:
@@ -243,7 +244,7 @@ def _finite(text: str) -> float:
 
 def _integer(text: str) -> int:
     if len(text) > 300:
-        raise ValueError(f"a number of {len(text)} digits")
+        raise ValueError(f"it contains a number of {len(text)} digits")
     return int(text)
 
 
@@ -255,4 +256,4 @@ def _unreadable(path: str | os.PathLike, what: str, error: Exception) -> InputEr
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return InputError(f"{path} cannot be read ({reason or type(error).__name__}).",
                       f"{what[0].upper()}{what[1:]} was expected.",
-                      "It is missing, damaged or of another kind.")
+                      "It is missing, damaged or of another type.")

@@ -31,11 +31,11 @@ def relative_name(name: str) -> str:
         why = "It is absolute, or has a backslash or a drive."
     elif any(not part.strip(". ") for part in pure.parts) or not pure.parts:
         # Windows drops dots and spaces at the end of a name.
-        why = "It leads upwards, or names no file."
+        why = "It leads to a parent folder, or does not name a file."
     elif any(PureWindowsPath(part).drive for part in pure.parts):
-        why = "A part of it names a drive."
+        why = "Part of it is the name of a drive."
     elif any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
-        why = "It has control characters, or is not valid Unicode."
+        why = "It contains control characters, or is not valid Unicode."
     else:
         return pure.as_posix()
     raise InputError(f"{name[:200]!r} cannot be used as a file name in a folder.", why,
@@ -81,5 +81,5 @@ def is_link(path: Path) -> bool:
 
 def _link_error(path: Path) -> InputError:
     return InputError(f"{path} is a link.",
-                      "It may lead out of its folder, where nothing may be read or written.",
-                      "Put a copy of what it leads to in its place, or remove it.")
+                      "It may point outside its folder, where Limber must not read or write.",
+                      "Replace it with a copy of its target, or remove it.")

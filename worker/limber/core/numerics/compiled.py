@@ -121,14 +121,14 @@ class _CheckedFile(IndexDataCacheFile):
             if content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest():
                 return True
             os.unlink(path)
-            _tell_damage(f"The compiled code kept in {path} was damaged; it is compiled anew.")
+            _tell_damage(f"The compiled code stored in {path} is damaged. It is compiled again.")
         except FileNotFoundError:
             # Nothing is kept; or another process has just removed it, and said so.
             return True
         except OSError as error:
-            _tell_damage(f"The compiled code kept in {path} cannot be read or replaced "
-                         f"({error.strerror}); it is compiled for this run alone. Remove that "
-                         "file or change its permissions.")
+            _tell_damage(f"The compiled code stored in {path} cannot be read or replaced "
+                         f"({error.strerror}). It is compiled for this run only. Remove that file "
+                         "or change its permissions.")
         return False
 
 
@@ -170,8 +170,8 @@ def _forgiving(kernel: Any) -> Any:
             save(signature, data)
         except OSError as error:
             # The kernel is compiled: that it is not kept costs time, no result.
-            _tell_damage(f"Compiled code cannot be kept in {cache.cache_path} "
-                         f"({error.strerror}): every run compiles it.")
+            _tell_damage(f"Compiled code cannot be stored in {cache.cache_path} "
+                         f"({error.strerror}). Every run compiles it again.")
     cache.load_overload, cache.save_overload = load_or_forget, save_or_tell
     return kernel
 

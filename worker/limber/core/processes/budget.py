@@ -29,8 +29,9 @@ def core_budget() -> int:
     except ValueError:
         count = 0
     if count < 1:
-        raise InputError(f"{CORES} is {given!r}.", "It is how many cores Limber may use.",
-                         "Set it to a whole number from 1, or unset it.")
+        raise InputError(f"{CORES} is {given!r}.",
+                         "It sets the number of cores that Limber may use.",
+                         "Set it to a whole number of at least 1, or unset it.")
     return count
 
 

@@ -48,7 +48,7 @@ class LimitWatch:
         seconds, memory_limit = self.seconds, self._limits.memory_mb
         if self._limits.seconds is not None and seconds > self._limits.seconds:
             return WorkError(f"{self._name} was stopped after {seconds:.0f} s.",
-                             "It had not finished within its time limit.",
+                             "It exceeded its time limit.",
                              "Allow it more time, or make the task smaller.")
         if memory_limit is None or time.monotonic() < self._next_look:
             return None
@@ -56,4 +56,5 @@ class LimitWatch:
         used = memory_mb(self._process_id)
         return None if used <= memory_limit else WorkError(
             f"{self._name} was stopped at {used:.0f} MB of memory.",
-            f"Its limit is {memory_limit:.0f} MB.", "Allow it more, or make the task smaller.")
+            f"Its limit is {memory_limit:.0f} MB.",
+            "Allow it more memory, or make the task smaller.")

@@ -208,7 +208,7 @@ class Pool:
         if has_ended:
             self._end(worker, WorkError(
                 f"A process of {self.name} ended with exit code {worker.process.exitcode}.",
-                "It crashed, or the system ended it because memory ran out.",
+                "It crashed, or the system ended it because it ran out of memory.",
                 "Use a coarser mesh or fewer processes (LIMBER_CORES)."))
 
     def _take(self, worker: Worker, said: Any) -> None:
