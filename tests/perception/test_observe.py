@@ -54,7 +54,7 @@ def test_depth_frames_with_an_empty_mask(tmp_path, scene, pull):
     seen, warnings = observe(folder, pull, scene.skeleton, FRACTIONS)
     assert np.isnan(seen.positions[3]).all()
     assert np.nanmax(errors(scene, seen)) < 1.5e-3
-    assert any("1 of 6 frames show no branch" in warning for warning in warnings)
+    assert any("1 of 6 frames do not show the branch" in warning for warning in warnings)
 
 
 def test_a_camera_pose_that_is_off_is_corrected(tmp_path, scene, pull):
@@ -64,7 +64,7 @@ def test_a_camera_pose_that_is_off_is_corrected(tmp_path, scene, pull):
     folder = recorded(tmp_path / "seen", scene, scene.camera.model_copy(update={
         "pose": tuple(float(x) for x in off)}))
     seen, warnings = observe(folder, pull, scene.skeleton, FRACTIONS)
-    assert any("off by up to 2" in warning and "mm" in warning for warning in warnings)
+    assert any("an error of up to 2" in warning and "mm" in warning for warning in warnings)
     assert np.nanmedian(errors(scene, seen)) < 1.5e-3
 
 

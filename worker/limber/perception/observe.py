@@ -61,7 +61,7 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
     poses = poses_at(pull.times, pull.poses,
                      np.clip(times + pull.entry.time_offset_s, pull.times[0], pull.times[-1]))
     for index, (_, path) in enumerate(frames):
-        progress(index / count, "following the control points", frame=index)
+        progress(index / count, "tracking the control points", frame=index)
         cloud = load(path)
         if len(cloud.points) < 10:
             notes.empty.append(path.stem)
@@ -80,8 +80,8 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
         positions[index, tracked.visible] = tracked.positions[tracked.visible]
         covariance[index] = tracked.covariance + LASTING_SIGMA_M**2 * np.eye(3)
     if len(notes.empty) == count:
-        raise InputError(f"{folder}: the branch is in none of the {count} frames.",
-                         "Every mask is empty, or nothing lies in the depth range.",
+        raise InputError(f"{folder}: the branch was not found in any of the {count} frames.",
+                         "All masks are empty, or no points lie within the depth range.",
                          "Check the masks and the camera's depth_scale.")
     return Observations(times, positions, covariance), _sentences(pull.name, notes, count)
 
@@ -93,17 +93,17 @@ def list_frames(folder: Path, kind: str) -> list[tuple[float, Path]]:
     try:
         frames = sorted((float(path.stem), path) for path in files)
     except ValueError as error:
-        raise InputError(f"{folder}/{sub}: {error}.", "File names are time stamps in seconds.",
-                         "Bring the frames in with `limber import-pull --rate ...`.") from error
+        raise InputError(f"{folder}/{sub}: {error}.", "File names must be time stamps in seconds.",
+                         "Import the frames with `limber import-pull --rate-hz ...`.") from error
     if len(frames) < 2:
-        raise InputError(f"{folder}/{sub} has {len(frames)} frames.", "Two are needed.",
+        raise InputError(f"{folder}/{sub} has {len(frames)} frames.", "At least two are needed.",
                          "Import the recording again.")
     return frames
 
 
 def read_depth(path: Path, camera: Camera) -> np.ndarray:
     """Read a 16-bit depth image into metres, shape [height, width]; 0 is no reading."""
-    pixels = read_pixels(path, "a 16-bit PNG of depths")
+    pixels = read_pixels(path, "a 16-bit depth image (PNG)")
     return (pixels if pixels.ndim == 2 else pixels[..., 0]) / camera.depth_scale
 
 
@@ -162,7 +162,7 @@ def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray
                        rest_pose: np.ndarray, notes: _Notes) -> tuple[np.ndarray, np.ndarray]:
     nothing = np.eye(3), np.zeros(3)
     if np.linalg.norm(pose[:3] - rest_pose[:3]) > 2e-3:
-        notes.messages.append("the first usable frame shows the branch already pulled; the "
+        notes.messages.append("the branch is already pulled in the first usable frame. The "
                               "camera's pose could not be checked.")
         return nothing
     turn, shift = rest_offset(tracker, cloud)
@@ -171,8 +171,9 @@ def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray
         return nothing
     angle = np.degrees(rotation_angle(turn))
     notes.messages.append(
-        f"the camera's pose is off by up to {moved.max() * 1e3:.0f} mm and {angle:.1f} degrees at "
-        "the branch at rest; the frames were moved onto it. Calibrate the camera again.")
+        f"the camera's pose has an error of up to {moved.max() * 1e3:.0f} mm and {angle:.1f} "
+        "degrees at the branch at rest. The frames were moved onto the branch. Calibrate the "
+        "camera again.")
     return turn, shift
 
 
@@ -187,8 +188,9 @@ def _anchor(tracker: CurveTracker, pull: Pull, pose: np.ndarray) -> Anchor:
 def _sentences(name: str, notes: _Notes, count: int) -> list[str]:
     found = [f"{name}: {message}" for message in notes.messages]
     if notes.empty:
-        found.append(f"{name}: {len(notes.empty)} of {count} frames show no branch (first at "
-                     f"{notes.empty[0]} s); left out.")
+        found.append(f"{name}: {len(notes.empty)} of {count} frames do not show the branch and "
+                     f"were discarded. The first is at {notes.empty[0]} s.")
     if notes.hidden:
-        found.append(f"{name}: control points were hidden {notes.hidden} times; left out there.")
+        found.append(f"{name}: control points were hidden {notes.hidden} times. They are not used "
+                     "in those frames.")
     return found
