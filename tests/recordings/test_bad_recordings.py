@@ -102,8 +102,8 @@ def test_spike_saturation_offset_and_sign(bare_folder, tables, capsys):
         values[:, 6:] *= -1
         return times, values
 
-    for change, words in ((spike, ("spike", "not used")), (flat, ("saturated",)),
-                          (untared, ("not tared", "subtracted")), (turned, ("sign was turned",))):
+    for change, words in ((spike, ("spike", "discarded")), (flat, ("saturated",)),
+                          (untared, ("not tared", "subtracted")), (turned, ("sign was reversed",))):
         (tables / "robot.csv").write_bytes(good)
         changed(tables / "robot.csv", change)
         line = imported(bare_folder, tables, capsys)
@@ -124,7 +124,7 @@ def test_a_recording_that_ends_inside_a_line(bare_folder, tables, capsys, table)
     """The power went off: the cut line is dropped with a word."""
     path = tables / table
     path.write_text(path.read_text()[:-25])
-    assert warned(imported(bare_folder, tables, capsys), table, "unfinished")
+    assert warned(imported(bare_folder, tables, capsys), table, "incomplete")
 
 
 def test_clocks_without_a_common_moment(bare_folder, tables, capsys):
@@ -133,7 +133,7 @@ def test_clocks_without_a_common_moment(bare_folder, tables, capsys):
     assert call(["import-pull", str(bare_folder), str(tables / "markers.csv"), "--name", "m",
                  "--robot", str(tables / "robot.csv"), "--json", "--progress", "none"]) == 0
     line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert warned(line, "no moment in common")
+    assert warned(line, "do not overlap")
     assert line["time_offset_s"] == pytest.approx(0.2 - 1.7e9, abs=0.2)
 
 

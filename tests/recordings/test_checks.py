@@ -31,7 +31,7 @@ def test_wrong_sign_is_turned(plain_pull):
     """A sensor that reports the branch's force on the gripper: negative work gives it away."""
     cleaned = clean(with_force(plain_pull, -plain_pull.wrenches))
     assert np.allclose(cleaned.wrenches, plain_pull.wrenches)
-    assert any("sign was turned" in w for w in cleaned.warnings)
+    assert any("sign was reversed" in w for w in cleaned.warnings)
 
 
 def test_sign_is_only_questioned_under_gravity(plain_pull):

@@ -65,7 +65,7 @@ def test_incomplete_rows_are_dropped_with_a_word(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("force (N),displacement (mm)\n" + rows + "0.9")
     way, _, warnings = read_force_displacement(path)
-    assert len(way) == 8 and "unfinished" in warnings[0]
+    assert len(way) == 8 and "incomplete" in warnings[0]
 
 
 def test_recorded_canes():
@@ -110,7 +110,7 @@ def test_signs_are_turned_by_the_work_done(turn_way, turn_force):
     way, force = push(np.random.default_rng(3))
     found = force_slope(turn_way * way, turn_force * force)
     assert found.slope == pytest.approx(150, rel=0.03)
-    assert any("turned" in warning for warning in found.warnings)
+    assert any("reversed" in warning for warning in found.warnings)
 
 
 def test_spike_saturation_and_slip_are_told_apart():
@@ -134,7 +134,7 @@ def test_a_push_that_starts_loaded_says_so():
     """Without a reading before contact there is none to report; the slope is right."""
     way, force = push(np.random.default_rng(5), contact=0.09)
     found = force_slope(way, force)
-    assert not found.contact_seen and any("loaded already" in w for w in found.warnings)
+    assert not found.contact_seen and any("already loaded" in w for w in found.warnings)
     assert found.slope == pytest.approx(150, rel=0.03)
 
 
@@ -179,4 +179,4 @@ def test_the_first_contact_counts_not_an_obstacle_behind_it():
     found = force_slope(way, force)
     assert found.slope == pytest.approx(60, rel=0.05)
     assert found.contact == pytest.approx(0.02, abs=3e-3)
-    assert any("left out" in message and "first contact" in message for message in found.warnings)
+    assert any("discarded" in message and "first contact" in message for message in found.warnings)

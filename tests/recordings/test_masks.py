@@ -102,7 +102,7 @@ def test_yolo_text_prompt_and_nothing_found(weights):
 
 def test_yolo_says_what_is_missing(weights, tmp_path, monkeypatch):
     """No weights, no such class, no package: each its own sentence, and nothing is downloaded."""
-    with pytest.raises(InputError, match="downloads no model"):
+    with pytest.raises(InputError, match="does not download models"):
         YoloSegmenter(tmp_path / "none.pt")
     with pytest.raises(InputError, match="potted plant"):
         YoloSegmenter(weights, class_name="oak")

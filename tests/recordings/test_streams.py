@@ -53,7 +53,7 @@ def test_a_recording_that_ends_inside_a_line(tmp_path):
     """The unfinished line goes, also where the cut leaves as many numbers as there should be."""
     for tail in ("0.3,3.1", "0.3", "0.3,-"):
         stream = read_stream(written(tmp_path, f"t_s,x\n0.1,1\n0.2,2\n{tail}"))
-        assert len(stream) == 2 and "unfinished" in stream.warnings[0]
+        assert len(stream) == 2 and "incomplete" in stream.warnings[0]
 
 
 def test_rubbish_in_the_middle_is_named_by_line(tmp_path):

@@ -89,7 +89,7 @@ def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
     ("time_s,a\n1,1\n0,2\n", "backwards"),
     ("time_s,a\n0,nan\n1,2\n", "two samples"),
     ("t,a\n1,1\n", "two samples"),
-    ("b,a\n1,1\n", "None is called time"),
+    ("b,a\n1,1\n", "No column is named time"),
     ("time_s,a\n" + "".join(f"{k},1\n" for k in range(40)) + "1e12,1\n", "gaps"),
     ("time_s,a\n" + "".join(f"{k},{k % 2}\n" for k in range(9)), "At least 32"),
 ])

@@ -25,29 +25,35 @@ class CalibrationEntry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pose_sigma_m: float = Field(
-        1e-3, ge=0, description="Place of the gripper's frame in the branch's, each axis.")
+        1e-3, ge=0,
+        description="Position of the gripper's frame in the branch's frame, each axis.")
     pose_sigma_rad: float = Field(
-        0.0175, ge=0, description="Turn of the gripper's frame in the branch's, each axis.")
+        0.0175, ge=0,
+        description="Rotation of the gripper's frame in the branch's frame, each axis.")
     pose_noise_m: float = Field(
         1e-4, gt=0, description="Error of a single pose: the robot's repeatability.")
-    force_gain_sigma: float = Field(0.02, ge=0, description="Of the force, relative.")
-    force_bias_sigma_n: float = Field(1.0, ge=0, description="Zero of the force, each axis.")
+    force_gain_sigma: float = Field(0.02, ge=0, description="Relative error of the force.")
+    force_bias_sigma_n: float = Field(
+        1.0, ge=0, description="Zero offset of the force, each axis.")
     force_drift_sigma_n: float = Field(
-        1.0, ge=0, description="Change of that zero over the recording, each axis.")
-    torque_bias_sigma_nm: float = Field(0.05, ge=0, description="Zero of the torque, each axis.")
+        1.0, ge=0, description="Drift of the force's zero over the recording, each axis.")
+    torque_bias_sigma_nm: float = Field(
+        0.05, ge=0, description="Zero offset of the torque, each axis.")
     camera_sigma_m: float = Field(
-        1e-3, ge=0, description="Place of the observer's frame in the branch's, each axis.")
+        1e-3, ge=0,
+        description="Position of the observer's frame in the branch's frame, each axis.")
     camera_sigma_rad: float = Field(
-        1e-3, ge=0, description="Turn of the observer's frame about the branch, each axis.")
+        1e-3, ge=0, description="Rotation of the observer's frame about the branch, each axis.")
     clock_sigma_s: float = Field(
-        2e-3, ge=0, description="Observer's clock against the robot's, left after alignment.")
+        2e-3, ge=0,
+        description="Offset of the observer's clock from the robot's that remains after alignment.")
     slip_sigma_m: float = Field(
-        5e-4, ge=0, description="Creep of the grasp along the branch, from begin to end.")
+        5e-4, ge=0, description="Slip of the grasp along the branch from beginning to end.")
     held_length_sigma_m: float = Field(
         1e-3, ge=0, description="Half the length of the piece that a clamping gripper holds.")
     repeat_sigma: float = Field(
-        0.02, ge=0, description="Stiffness of one and the same branch from recording to recording, "
-        "relative: creep, warmth, how it is held.")
+        0.02, ge=0, description="Relative variation of the stiffness of one branch between "
+        "recordings: creep, temperature, how it is held.")
 
 
 EXACT = CalibrationEntry(

@@ -28,10 +28,10 @@ STIFFENING = 0.3
 
 WHY_NO_MODULUS = (
     "A force slope is the stiffness of the whole structure below the contact: proportional to "
-    "Young's modulus times radius to the fourth power over length cubed. Radius along the branch "
-    "and where it is held are not in this file; a radius wrong by 10 % alone changes the modulus "
-    "by 40 %. Reconstruct the branch from a scan and import the pull with its grasp point to get "
-    "a modulus.")
+    "Young's modulus times radius to the fourth power over length cubed. This file does not "
+    "contain the radius along the branch or the position where the branch is held. A radius error "
+    "of 10 % alone changes the modulus by 40 %. To get a modulus, reconstruct the branch from a "
+    "scan and import the pull with its grasp point.")
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,9 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
     kept = pairs[np.isfinite(pairs).all(axis=1)]
     warnings = list(table.warnings)
     if len(kept) < len(pairs):
-        warnings.append(f"{path.name}: {len(pairs) - len(kept)} incomplete row(s) were dropped.")
+        warnings.append(f"{path.name}: {len(pairs) - len(kept)} incomplete row(s) were discarded.")
     if len(kept) < 5:
-        raise InputError(f"{path} has {len(kept)} complete rows.", "Five are needed for a slope.",
+        raise InputError(f"{path} has {len(kept)} complete rows.", "A slope needs at least five.",
                          "Record more of the push.")
     return kept[:, 0] * moved_scale, kept[:, 1] * force_scale, tuple(warnings)
 
@@ -122,21 +122,21 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
     loaded = (x > contact) & (y > baseline + NOISE_FLOOR_N) & (x <= obstacle)
     if obstacle < x[-1]:
         messages.append(
-            f"From {1e3 * obstacle:.1f} mm on the force rises {OBSTACLE:.0f} times as steeply or "
-            f"more: something else is touched there. {int(np.sum(x > obstacle))} samples beyond "
-            "were left out; the slope is that of the first contact.")
+            f"From {1e3 * obstacle:.1f} mm the force rises at least {OBSTACLE:.0f} times as "
+            f"steeply, so the sensor touches a second object there. {int(np.sum(x > obstacle))} "
+            "samples beyond this point were discarded. The slope is that of the first contact.")
     if loaded.sum() < 4:
         raise InputError(
             f"The force rises by {np.ptp(y):.3g} N over {np.ptp(x) * 1e3:.3g} mm.",
-            f"Fewer than 4 samples lie over the noise of {NOISE_FLOOR_N:.2g} N.",
+            f"Fewer than 4 samples exceed the noise of {NOISE_FLOOR_N:.2g} N.",
             "Push farther, or use a more sensitive sensor.")
     contact_seen = bool(contact > x[0])
     if not contact_seen:
-        messages.append("The first sample is loaded already: where contact was made, and the "
-                        "reading without load, are not in the file. The slope is.")
+        messages.append("The first sample is already loaded. The file does not show the position "
+                        "of contact or the reading without load. The slope is still valid.")
     elif abs(baseline) > NOISE_FLOOR_N:
-        messages.append(f"The load cell reads {baseline:.3g} N without load: not tared. The slope "
-                        "does not depend on it.")
+        messages.append(f"The load cell reads {baseline:.3g} N without load: it was not tared. "
+                        "This does not affect the slope.")
     x, y = x[loaded], y[loaded]
     slope, error = _line(x, y)
     width = scipy.special.stdtrit(len(x) - 2, 0.975) * error
@@ -146,14 +146,15 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
         len(slips) and slips[0] >= 3) else None
     if len(slips):
         messages.append(
-            f"The force drops at once at {', '.join(f'{x[k] * 1e3:.1f}' for k in slips[:4])} mm: "
-            "the contact slipped, or wood gave way. "
+            f"The force drops suddenly at {', '.join(f'{x[k] * 1e3:.1f}' for k in slips[:4])} mm: "
+            "the contact slipped, or the wood broke. "
             + (f"Up to the first drop the slope is {before:.4g} N/m." if before else ""))
     elif stiffening is not None and abs(stiffening) > STIFFENING:
         messages.append(f"The slope changes by {100 * stiffening:+.0f} % along the push: a "
-                        "straight line is a coarse description of it.")
+                        "straight line describes it only roughly.")
     if slope <= 0:
-        messages.append("The force falls as the actuator advances: sign or slip?")
+        messages.append("The force falls as the actuator advances. Check its sign, and check "
+                        "whether the contact slipped.")
     return ForceSlope(
         float(slope), (float(slope - width), float(slope + width)), float(contact), contact_seen,
         float(baseline), len(x), stiffening, tuple(float(x[k]) for k in slips), before,
@@ -171,12 +172,14 @@ def _column(table: Table, name: str, units: dict[str, float], given: str | None,
             return index, units[given]
         if title.unit is None:
             raise InputError(
-                f"{table.path}: the column {text!r} names no unit out of {', '.join(units)}.",
-                "A number without unit cannot be used.",
-                "Add it: 'Force (N)'; or give --unit and --force-unit.")
+                f"{table.path}: the column {text!r} does not state a unit. Known units: "
+                f"{', '.join(units)}.",
+                "A number without a unit cannot be used.",
+                "Add the unit to the title, for example 'Force (N)', or give --unit and "
+                "--force-unit.")
         return index, scale_of(title, units, "", table.path)
     raise InputError(f"{table.path} has the columns {', '.join(table.titles)}.",
-                     f"None is named like {name.replace('|', ' or ')}.", "Rename the column.")
+                     f"No column name contains {name.replace('|', ' or ')}.", "Rename the column.")
 
 
 def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
@@ -185,7 +188,7 @@ def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
     limited = saturated(force[:, None])
     if limited.any() and limited.sum() < 0.8 * len(force):
         messages.append(f"{int(limited.sum())} readings at {np.abs(force[limited]).max():.3g} N "
-                        "are alike: the load cell is saturated there; left out, at "
+                        "are identical: the load cell is saturated there. They were discarded, at "
                         f"{_shown_places(moved[limited])}.")
         moved, force = moved[~limited], force[~limited]
     # One sample far from both neighbours, on the same side; a slip stays where it falls to.
@@ -195,7 +198,7 @@ def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
     stray = np.r_[False, jump > max(10 * usual, 2 * NOISE_FLOOR_N), False] if len(force) > 2 else (
         np.zeros(len(force), bool))
     if stray.any():
-        messages.append(f"{int(stray.sum())} spike(s) in the force, left out: at "
+        messages.append(f"{int(stray.sum())} spike(s) in the force were discarded, at "
                         f"{_shown_places(moved[stray])}.")
     return moved[~stray], force[~stray]
 
@@ -213,15 +216,16 @@ def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
     """Turn signs so that the actuator advances and the body pushes back."""
     far = int(np.argmax(np.abs(moved - moved[0])))
     if moved[far] < moved[0]:
-        messages.append("The displacement counts downwards; it was turned.")
+        messages.append("The displacement decreases as the actuator advances. Its sign was "
+                        "reversed.")
         moved = -moved
     far = int(np.argmax(moved))
     change = force[:far + 1] - force[0]
     # Work of the reading over its first one: negative where the sensor counts pressure negative.
     work = float(np.sum((change[1:] + change[:-1]) / 2 * np.diff(moved[:far + 1])))
     if work < 0 and change.min() < -NOISE_FLOOR_N and -change.min() > 3 * change.max():
-        messages.append("The reading falls as the actuator advances: by the work done, its sign "
-                        "is that of the force on the sensor. It was turned.")
+        messages.append("The reading falls as the actuator advances. The work done shows that it "
+                        "is the force on the sensor. Its sign was reversed.")
         force = -force
     return moved, force
 

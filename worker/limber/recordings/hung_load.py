@@ -76,7 +76,7 @@ def settled(seen: Observations, name: str) -> Settled:
     whole = seen.visible.mean(axis=0) > 0.5
     if not whole.any() or not np.isfinite(positions[0, whole]).all(axis=1).any():
         raise InputError(f"{name}: the first frame shows no marker that stays in view.",
-                         "It must show the branch without the load.",
+                         "The first frame must show the branch without the load.",
                          "Trim the recording so that it starts before the load.")
     noise = _noise(positions[:, whole])
     last = max(len(times) // 20, 3)
@@ -87,8 +87,8 @@ def settled(seen: Observations, name: str) -> Settled:
     moved = float(np.nanmax(off[whole]))
     if moved < 1.5 * SURE * noise * np.sqrt(1 / count + 1 / last):
         raise InputError(
-            f"{name}: between start and end no marker moves more than {moved * 1e3:.2g} mm.",
-            f"The markers' noise is {noise * 1e3:.2g} mm: no load shows.",
+            f"{name}: no marker moves by more than {moved * 1e3:.2g} mm between start and end.",
+            f"The markers' noise is {noise * 1e3:.2g} mm, so the load has no visible effect.",
             "Hang a larger weight, or check that the recording starts without it.")
     away = np.linalg.norm(_running_mean(positions[:, whole]) - end[whole], axis=2)
     band = max(STILL_SHARE * moved, STRAY * noise * np.sqrt(1 / MEAN_WIDTH + 1 / last))
@@ -100,18 +100,18 @@ def settled(seen: Observations, name: str) -> Settled:
         swing = np.nanmax(np.ptp(positions[-last:, whole], axis=0))
         raise InputError(
             f"{name}: the recording ends before the branch is at rest (it still moves by "
-            f"{swing * 1e3:.2g} mm).", "A static fit needs the branch at rest under its load.",
-            "Record until it has settled, or import it with --motion swing and fit the swing "
-            "(`limber swing`).")
+            f"{swing * 1e3:.2g} mm).", "A static fit needs the branch at rest under the load.",
+            "Record until the branch has settled, or import the recording with --motion swing and "
+            "fit the swing (`limber swing`).")
     blocks = np.array_split(np.arange(first, len(times)), FRAMES)
     means = np.array([_mean(positions[block]) for block in blocks])
     middle = np.array([times[block].mean() for block in blocks])
     drift = float(np.nanmax(np.linalg.norm(means[-1] - means[0], axis=1)[whole]))
     warnings: tuple[str, ...] = ()
     if drift > 0.002 * moved + 2 * noise / np.sqrt(len(blocks[0])):
-        warnings = (f"{name}: at rest it still creeps, by {100 * drift / moved:.1f} % of its "
-                    f"displacement over {times[-1] - times[first]:.1f} s. Young's modulus is that "
-                    "of this moment.",)
+        warnings = (f"{name}: the branch still creeps at rest, by {100 * drift / moved:.1f} % of "
+                    f"its displacement over {times[-1] - times[first]:.1f} s. Young's modulus "
+                    "applies to this moment only.",)
     return Settled(rest, middle, means, noise, moved, float(times[-1] - times[first]), warnings)
 
 
@@ -126,8 +126,8 @@ def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]
     """
     whole = seen.visible.mean(axis=0) > 0.5
     if not whole.any():
-        raise InputError(f"{name}: no marker stays in view.", "A swing is followed in time.",
-                         "Record again, with the markers towards the cameras.")
+        raise InputError(f"{name}: no marker stays in view.", "A swing is tracked over time.",
+                         "Record again with the markers facing the cameras.")
     noise = _noise(seen.positions[:, whole])
     if start == "held":
         last = _mean(seen.positions[-max(len(seen.times) // 20, 3):])
@@ -136,8 +136,8 @@ def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]
     way = np.nanmax(np.ptp(seen.positions[:, whole], axis=0))
     if np.nanmax(np.ptp(last[:, whole], axis=0)) > 0.05 * way + 6 * noise:
         raise InputError(f"{name}: the recording ends while the branch still swings.",
-                         "Where it rests without the load is then not known.",
-                         "Record until it has settled.")
+                         "Its rest position without the load is not known then.",
+                         "Record until the branch has settled.")
     return _mean(last), noise
 
 

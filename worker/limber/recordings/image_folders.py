@@ -50,7 +50,8 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
     files = sorted(source.glob("*.ply"))
     if len(files) < 2:
         raise InputError(f"{source} has {len(files)} PLY files.",
-                         "A folder of frames was expected.", "Name the folder that holds them.")
+                         "A folder of frames was expected.", "Give the folder that contains the "
+                                                             "frames.")
     scale, broken = LENGTH_UNITS_M[settings.unit or "m"], []
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     for index, file in enumerate(files):
@@ -64,10 +65,11 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
         write_frame(folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply", read * scale)
     if len(files) - len(broken) < 2:
         raise InputError(f"{source}: {len(broken)} of {len(files)} PLY files cannot be read.",
-                         "Two frames are needed.", "Record it again.")
+                         "At least two frames are needed.", "Record it again.")
     if (source / "camera.toml").exists():
         write_camera(folder / "camera.toml", read_camera(source / "camera.toml"))
-    return [f"{len(broken)} PLY file(s) cannot be read, the first {broken[0]}; left out."
+    return [f"{len(broken)} PLY file(s) cannot be read and were discarded. The first is "
+            f"{broken[0]}."
             ] if broken else []
 
 
@@ -112,8 +114,8 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
         shutil.copyfile(source / "background.png", folder / "background.png")
     given = sum(mask is not None for mask in masks)
     if 0 < given < len(present):
-        warnings.append(f"{len(present) - given} of {len(present)} frames have no mask; the "
-                        "branch is found there by depth alone.")
+        warnings.append(f"{len(present) - given} of {len(present)} frames have no mask. In those "
+                        "frames the branch is segmented by depth alone.")
     return warnings
 
 
@@ -122,14 +124,14 @@ def _depth_images(source: Path, settings: Any) -> tuple[list[tuple[float, Path]]
     listed = _listed(source, "depth", settings)
     if len(listed) < 2:
         raise InputError(f"{source} has {len(listed)} depth images.",
-                         "Two frames are needed.", "Copy the whole folder.")
+                         "At least two frames are needed.", "Copy the whole folder.")
     present = [(stamp, file) for stamp, file in listed if file.is_file()]
     missing = f"{len(listed) - len(present)} of {len(listed)} depth images are missing"
     lost = next((file.name for _, file in listed if not file.is_file()), "")
     if len(present) < 0.5 * len(listed):
-        raise InputError(f"{source / 'depth.txt'} names {lost}, which is not there.",
+        raise InputError(f"{source / 'depth.txt'} lists {lost}, which does not exist.",
                          f"{missing}: the recording is incomplete.", "Copy the whole folder.")
-    return present, [f"{missing}, the first {lost}; left out."] if lost else []
+    return present, [f"{missing} and were discarded. The first is {lost}."] if lost else []
 
 
 def tum_list(path: Path) -> list[tuple[float, str]]:
@@ -174,15 +176,15 @@ def _inside(source: Path, name: str) -> Path:
     try:
         return inside(source, name)
     except InputError as error:
-        raise InputError(f"A list in {source} names {name[:100]!r}. {error.seen}",
-                         f"{error.why} It may lead out of the recording's folder.",
+        raise InputError(f"A list in {source} contains {name[:100]!r}. {error.seen}",
+                         f"{error.why} It may point outside the recording's folder.",
                          f"Correct the list. {error.fix}") from error
 
 
 def _camera(source: Path, image: Path) -> Camera:
     if (source / "camera.toml").is_file():
         return read_camera(source / "camera.toml")
-    height, width = read_pixels(image, "a 16-bit PNG of depths").shape[:2]
+    height, width = read_pixels(image, "a 16-bit depth image (PNG)").shape[:2]
     for name in ("calibration.txt", "intrinsics.txt", "camera.txt"):
         if (source / name).is_file():
             fx, fy, cx, cy = _four_numbers(source / name)
@@ -193,7 +195,7 @@ def _camera(source: Path, image: Path) -> Camera:
         if (source / name).is_file():
             return _open3d_camera(source / name)
     raise InputError(f"{source} has no intrinsics.",
-                     "Depth images mean nothing without focal length and principal point.",
+                     "Depth images cannot be used without focal length and principal point.",
                      "Write camera.toml (width, height, fx, fy, cx, cy, depth_scale, pose) or "
                      "calibration.txt (fx fy cx cy) beside the images.")
 
@@ -204,26 +206,26 @@ def _four_numbers(path: Path) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{path} has something else than numbers ({error}).",
+        raise InputError(f"{path} contains text that is not a number ({error}).",
                          "fx fy cx cy were expected.", "Correct the file.") from error
     if len(numbers) == 9:
         return [numbers[0], numbers[4], numbers[2], numbers[5]]
     if len(numbers) < 4:
         raise InputError(f"{path} has {len(numbers)} numbers.",
-                         "fx fy cx cy, or a matrix of 3 x 3, were expected.", "Correct the file.")
+                         "fx fy cx cy, or a 3 x 3 matrix, was expected.", "Correct the file.")
     return numbers[:4]
 
 
 def _open3d_camera(path: Path) -> Camera:
     try:
-        content = read_json(path, "a camera intrinsic of Open3D")
+        content = read_json(path, "a file of Open3D camera intrinsics")
         matrix = [float(value) for value in content["intrinsic_matrix"]]
         # Column by column.
         return Camera(width=int(content["width"]), height=int(content["height"]), fx=matrix[0],
                       fy=matrix[4], cx=matrix[6], cy=matrix[7],
                       depth_scale=float(content.get("depth_scale", 1000.0)))
     except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
-        raise InputError(f"{path} is no camera intrinsic of Open3D ({error!r}).",
+        raise InputError(f"{path} is not a file of Open3D camera intrinsics ({error!r}).",
                          "width, height and intrinsic_matrix (9 numbers) were expected.",
                          "Write camera.toml instead.") from error
 
@@ -237,12 +239,12 @@ def _placed(camera: Camera, source: Path, start: float, end: float) -> tuple[Cam
     try:
         rows = np.array([[stamp, *map(float, text.split()[:7])] for stamp, text in listed])
         if rows.shape[1] != 8 or not np.isfinite(rows).all():
-            raise ValueError("tx ty tz qx qy qz qw are needed in every line")
+            raise ValueError("each line needs tx ty tz qx qy qz qw")
         turn = np.linalg.norm(rows[:, 4:], axis=1)
         if not ((turn > 1e-6) & np.isfinite(turn)).all():
-            raise ValueError("a quaternion of length 0 is no turn")
+            raise ValueError("a quaternion has length 0")
     except ValueError as error:
-        raise InputError(f"{path} is no trajectory ({error}).",
+        raise InputError(f"{path} is not a trajectory ({error}).",
                          "Each line is `timestamp tx ty tz qx qy qz qw`.",
                          "Correct the file.") from error
     nearest = rows[np.argmin(np.abs(rows[:, 0] - start))]
@@ -256,8 +258,8 @@ def _placed(camera: Camera, source: Path, start: float, end: float) -> tuple[Cam
     if moved > CAMERA_MOVES_M or turned > CAMERA_TURNS_RAD:
         raise InputError(
             f"{path}: the camera moves by {moved * 1e3:.0f} mm and {np.degrees(turned):.1f} "
-            "degrees during the pull.", "One pose is taken for all frames.",
-            "Fix the camera while the branch is pulled.")
+            "degrees during the pull.", "One camera pose is used for all frames.",
+            "Keep the camera fixed while the branch is pulled.")
     return placed, []
 
 
@@ -287,8 +289,9 @@ def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
 
     images = _listed(source, "rgb", settings)
     if not images:
-        raise InputError(f"{source} has no colour images.", "YOLO finds the branch in them.",
-                         "Record rgb/ (and rgb.txt), or leave --yolo-weights out.")
+        raise InputError(f"{source} has no colour images.", "YOLO segments the branch in colour "
+                                                            "images.",
+                         "Record rgb/ (and rgb.txt), or omit --yolo-weights.")
     segment = YoloSegmenter(Path(settings.yolo_weights), prompt=settings.yolo_prompt,
                             class_name=settings.yolo_class)
     masks: list[np.ndarray | None] = []
@@ -321,5 +324,5 @@ def _stamp(file: Path, index: int, settings: Any) -> float:
             raise ValueError("not finite")
         return stamp
     except ValueError as error:
-        raise InputError(f"The file name {file.name} is no time stamp.",
-                         "Frames need times.", "Give --rate-hz.") from error
+        raise InputError(f"The file name {file.name} is not a time stamp.",
+                         "Every frame needs a time.", "Give --rate-hz.") from error

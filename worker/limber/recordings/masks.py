@@ -37,8 +37,9 @@ def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
     valid = np.isfinite(depth) & (depth > near) & (depth < far)
     if background is not None:
         if background.shape != depth.shape:
-            raise InputError(f"The background has {background.shape}, the depth {depth.shape}.",
-                             "They must be of one camera.", "Record the background again.")
+            raise InputError(f"The background has shape {background.shape}, the depth image "
+                             f"{depth.shape}.",
+                             "They must come from the same camera.", "Record the background again.")
         known = np.isfinite(background) & (background > 0)
         valid &= ~known | (depth < background - difference)
     labels, count = scipy.ndimage.label(valid, structure=np.ones((3, 3)))
@@ -59,15 +60,15 @@ class YoloSegmenter:
                  confidence: float = 0.25):
         weights = Path(weights)
         if not weights.is_file():
-            raise InputError(f"There is no weights file {weights}.",
-                             "Limber downloads no model by itself.",
-                             "Give the path of a YOLO segmentation model of your own.")
+            raise InputError(f"The weights file {weights} does not exist.",
+                             "Limber does not download models.",
+                             "Give the path of your own YOLO segmentation model.")
         try:
             from ultralytics import YOLO
         except ImportError as error:
             raise MissingDependencyError(
-                "The package ultralytics is not installed.", "It runs YOLO models.",
-                "Install it (pip install ultralytics), or use masks from files or the built-in "
+                "The package ultralytics is not installed.", "It is needed to run YOLO models.",
+                "Install it (pip install ultralytics), use masks from files, or use the built-in "
                 "segmenter.") from error
         self._model = YOLO(str(weights))
         self._confidence = confidence
@@ -83,16 +84,18 @@ class YoloSegmenter:
         masks = data.cpu().numpy() if hasattr(data, "cpu") else np.asarray(data)
         joined = (masks > 0.5).any(axis=0)
         if joined.shape != image.shape[:2]:
-            raise WorkError(f"YOLO's masks have {joined.shape}, the image {image.shape[:2]}.",
-                            "Masks at the image's size were asked for.", "Update ultralytics.")
+            raise WorkError(f"YOLO's masks have shape {joined.shape}, the image "
+                            f"{image.shape[:2]}.",
+                            "The masks must have the image's size.", "Update ultralytics.")
         return joined
 
     def _chosen_classes(self, prompt: str | None, class_name: str | None) -> list[int] | None:
         model: Any = self._model
         if prompt is not None:
             if not hasattr(model, "set_classes"):
-                raise InputError("This YOLO model takes no text prompt.",
-                                 "Its classes are fixed.", "Name one of them, or use YOLOE.")
+                raise InputError("This YOLO model does not accept a text prompt.",
+                                 "Its classes are fixed.",
+                                 "Select one of its classes, or use YOLOE.")
             model.set_classes([prompt])
             return None
         if class_name is None:
@@ -100,6 +103,6 @@ class YoloSegmenter:
         numbers = [number for number, name in dict(model.names).items() if name == class_name]
         if not numbers:
             raise InputError(f"The model has no class {class_name!r}.",
-                             f"It has {', '.join(map(str, dict(model.names).values()))}.",
-                             "Name one of these.")
+                             f"Its classes are {', '.join(map(str, dict(model.names).values()))}.",
+                             "Select one of these.")
         return numbers

@@ -30,9 +30,11 @@ class GraspEntry(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    point_m: Vector = Field(description="Centre of the grasp patch at rest, branch frame.")
-    radius_m: float = Field(gt=0, description="Nodes within this distance are held; clamped, the "
-                            "branch as far to both sides along its axis.")
+    point_m: Vector = Field(
+        description="Centre of the grasp patch at rest, in the branch's frame.")
+    radius_m: float = Field(
+        gt=0, description="Nodes within this distance are held. A clamped grasp holds the branch "
+        "over this length to both sides along its axis.")
     mode: Literal["clamped", "pinned"] = "clamped"
 
 
@@ -54,12 +56,12 @@ class SwingEntry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     start: Literal["held", "loaded"] = Field(
-        "held", description="held: in its shape at rest, until its weight and the load act; "
-        "loaded: bent by the load, until that is gone.")
+        "held", description="held: in the rest shape, until weight and load act. loaded: bent by "
+        "the load until it is removed.")
     load_mass_kg: float = Field(0.0, ge=0, description="Mass that swings with the branch.")
-    noise_m: float = Field(gt=0, description="Of one reading of a marker.")
+    noise_m: float = Field(gt=0, description="Noise of one reading of a marker.")
     registration_m: float | None = Field(
-        None, gt=0, description="RMS distance of the markers from their places on the branch.")
+        None, gt=0, description="RMS distance of the markers from their positions on the branch.")
 
 
 class PullEntry(BaseModel):
@@ -71,21 +73,21 @@ class PullEntry(BaseModel):
     observation: Literal["markers", "clouds", "depth", "none"] = "markers"
     drive: Literal["pose", "force"] = "pose"
     motion: Literal["quasi_static", "dynamic", "swing"] = "quasi_static"
-    swing: SwingEntry | None = Field(None, description="Of motion \"swing\".")
+    swing: SwingEntry | None = Field(None, description="For motion \"swing\".")
     gravity_m_s2: Vector | None = Field(
-        None, description="Gravity that bends the branch out of its rest shape; absent where the "
-        "scanned shape already carries it.")
+        None, description="Gravity that bends the branch out of its rest shape. Absent if the "
+        "scanned shape already includes it.")
     weightless: bool = Field(
-        False, description="A simulated pull of a branch without weight.")
+        False, description="Whether this is a simulated pull of a branch without weight.")
     time_offset_s: float = Field(
         0.0, description="Added to the observations' time stamps to get the robot's.")
     grasp: GraspEntry
     sensor: SensorEntry = SensorEntry()
     calibration: CalibrationEntry | None = Field(
-        None, description="How well gripper, force and camera are calibrated; absent: as a cell "
-        "that was set up with care and not measured since.")
+        None, description="Calibration errors of gripper, force and camera. Absent: those of a "
+        "cell that was set up with care and not measured since.")
     rest_points_m: tuple[Vector, ...] | None = Field(
-        None, description="Where the observed points are at rest; absent: the control points.")
+        None, description="Positions of the observed points at rest. Absent: the control points.")
     source: str = ""
     truth: dict[str, Any] | None = None
 
@@ -156,7 +158,8 @@ def read_pull(folder: str | Path) -> Pull:
     if not np.isfinite(poses).all():
         bad = ~np.isfinite(poses).all(axis=1)
         robot = replace(robot, times=robot.times[~bad], warnings=(
-            *robot.warnings, f"robot.csv: {bad.sum()} rows without a full pose were dropped."))
+            *robot.warnings,
+            f"robot.csv: {bad.sum()} rows without a complete pose were discarded."))
         poses, wrenches = poses[~bad], wrenches[~bad]
     warnings = list(robot.warnings)
     observations = None
@@ -201,7 +204,7 @@ def entry_of_text(text: str, where: str) -> PullEntry:
     try:
         content = tomlkit.parse(text).unwrap()
     except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
-        raise InputError(f"{where} holds no TOML ({error}).", "", "Export it again.") from error
+        raise InputError(f"{where} is not valid TOML ({error}).", "", "Export it again.") from error
     return _checked(content, where)
 
 
@@ -212,7 +215,8 @@ def _checked(content: dict[str, Any], where: str) -> PullEntry:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise InputError(f"{where}: {place}: {first['msg']}.",
-                         "The pull cannot be read without it.", "Correct the entry.") from error
+                         "The pull cannot be read without a valid entry.",
+                         "Correct the entry.") from error
 
 
 def write_entry(path: Path, entry: PullEntry) -> None:
@@ -237,7 +241,8 @@ def _columns(path: Path, stream: Stream, names: tuple[str, ...], missing: float 
     if absent and missing is None:
         raise InputError(f"{path} lacks {', '.join(absent)}.",
                          "The gripper's pose is needed in every row.",
-                         "Add the columns (metres, radians; names as in the documentation).")
+                         "Add the columns, in metres and radians, with the names given in the "
+                         "documentation.")
     return np.column_stack([
         stream.values[:, stream.columns.index(name)] if name in stream.columns
         else np.full(len(stream), missing) for name in names])
@@ -246,8 +251,8 @@ def _columns(path: Path, stream: Stream, names: tuple[str, ...], missing: float 
 def _marker_observations(path: Path, stream: Stream) -> Observations:
     if len(stream.columns) % 3 or not all(name.endswith("_m") for name in stream.columns):
         raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
-                         "Three columns a marker, m0_x_m, m0_y_m, m0_z_m, ..., were expected.",
-                         "Bring the file in with `limber import-pull --unit ...`.")
+                         "Three columns per marker, m0_x_m, m0_y_m, m0_z_m, ..., were expected.",
+                         "Import the file with `limber import-pull --unit ...`.")
     positions = stream.values.reshape(len(stream), -1, 3)
     partly = np.isfinite(positions).any(axis=2) & ~np.isfinite(positions).all(axis=2)
     positions = np.where(partly[..., None], np.nan, positions)

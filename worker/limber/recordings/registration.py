@@ -58,21 +58,23 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
                  if line.strip() and not line.startswith("#")]
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read ({error}).",
-                         "The markers' nominal places were expected.", "Check the path.") from error
+                         "The markers' nominal positions were expected.",
+                         "Check the path.") from error
     sign = next((sign for sign in ("\t", ";", ",") if lines and sign in lines[0]), ",")
     rows = [[part.strip().strip('"') for part in line.split(sign)] for line in lines]
     try:
         titles = [split_title(part) for part in rows[0][1:4]]
         if len(titles) != 3:
-            raise ValueError("its first line has no three columns of places")
+            raise ValueError("its first line does not have three columns of positions")
         scale = [scale_of(title, LENGTH_UNITS_M, "m", path) for title in titles]
         labels = [row[0] for row in rows[1:]]
         places = np.array([[float(part) for part in row[1:4]] for row in rows[1:]])
         if places.shape != (len(labels), 3) or not np.isfinite(places).all():
-            raise ValueError("three numbers a marker are needed")
+            raise ValueError("each marker needs three numbers")
     except (IndexError, ValueError) as error:
-        raise InputError(f"{path} is no table of markers ({error}).",
-                         "Its first line is label,x_m,y_m,z_m, then one marker a line.",
+        raise InputError(f"{path} is not a table of markers ({error}).",
+                         "The first line must be label,x_m,y_m,z_m. Each further line is one "
+                         "marker.",
                          "Correct the file.") from error
     return labels, places * scale
 
@@ -100,13 +102,13 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
     messages = []
     if len(pairs) < 3 and len(labels) == len(nominal_labels) and np.isfinite(points).all():
         pairs, told = _paired_by_fit(points, nominal)
-        messages.append(f"{name}: markers share no names with the nominal ones; {told}.")
+        messages.append(f"{name}: the markers' names do not match the nominal names; {told}.")
     if len(pairs) < 3:
         raise InputError(
-            f"{name}: the recording has {', '.join(labels)}; nominal places are known of "
-            f"{', '.join(nominal_labels)}.",
-            "Three markers in common, in view at the start, are needed for a rigid fit.",
-            "Use the recording's labels.")
+            f"{name}: the recording has the markers {', '.join(labels)}. Nominal positions are "
+            f"given for {', '.join(nominal_labels)}.",
+            "A rigid fit needs three common markers that are in view at the start.",
+            "Use the recording's labels in the table of nominal positions.")
     used = np.array([k for k, _ in pairs])
     target = nominal[[j for _, j in pairs]]
     messages += _unpaired(labels, nominal_labels, pairs, name)
@@ -117,8 +119,9 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
     residual = np.linalg.norm(points[used] @ rotation.T + shift - target, axis=1)
     for k, off, good in zip(used, residual, inlier, strict=True):
         if not good or off > POOR_FIT_M:
-            messages.append(f"{name}: marker {labels[k]} lies {off * 1e3:.1f} mm from its nominal "
-                            f"place{'' if good else ' and was left out of the rigid fit'}.")
+            excluded = "" if good else " and was excluded from the rigid fit"
+            messages.append(f"{name}: marker {labels[k]} is {off * 1e3:.1f} mm away from its "
+                            f"nominal position{excluded}.")
     return Registration(rotation, shift, used, residual, tuple(messages))
 
 
@@ -132,23 +135,23 @@ def _unpaired(labels: list[str], nominal_labels: list[str], pairs: list[tuple[in
     missing = [label for j, label in enumerate(nominal_labels) if j not in {j for _, j in pairs}]
     if missing:
         raise InputError(
-            f"{name}: {', '.join(missing)} has a nominal place, but is not in the recording's "
-            f"first frame; that has {', '.join(labels)}.",
-            "A marker that is missing, or has another name there, would be left out silently.",
-            "Correct its name in the table of nominal places, or take it out of the table.")
+            f"{name}: {', '.join(missing)} has a nominal position, but is not in the recording's "
+            f"first frame. That frame has {', '.join(labels)}.",
+            "A marker that is missing or has another name would be ignored without notice.",
+            "Correct its name in the table of nominal positions, or remove it from the table.")
     unknown = [label for k, label in enumerate(labels) if k not in {k for k, _ in pairs}]
     if not unknown:
         return []
-    return [f"{name}: no nominal place is known of {', '.join(unknown)}; left out."]
+    return [f"{name}: {', '.join(unknown)} has no nominal position and was discarded."]
 
 
 def _require_body(target: np.ndarray, name: str) -> None:
     """Raises InputError where markers lie on a line: a turn about it would not show."""
     extent = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)
     if extent[1] < max(COLLINEAR * extent[0], 1e-4):
-        raise InputError(f"{name}: the markers' nominal places lie on a line.",
-                         "How the recording is turned about that line cannot be told.",
-                         "Use a marker beside the line; three must span a triangle.")
+        raise InputError(f"{name}: the markers' nominal positions lie on a line.",
+                         "The rotation of the recording about that line cannot be determined.",
+                         "Use at least one marker off the line, so that three span a triangle.")
 
 
 def _require_same_body(points: np.ndarray, target: np.ndarray, labels: list[str],
@@ -160,9 +163,9 @@ def _require_same_body(points: np.ndarray, target: np.ndarray, labels: list[str]
     mirrored = float(np.sqrt(np.mean(_residuals(points * [1.0, 1.0, -1.0], target)**2)))
     if mirrored < min(rms / 3, POOR_FIT_M):
         raise InputError(
-            f"{name}: the markers fit their nominal places to {1e3 * mirrored:.1f} mm mirrored, "
-            f"and to {1e3 * rms:.0f} mm as they are.",
-            "An axis counts the other way in the recording or in the table.",
+            f"{name}: the markers fit their nominal positions to {1e3 * mirrored:.1f} mm when "
+            f"mirrored, and to {1e3 * rms:.0f} mm as they are.",
+            "One axis has the wrong sign in the recording or in the table.",
             "Check the signs and the order of the axes (x, y, z right-handed).")
     for first, second in combinations(range(len(points)), 2):
         order = np.arange(len(points))
@@ -170,10 +173,10 @@ def _require_same_body(points: np.ndarray, target: np.ndarray, labels: list[str]
         swapped = float(np.sqrt(np.mean(_residuals(points, target[order])**2)))
         if swapped < min(rms / 3, POOR_FIT_M):
             raise InputError(
-                f"{name}: {labels[first]} and {labels[second]} fit to {1e3 * swapped:.1f} mm if "
+                f"{name}: {labels[first]} and {labels[second]} fit to {1e3 * swapped:.1f} mm when "
                 f"they are exchanged, and to {1e3 * rms:.0f} mm as they are named.",
-                "They are mistaken for each other in the recording or in the table.",
-                "Exchange their names in the table of nominal places.")
+                "Their names are swapped in the recording or in the table.",
+                "Exchange their names in the table of nominal positions.")
 
 
 def _residuals(points: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -201,12 +204,12 @@ def _consistent(points: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _paired_by_fit(points: np.ndarray, nominal: np.ndarray) -> tuple[list[tuple[int, int]], str]:
     order = tuple(range(len(points)))
     rms = float(np.sqrt(np.mean(_residuals(points, nominal)**2)))
-    told = "they were paired in their order"
+    told = "they were paired in order"
     if rms > POOR_FIT_M and len(points) <= _MOST_FOR_PERMUTATION:
         found = min(permutations(order), key=lambda p: float(
             np.sum(_residuals(points, nominal[list(p)])**2)))
         better = float(np.sqrt(np.mean(_residuals(points, nominal[list(found)])**2)))
         if better < rms / 3:
             order, rms = found, better
-            told = "they were paired as fits best"
+            told = "they were paired by the best fit"
     return [(k, order[k]) for k in range(len(points))], f"{told} ({rms * 1e3:.1f} mm RMS)"

@@ -96,8 +96,8 @@ def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: St
         turns = np.full((len(stream), 3), np.nan)
         turns[known] = Rotation.from_quat(quaternion[known]).as_rotvec()
     else:
-        warnings.append("The robot's table has no rotation: the gripper is taken not to turn. "
-                        "Right for a grasp that is pinned (--grasp-mode pinned).")
+        warnings.append("The robot's table has no rotation, so the gripper is assumed not to "
+                        "rotate. This is correct for a pinned grasp (--grasp-mode pinned).")
         turns = np.zeros((len(stream), 3))
     values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
 

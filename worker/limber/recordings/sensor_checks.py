@@ -27,8 +27,9 @@ def clean(pull: Pull) -> Pull:
         pull = replace(pull, observations=observations)
         if swaps:
             frames = ", ".join(str(frame) for frame in swaps[:8])
-            pull = pull.warned(f"{pull.name}: markers swapped names at frame {frames}"
-                               f"{' ...' if len(swaps) > 8 else ''}; they were swapped back.")
+            pull = pull.warned(f"{pull.name}: markers swapped names at frame "
+                               f"{frames}{' ...' if len(swaps) > 8 else ''}. The names were "
+                               "corrected.")
     return pull
 
 
@@ -58,10 +59,10 @@ def force_unit_suspicion(young_pa: float) -> str | None:
         return None
     fitting = [name for name, newtons in FORCE_UNITS_N.items()
                if name != "N" and low <= young_pa * newtons <= high]
-    hint = f"Is it in {' or '.join(fitting)}? " if fitting else ""
-    return (f"The measured force implies a Young's modulus of {young_pa:.2g} Pa, outside "
-            f"{low:.0e}-{high:.0e} Pa for plants: the force may be in another unit than newtons. "
-            f"{hint}Import it with --force-unit.")
+    hint = f"It may be in {' or '.join(fitting)}. " if fitting else ""
+    return (f"The measured force implies a Young's modulus of {young_pa:.2g} Pa, outside the "
+            f"range of plants, {low:.0e}-{high:.0e} Pa. The force may be in another unit than "
+            f"newtons. {hint}Import the recording with --force-unit.")
 
 
 def unswapped(observations: Observations) -> tuple[Observations, list[int]]:
@@ -121,13 +122,13 @@ def _without_bad_readings(pull: Pull) -> Pull:
         limited = np.union1d(limited, np.flatnonzero(beyond))
     if len(limited):
         messages.append(f"{pull.name}: the force sensor is saturated in {len(limited)} samples "
-                        f"(at {np.nanmax(np.abs(wrench[limited, :3])):.3g} N); their force is not "
-                        "used. Pull less far, or use a sensor of wider range.")
+                        f"(at {np.nanmax(np.abs(wrench[limited, :3])):.3g} N). The force of these "
+                        "samples is not used. Pull less far, or use a sensor with a wider range.")
     kept = np.setdiff1d(rows, limited)
     jumps = kept[spikes(wrench[kept, :3])] if len(kept) else kept
     if len(jumps):
         times = ", ".join(f"{pull.times[row]:.2f}" for row in jumps[:5])
-        messages.append(f"{pull.name}: {len(jumps)} force spike(s) at {times} s; not used.")
+        messages.append(f"{pull.name}: {len(jumps)} force spike(s) at {times} s were discarded.")
     wrench[np.union1d(limited, jumps).astype(int)] = np.nan
     return replace(pull, wrenches=wrench).warned(*messages)
 
@@ -166,12 +167,12 @@ def _with_right_sign(pull: Pull) -> Pull:
         np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
     if -least <= 3 * most or -least <= 3 * noise:
         return pull
-    seen = (f"{pull.name}: by the measured force the branch did {-least:.3g} J of work on the "
-            "gripper, which a branch at rest cannot")
+    seen = (f"{pull.name}: according to the measured force, the branch did {-least:.3g} J of work "
+            "on the gripper. A branch at rest cannot do this")
     if pull.entry.gravity_m_s2 is not None:
         return pull.warned(f"{seen} except by its weight. Check the sign of the force.")
     return replace(pull, wrenches=-pull.wrenches).warned(
-        f"{seen}: the wrench is that of the branch on the gripper. Its sign was turned.")
+        f"{seen}. The wrench is that of the branch on the gripper. Its sign was reversed.")
 
 
 def _with_gaps_named(pull: Pull) -> Pull:
@@ -183,6 +184,6 @@ def _with_gaps_named(pull: Pull) -> Pull:
         found = gaps(times)
         if len(found):
             longest = np.max(found[:, 1] - found[:, 0])
-            messages.append(f"{pull.name}: {len(found)} gap(s) in the {name}, the longest "
-                            f"{longest:.2f} s; nothing is interpolated across.")
+            messages.append(f"{pull.name}: there are {len(found)} gap(s) in the {name}, the "
+                            f"longest {longest:.2f} s. Values are not interpolated across gaps.")
     return pull.warned(*messages)

@@ -24,7 +24,7 @@ class ImportSettings(Settings):
     common = ("unit", "grasp_point", "cell")
 
     kind: Annotated[str, OneOf(kind_names)] = Field(
-        "auto", description="Kind of SOURCE. auto: by its name and content.")
+        "auto", description="Kind of SOURCE. auto: determined from its name and content.")
     robot: str | None = Field(None, description="CSV of the gripper with time, pose and wrench.")
     unit: Literal["m", "cm", "mm"] | None = Field(
         None, description="Unit of positions in SOURCE. Default: the unit in the columns' names, "
@@ -32,10 +32,10 @@ class ImportSettings(Settings):
     force_unit: Literal["N", "gf", "mN", "lbf", "kgf", "kN"] | None = Field(
         None, description="Unit of forces. Default: the unit in the columns' names, else newtons.")
     rate_hz: float | None = Field(
-        None, gt=0, description="Frames a second, if SOURCE has no time stamps.")
+        None, gt=0, description="Frames per second, if SOURCE has no time stamps.")
     nominal: str | None = Field(
         None, description="CSV with label,x_m,y_m,z_m: positions of the markers on the branch at "
-        "rest. The recording's first frames are fitted to them rigidly.")
+        "rest. A rigid transform fits the recording's first frames to them.")
     coordinates: Literal["branch", "scan"] = Field(
         "branch", description="Coordinates of --nominal, --grasp-point and --load: the branch "
         "folder's, or those of the scan's file.")
@@ -58,7 +58,8 @@ class ImportSettings(Settings):
         False, description="The scanned shape does not include the sag under the branch's own "
         "weight (it was held up, or scanned lying), so the weight acts as well.")
     drive: Literal["pose", "force"] = Field(
-        "pose", description="What drives the simulation; the other is compared with the recording.")
+        "pose", description="Quantity that drives the simulation. The other one is compared with "
+        "the recording.")
     motion: Literal["quasi_static", "dynamic", "swing"] = Field(
         "quasi_static", description="dynamic: inertia matters. swing: released without a robot "
         "(with --weight or --load), for `limber swing`.")
@@ -68,8 +69,8 @@ class ImportSettings(Settings):
     time_offset: float | None = Field(
         None, description="Added to SOURCE's time stamps [s]. Default: estimated.")
     position_sigma: float | None = Field(
-        None, gt=0, description="Noise of positions [m]. Default: 1 mm, or under a steady load "
-        "what the recording shows.")
+        None, gt=0, description="Noise of positions [m]. Default: 1 mm; under a steady load, the "
+        "noise measured in the recording.")
     force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
     torque_sigma: float | None = Field(
         None, gt=0, description="Noise of torques about the pose's position [N m]. A clamped "
@@ -78,19 +79,20 @@ class ImportSettings(Settings):
         None, description="The robot's cell file: its base in the branch's frame, and its "
         "kinematics.")
     frame_pose: tuple[float, float, float, float, float, float] | None = Field(
-        None, description="Pose, in the branch's frame, of the frame that gripper poses are "
-        "given in: [m] and rotation vector [rad]. Default: the cell's base.")
+        None, description="Pose, in the branch's frame, of the frame of the gripper poses: [m] "
+        "and rotation vector [rad]. Default: the cell's base.")
     wrench_topic: str | None = Field(None, description="Topic of the wrench, if there are several.")
     pose_topic: str | None = Field(
         None, description="Topic of the gripper's pose, or its TF frame, if there are several.")
     points_topic: str | None = Field(
-        None, description="Topic of markers, clouds or depth images. none: nothing was observed.")
+        None, description="Topic of markers, clouds or depth images. none: no observations are "
+        "used.")
     bag_clock: Literal["header", "log"] = Field(
         "header", description="Time stamps of a bag: those in the messages' headers, or the "
             "times of logging.")
     yolo_weights: str | None = Field(
-        None, description="Weights file of a YOLO segmentation model of your own, for masks of "
-        "an RGB-D folder's colour images (needs ultralytics).")
+        None, description="Weights file of your own YOLO segmentation model, for masks of an "
+        "RGB-D folder's colour images (needs ultralytics).")
     yolo_prompt: str | None = Field(
         None, description="Prompt for open-vocabulary models.")
     yolo_class: str | None = Field(None, description="Name of the class that is the branch.")

@@ -66,13 +66,13 @@ def frames_of(pull: Pull) -> Frames:
     usable &= ~inside_gap(times, gaps(pull.times))
     if usable.sum() < 2:
         raise InputError(
-            f"{pull.name}: the robot's clock covers {pull.times[0]:.2f} to {pull.times[-1]:.2f} s, "
-            f"the observations {times[0]:.2f} to {times[-1]:.2f} s.",
-            "Fewer than two observations fall into the robot's time.",
+            f"{pull.name}: the robot's recording covers {pull.times[0]:.2f} to "
+            f"{pull.times[-1]:.2f} s, the observations {times[0]:.2f} to {times[-1]:.2f} s.",
+            "Fewer than two observations lie within the robot's recording.",
             "Set time_offset_s in pull.toml, or import with --time-offset auto.")
     warnings = () if usable.all() else (
         f"{pull.name}: {np.sum(~usable)} of {len(times)} observed frames lie outside the robot's "
-        "recording or in a gap of it; not used.",)
+        "recording or in a gap in it. They are not used.",)
     times = np.clip(times[usable], pull.times[0], pull.times[-1])
     wrenches, counts = _mean_wrenches(pull, times)
     return Frames(times, poses_at(pull.times, pull.poses, times), wrenches, counts,

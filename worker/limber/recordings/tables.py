@@ -79,8 +79,8 @@ def read_table(path: str | Path) -> Table:
     first, width = _first_numbers(path, rows)
     titles = _titles(rows[:first], comments, width, separator)
     if titles is None:
-        raise InputError(f"{path} has no header line with {width} names above its numbers.",
-                         "Without names nobody knows what the columns are.",
+        raise InputError(f"{path} has no header line with {width} column names.",
+                         "The columns cannot be identified without names.",
                          "Add a first line such as t_s,x_m,y_m,z_m.")
     table = Table(path, titles, np.empty((0, width)))
     table.values = _numbers(table, bare[first:], rows[first:], text.endswith(("\n", "\r")))
@@ -110,8 +110,9 @@ def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -
     for spelt in (unit, unit.lower()):
         if spelt in known:
             return known[spelt]
-    raise InputError(f"{where}: the column {title.name!r} is in {unit!r}.",
-                     f"Known are {', '.join(units)}.", "Convert the column, or correct its name.")
+    raise InputError(f"{where}: the column {title.name!r} has the unit {unit!r}.",
+                     f"Known units: {', '.join(units)}.",
+                     "Convert the column, or correct its name.")
 
 
 def time_column(table: Table) -> int | None:
@@ -141,7 +142,7 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
     else:
         raise InputError(
             f"{table.path} has the columns {', '.join(table.titles)}.",
-            "None is called time (t_s, Time (ms), timestamp, ...).",
+            "No column is named time (t_s, Time (ms), timestamp, ...).",
             "Rename the column of time stamps, or give --rate-hz.")
     kept = [k for k in range(len(titles)) if k != at]
     times, values = in_order(table.path, times, table.values[:, kept], warnings)
@@ -171,7 +172,7 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     whole = {label: at for label, at in places.items() if set(at) == set("xyz")}
     if not whole:
         raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
-                         "No marker has an x, a y and a z column.",
+                         "No marker has x, y and z columns.",
                          "Name them LABEL_x_m, LABEL_y_m, LABEL_z_m.")
     used = [at[letter] for at in whole.values() for letter in "xyz"]
     scales = [LENGTH_UNITS_M[unit] if unit else
@@ -240,7 +241,7 @@ def _text(path: Path) -> str:
     except UnicodeDecodeError:
         text = raw.decode("latin-1")
     if "\x00" in text:
-        raise InputError(f"{path} is no text.", "A table of numbers was expected.",
+        raise InputError(f"{path} is not a text file.", "A table of numbers was expected.",
                          "Export it as CSV.")
     return text
 
@@ -284,7 +285,7 @@ def _first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
             return index, len(row)
     raise InputError(f"{path} has no row of numbers." if rows else f"{path} is empty.",
                      "A header and rows of numbers were expected.",
-                     "Check the file; export it again.")
+                     "Check the file, or export it again.")
 
 
 def _titles(above: list[list[str]], comments: list[str], width: int, separator: str | None,
@@ -326,18 +327,18 @@ def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bo
         whole = len(numbers) == width and None not in numbers
         if is_last and (not whole or not complete):
             # Without an end of line even a last line of full length may have lost digits.
-            table.warnings.append(f"{name}: the last line is unfinished; it was dropped.")
+            table.warnings.append(f"{name}: the last line is incomplete and was discarded.")
         elif whole:
             kept.append(numbers)
         else:
             bad.append(index)
     if len(bad) > 0.05 * len(rows):
-        raise InputError(f"{table.path}: {len(bad)} of {len(rows)} rows are not "
-                         f"{width} numbers, the first {lines[bad[0]][:60]!r}.",
-                         "The table cannot be trusted.", "Correct or delete those lines.")
+        raise InputError(f"{table.path}: {len(bad)} of {len(rows)} rows do not have {width} "
+                         f"numbers. The first is {lines[bad[0]][:60]!r}.",
+                         "The table is not reliable.", "Correct or delete those lines.")
     if bad:
-        table.warnings.append(f"{name}: {len(bad)} row(s) that are not {width} numbers were "
-                              f"dropped, the first {lines[bad[0]][:40]!r}.")
+        table.warnings.append(f"{name}: {len(bad)} row(s) without {width} numbers were discarded. "
+                              f"The first is {lines[bad[0]][:40]!r}.")
     return np.array(kept, float).reshape(-1, width)
 
 
@@ -345,5 +346,5 @@ def _suspicious_clock(path: Path, times: np.ndarray) -> list[str]:
     step = float(np.median(np.diff(times[np.isfinite(times)]))) if len(times) > 2 else 0.0
     if step < 1.0 or np.any(times != np.round(times)):
         return []
-    return [f"{path.name}: time names no unit and steps by {step:g}; it was taken in seconds. "
-            "If it counts milliseconds, call the column t_ms."]
+    return [f"{path.name}: the time column does not state a unit and has steps of {step:g}. "
+            "Seconds are assumed. If it is in milliseconds, rename the column to t_ms."]

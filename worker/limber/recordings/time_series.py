@@ -57,7 +57,7 @@ def read_stream(path: str | Path) -> Stream:
     if "t_s" not in rows.header:
         raise InputError(f"{path} has the columns {', '.join(rows.header)}.",
                          "A column t_s with time stamps in seconds was expected.",
-                         "Rename the column, or bring the file in with `limber import-pull`.")
+                         "Rename the column, or import the file with `limber import-pull`.")
     table = np.array(rows.numbers, float).reshape(-1, len(rows.header))
     at = rows.header.index("t_s")
     times, values = table[:, at], np.delete(table, at, axis=1)
@@ -167,9 +167,10 @@ def _read_rows(path: Path) -> _Rows:
         unfinished = is_last and not complete
         if len(numbers) != len(rows.header) or unfinished:
             if is_last:
-                rows.warnings.append(f"{path.name}: the last line is unfinished; it was dropped.")
+                rows.warnings.append(f"{path.name}: the last line is incomplete and was "
+                                     "discarded.")
                 continue
-            raise InputError(f"{path}, line {number}: {line[:60]!r}.",
+            raise InputError(f"{path}, line {number} is {line[:60]!r}.",
                              f"{len(rows.header)} numbers were expected.",
                              "Correct or delete the line.")
         rows.numbers.append(numbers)
@@ -187,17 +188,20 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
     """
     finite = np.isfinite(times)
     if not finite.all():
-        warnings.append(f"{path.name}: {np.sum(~finite)} rows without a time stamp were dropped.")
+        warnings.append(f"{path.name}: {np.sum(~finite)} rows without a time stamp were "
+                        "discarded.")
         times, values = times[finite], values[finite]
     backward = int(np.sum(np.diff(times) < 0))
     if backward and backward >= 0.1 * len(times):
         raise InputError(f"{path}: {backward} of {len(times)} time stamps run backwards.",
-                         "The rows cannot be put into order with confidence.",
-                         "Check the recorder's clock, or the column taken for time.")
+                         "The order of the rows is not reliable.",
+                         "Check the recorder's clock and the column used as time.")
     if backward:
-        warnings.append(f"{path.name}: {backward} time stamps out of order; rows were sorted.")
+        warnings.append(f"{path.name}: {backward} time stamps are out of order. The rows were "
+                        "sorted.")
     times, first = np.unique(times, return_index=True)
     doubled = len(values) - len(first)
     if doubled:
-        warnings.append(f"{path.name}: {doubled} duplicate time stamps; the first row was kept.")
+        warnings.append(f"{path.name}: there are {doubled} duplicate time stamps. The first row "
+                        "of each was kept.")
     return times, values[first]

@@ -62,10 +62,11 @@ def pull_of_bag(bag: Bag, folder: Path, settings: ImportSettings,
     clock = "stamps" if settings.bag_clock == "header" else "logged"
     frames = Frames(bag.of("transform"), clock)
     wrench = _chosen(bag, "wrench", settings.wrench_topic, "--wrench-topic",
-                     "Without a measured force nothing is said of stiffness.")
+                     "Stiffness cannot be estimated without a measured force.")
     warnings: list[str] = []
     if bag.broken:
-        warnings.append(f"{bag.path.name}: {bag.broken} messages could not be decoded; left out.")
+        warnings.append(f"{bag.path.name}: {bag.broken} messages could not be decoded and were "
+                        "discarded.")
     times, poses, base = _gripper(bag, frames, settings, clock, joint_poses, warnings)
     _require_one_clock(bag, (("wrench", getattr(wrench, clock)), ("pose", times)), settings)
     wrenches = _on_branch(wrench, getattr(wrench, clock), times, poses, base, frames, warnings)
@@ -93,9 +94,9 @@ def _chosen(bag: Bag, kind: str, named: str | None, option: str, why: str) -> To
         missing = f"no {kind}" if named is None else f"no {kind} on {named}"
         raise InputError(f"{bag.path} has {missing}.", f"{why} Its topics: {there[:400]}.",
                          f"Name a topic with {option} (known: {known}).")
-    raise InputError(f"{bag.path} has {len(topics)} topics of {kind}s: {known}.",
-                     "Two grippers, or one told twice: a pull is of one.",
-                     f"Say which with {option}.")
+    raise InputError(f"{bag.path} has {len(topics)} {kind} topics: {known}.",
+                     "A pull uses one gripper and one topic of each kind.",
+                     f"Select one with {option}.")
 
 
 def _gripper(bag: Bag, frames: Frames, settings: ImportSettings, clock: str,
@@ -132,7 +133,7 @@ def _by_frames(bag: Bag, frames: Frames, name: str | None, clock: str, warnings:
     found = frames.between(frame, root, times)
     if found is None:
         return None
-    warnings.append(f"{bag.path.name}: the gripper is frame {frame} in {root}.")
+    warnings.append(f"{bag.path.name}: the gripper's pose is that of frame {frame} in {root}.")
     return times, _six(*found), root
 
 
@@ -146,9 +147,10 @@ def _by_joints(bag: Bag, name: str | None, clock: str, joint_poses: JointPoses |
     if not bag.of("joints"):
         return None
     if joint_poses is None:
-        raise InputError(f"{bag.path} tells joint angles alone.",
-                         "Where the gripper is follows from the arm's model and tool.",
-                         "Give the robot with --cell cell.toml, or record poses or TF.")
+        raise InputError(f"{bag.path} contains only joint angles.",
+                         "The gripper's pose must be computed from the arm's model and tool.",
+                         "Give the robot's cell file with --cell cell.toml, or record poses or "
+                         "TF.")
     topic = _chosen(bag, "joints", name, "--pose-topic", "The gripper's pose is needed.")
     times, first = np.unique(getattr(topic, clock), return_index=True)
     return times, joint_poses(topic.labels, topic.values[first]), "base"
@@ -173,10 +175,11 @@ def _require_one_clock(bag: Bag, streams: tuple[tuple[str, np.ndarray], ...],
         return
     hint = "log" if settings.bag_clock == "header" else "header"
     raise InputError(
-        f"{bag.path}: the {one}s are of {first[0]:.1f} to {first[-1]:.1f} s, the {other}s of "
-        f"{second[0]:.1f} to {second[-1]:.1f} s: {abs(first[0] - second[0]):.0f} s apart.",
-        "They have no moment in common: their clocks are not one.",
-        f"Set the clocks (NTP), or take the other time stamps with --bag-clock {hint}.")
+        f"{bag.path}: the {one} time stamps run from {first[0]:.1f} to {first[-1]:.1f} s, the "
+        f"{other} time stamps from {second[0]:.1f} to {second[-1]:.1f} s. They start "
+        f"{abs(first[0] - second[0]):.0f} s apart.",
+        "They do not overlap, so they come from different clocks.",
+        f"Synchronise the clocks (NTP), or use the other time stamps with --bag-clock {hint}.")
 
 
 def _on_branch(topic: Topic, clock: np.ndarray, times: np.ndarray, poses: np.ndarray, base: str,
@@ -187,7 +190,7 @@ def _on_branch(topic: Topic, clock: np.ndarray, times: np.ndarray, poses: np.nda
     good = np.isfinite(values).all(axis=1) & np.isfinite(stamps)
     stamps, values = stamps[good], values[good]
     if len(stamps) < 2:
-        raise InputError(f"{topic.name} has {len(stamps)} wrenches.", "A pull needs a course.",
+        raise InputError(f"{topic.name} has {len(stamps)} wrenches.", "A pull needs at least two.",
                          "Record it again.")
     after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
     longest = max(_LONGEST_GAP, 3 * float(np.median(np.diff(stamps))))
@@ -200,9 +203,9 @@ def _on_branch(topic: Topic, clock: np.ndarray, times: np.ndarray, poses: np.nda
         return wrench
     found = frames.between(own, base, times)
     if found is None:
-        warnings.append(f"{topic.name} is in frame {own or '(none)'}, of which nothing says where "
-                        f"it is in {base or '(none)'}: taken to have the gripper's axes and "
-                        "centre.")
+        warnings.append(f"{topic.name} is in frame {own or '(none)'}, whose pose in "
+                        f"{base or '(none)'} is not known. It is assumed to have the gripper's "
+                        "axes and centre.")
         turns, lever = Rotation.from_rotvec(poses[:, 3:]), np.zeros((len(times), 3))
     else:
         turns, lever = found[1], found[0] - poses[:, :3]
@@ -223,17 +226,17 @@ def _placed(base: str, frames: Frames, settings: ImportSettings, warnings: list[
             return position, turn
         found = frames.between(base, "base", np.zeros(1))
         if found is None:
-            warnings.append(f"Poses are in frame {base or '(none)'}, taken to be the robot's base "
-                            "as its pendant shows it. ROS' base_link is turned by 180 degrees "
-                            "against it.")
+            warnings.append(f"Poses are in frame {base or '(none)'}. It is assumed to be the "
+                            "robot's base as the pendant shows it. ROS' base_link is rotated by "
+                            "180 degrees relative to that base.")
             return position, turn
         return position + turn.apply(found[0][0]), turn * found[1][0]
     found = frames.between(base, BRANCH_FRAME, np.zeros(1)) if base != BRANCH_FRAME else None
     if found is not None:
         return found[0][0], found[1][0]
     if base != BRANCH_FRAME:
-        warnings.append(f"Poses are in frame {base or '(none)'}, taken to be the branch's; else "
-                        "give --frame-pose.")
+        warnings.append(f"Poses are in frame {base or '(none)'}, which is assumed to be the "
+                        "branch's frame. If it is not, give --frame-pose.")
     return np.zeros(3), Rotation.identity()
 
 
@@ -247,15 +250,15 @@ def _seen(bag: Bag, folder: Path, settings: ImportSettings, clock: str, begin: f
     images = [topic for topic in bag.of("image") if named in (None, topic.name)]
     points = [topic for topic in bag.of("points") if named in (None, topic.name)]
     if named is not None and not images and not points:
-        _chosen(bag, "points", named, "--points-topic", "It was asked for.")
+        _chosen(bag, "points", named, "--points-topic", "The option --points-topic requests it.")
     if len(images) + len(points) > 1:
         if named is None and len(points) == 1:
             images = []
         else:
             known = ", ".join(topic.name for topic in (*images, *points))
-            raise InputError(f"{bag.path} shows the branch on more than one topic: {known}.",
-                             "One of them is compared with the model.",
-                             "Say which with --points-topic, or none.")
+            raise InputError(f"{bag.path} has more than one topic that shows the branch: {known}.",
+                             "The model is compared with only one of them.",
+                             "Select one with --points-topic, or give --points-topic none.")
     if points:
         topic = points[0]
         times = getattr(topic, clock) - begin
@@ -285,8 +288,8 @@ def _frame_of(topic: Topic, base: str, placed: tuple[np.ndarray, Rotation], fram
         return placed
     found = frames.between(own, base, np.zeros(1))
     if found is None:
-        warnings.append(f"{topic.name} is in frame {own or '(none)'}, of which nothing says where "
-                        "it is; taken to be that of the poses.")
+        warnings.append(f"{topic.name} is in frame {own or '(none)'}, whose position is not "
+                        "known. It is assumed to be the frame of the poses.")
         return placed
     return placed[0] + placed[1].apply(found[0][0]), placed[1] * found[1][0]
 
@@ -313,9 +316,9 @@ def _write_images(bag: Bag, topic: Topic, times: np.ndarray, base: str,
     infos = [info for info in bag.of("camera") if tuple(info.values[0, :2]) == (width, height)]
     beside = [info for info in infos if info.name.rsplit("/", 1)[0] == topic.name.rsplit("/", 1)[0]]
     if not infos:
-        raise InputError(f"{bag.path}: no CameraInfo of {width} x {height} pixels goes with "
-                         f"{topic.name}.", "Depth images mean nothing without focal length and "
-                         "principal point.", "Record the camera_info topic as well.")
+        raise InputError(f"{bag.path}: there is no CameraInfo of {width} x {height} pixels for "
+                         f"{topic.name}.", "Depth images cannot be used without focal length and "
+                         "principal point.", "Record the camera_info topic too.")
     _, _, fx, fy, cx, cy = (beside or infos)[0].values[0]
     position, turn = _frame_of(topic, base, placed, frames, warnings)
     camera = Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, depth_scale=1000.0,

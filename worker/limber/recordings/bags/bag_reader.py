@@ -92,7 +92,7 @@ def read_bag(path: Path) -> Bag:
     read, broken = int(arrays["read"]), int(arrays["broken"])
     if broken > _MOST_BROKEN * (read + broken):
         raise InputError(f"{path}: {broken} of {read + broken} messages cannot be decoded.",
-                         "What is left would be no recording.", "Record or export it again.")
+                         "Too few remain for a recording.", "Record or export it again.")
     others = tuple(str(entry) for entry in arrays["others"])
     return Bag(path, {kind: tuple(topics) for kind, topics in kinds.items()}, others, broken,
                str(arrays["pull_toml"]))

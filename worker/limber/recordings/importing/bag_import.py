@@ -54,9 +54,9 @@ def _markers(seen: Observations, told: PullEntry | None, request: ImportRequest,
     known = at_rest is not None and len(at_rest) == seen.point_count
     used = placed.used if placed else np.flatnonzero(seen.visible[0] | known)
     if not len(used):
-        raise InputError(f"{request.name}: no marker is seen in the first frame.",
-                         "Where each is at rest is not known.",
-                         "Record from before the pull, or give --nominal.")
+        raise InputError(f"{request.name}: no marker is visible in the first frame.",
+                         "The markers' positions at rest are not known.",
+                         "Start the recording before the pull, or give --nominal.")
     positions = seen.positions[:, used]
     seen = replace(seen, positions=placed.apply(positions) if placed else positions)
     rest = np.array(at_rest) if known else seen.positions[0]
@@ -73,8 +73,7 @@ def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
     try:
         return entry_of_text(bag.pull_toml, f"{bag.path.name}, metadata {LIMBER}"), ()
     except InputError as error:
-        return None, (f"{error} Grasp, noise and calibration are taken as of a bag that does not "
-                      "say them.",)
+        return None, (f"{error} Default values are used for grasp, noise and calibration.",)
 
 
 def _as_told(entry: PullEntry, told: PullEntry, request: ImportRequest) -> PullEntry:

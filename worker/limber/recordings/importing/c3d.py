@@ -35,12 +35,13 @@ def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: objec
     points, labels = data["points"], [str(label) for label in data["labels"]]
     if not points.size:
         raise InputError(f"{path} has no points.", "Marker tracks were expected.",
-                         "Export the trajectories as well.")
+                         "Export the trajectories too.")
     scale = LENGTH_UNITS_M.get(str(data["unit"]).lower(), 1e-3)
     rate = float(data["rate"])
     if not (np.isfinite(rate) and rate > 0) or np.isinf(points).any():
-        raise InputError(f"{path} has {rate:g} frames a second, or places that are not finite.",
-                         "Without times and places there is no motion.", "Export it again.")
+        raise InputError(f"{path} has a rate of {rate:g} frames per second, or positions that are "
+                         "not finite.",
+                         "A motion needs valid times and positions.", "Export it again.")
     positions = np.moveaxis(points, 0, -1).transpose(1, 0, 2) * scale
     times = np.arange(len(positions)) / rate
     return marker_tracks(times, positions), labels[:positions.shape[1]]

@@ -29,8 +29,8 @@ class RecordingFormat(Format):
 RECORDINGS = Registry("recording", "limber.recordings", [
     RecordingFormat("bag", (".mcap", ".db3", ".bag"), f"{_HERE}.bag_import:read_bag_pull",
                     recognises=lambda path: (path / "metadata.yaml").is_file(), holds="pull",
-                    about="bag of ROS, also as a folder"),
-    RecordingFormat("pull", (), f"{_READERS}:read_folder", holds="pull", about="pull of Limber",
+                    about="ROS bag, file or folder"),
+    RecordingFormat("pull", (), f"{_READERS}:read_folder", holds="pull", about="Limber pull",
                     recognises=lambda path: (path / "pull.toml").exists()),
     RecordingFormat("rgbd", (), f"{_READERS}:read_rgbd", holds="depth", about="RGB-D folder",
                     recognises=lambda path: (path / "depth").is_dir()),

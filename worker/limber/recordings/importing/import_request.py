@@ -126,10 +126,10 @@ def require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) ->
     if off > 2 * grasp.radius_m + 5e-3:
         place = ", ".join(f"{value:.4g}" for value in grasp.point_m)
         raise InputError(
-            f"{name}: the grasp point ({place}) m lies {off * 1e3:.0f} mm from the branch.",
-            "The gripper would hold nothing: the point, or the whole recording, is in another "
-            "frame of reference or unit.",
-            "Give --grasp-point on the branch (in the frame that --coordinates says), and check "
+            f"{name}: the grasp point ({place}) m is {off * 1e3:.0f} mm away from the branch.",
+            "The gripper would not hold the branch. The point, or the whole recording, has "
+            "another frame of reference or unit.",
+            "Give a --grasp-point on the branch, in the frame set by --coordinates, and check "
             "--unit.")
 
 
@@ -143,10 +143,10 @@ def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
     extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
     if off.max() > 0.25 * extent:
         raise InputError(
-            f"{name}: at rest a marker lies {off.max() * 1e3:.0f} mm from the branch, which is "
+            f"{name}: at rest a marker is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
-            "The recording is in another frame of reference, or in another unit.",
-            "Say with --nominal where on the branch the markers are, and check --unit.")
+            "The recording has another frame of reference or another unit.",
+            "Give the markers' positions on the branch with --nominal, and check --unit.")
 
 
 def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
@@ -160,12 +160,12 @@ def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
     if robot is None:
         taken = CalibrationEntry()
         return pull.warned(
-            f"{pull.name}: nothing says how well gripper and force sensor are known. Taken: the "
-            f"gripper's frame within {1e3 * taken.pose_sigma_m:g} mm and "
-            f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, the force within "
-            f"{100 * taken.force_gain_sigma:g} %, its zero within {taken.force_bias_sigma_n:g} N "
-            f"and its drift within {taken.force_drift_sigma_n:g} N, all standard deviations; the "
-            "interval of an estimate is as wide. Give --cell with the robot's cell file.")
+            f"{pull.name}: the calibration errors of gripper and force sensor are not stated. "
+            f"Assumed standard deviations: gripper frame {1e3 * taken.pose_sigma_m:g} mm and "
+            f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, force "
+            f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, "
+            f"force drift {taken.force_drift_sigma_n:g} N. They widen the interval of an "
+            "estimate. Give the robot's cell file with --cell.")
     sensor = pull.entry.sensor.model_copy(update={
         "force_range_n": robot.noise.force_range_n,
         **({} if "force_sigma" in request.given else {

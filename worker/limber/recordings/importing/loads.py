@@ -30,19 +30,21 @@ def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
     if chosen.holds != "markers":
         raise InputError(
             f"A steady load was given, but {request.source.name} is {chosen.name}.",
-            "Its rest is found in marker tracks.", "Give a CSV or C3D of markers.")
+            "The rest position is determined from marker tracks.",
+            "Give a CSV or C3D file of markers.")
     if settings.weight is not None and settings.load is not None:
-        raise InputError("Both --weight and --load were given.", "One load hangs on the branch.",
-                         "Give one of them.")
+        raise InputError("Both --weight and --load were given.", "The branch carries one load.",
+                         "Give only one of them.")
     sags = settings.weight == 0 and settings.own_weight
     if settings.grasp_point is None and not sags:
-        raise InputError("A load was given, but not where it hangs.",
-                         "How far it bends the branch depends on that.", "Give --grasp-point.")
+        raise InputError("A load was given without its position.",
+                         "The deflection of the branch depends on that position.",
+                         "Give --grasp-point.")
     if settings.motion == "dynamic":
         raise InputError("A steady load was given for a dynamic pull.",
-                         "It shows a branch that is let go and swings, or that rests.",
-                         "Give --motion swing and run `limber swing`; or leave --motion out, for "
-                         "the place of rest.")
+                         "A branch under a steady load either swings after release or is at rest.",
+                         "For a swing, give --motion swing and run `limber swing`. For the rest "
+                         "position, omit --motion.")
 
 
 def import_load(read: tuple[Stream, list[str]], request: ImportRequest) -> dict[str, Any]:
@@ -163,8 +165,8 @@ def against_load(moved: np.ndarray, load: np.ndarray) -> str:
         mean @ load / max(np.linalg.norm(mean) * np.linalg.norm(load), 1e-12), -1, 1)))
     if turn < 100:
         return ""
-    return (f"the markers move at {turn:.0f} degrees to the load. Is the recording in the "
-            "branch's frame (--nominal), and does the load pull that way?")
+    return (f"the markers move at {turn:.0f} degrees to the load. Check that the recording is in "
+            "the branch's frame (--nominal), and check the direction of the load.")
 
 
 def _load(request: ImportRequest) -> np.ndarray:

@@ -57,7 +57,7 @@ def _import_force(read: tuple[np.ndarray, np.ndarray, tuple[str, ...]], request:
     found = force_slope(displacement, force, warnings=warnings)
     for message in found.warnings:
         request.progress.warn(message)
-    request.progress.warn(f"No modulus from {request.source.name}. {WHY_NO_MODULUS}")
+    request.progress.warn(f"{request.source.name} does not give a modulus. {WHY_NO_MODULUS}")
     table = np.column_stack([displacement, force])
     np.savetxt(request.folder / "force.csv", table, "%.9g", ",", header="displacement_m,force_n",
                comments="")
@@ -96,14 +96,15 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
     if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
         offset = float(pull.times[0] - seen[0])
         request.progress.warn(
-            f"{pull.name}: the two clocks have no moment in common; the recordings were taken to "
+            f"{pull.name}: the times of the two recordings do not overlap. They are assumed to "
             "start together, and the offset was estimated from there.")
     entry = pull.entry.model_copy(update={"time_offset_s": offset})
     found, sigma = estimate_offset(replace(pull, entry=entry))
     if sigma < 0.02:
         return entry.model_copy(update={"time_offset_s": found})
     request.progress.warn(
-        f"{pull.name}: the clocks' offset cannot be told from this pull; {offset:g} s was taken.")
+        f"{pull.name}: the offset between the clocks cannot be determined from this pull. "
+        f"{offset:g} s is assumed.")
     return entry
 
 
@@ -132,8 +133,8 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
 def _gripper(request: ImportRequest) -> Stream:
     if request.settings.robot is None:
         raise InputError("No robot table was given.",
-                         "A pull needs what the gripper did: pose, and force where measured.",
-                         "Give it with --robot ROBOT.csv; a hung weight with --weight.")
+                         "A pull needs the gripper's pose, and its force where measured.",
+                         "Give the table with --robot ROBOT.csv, or a hung weight with --weight.")
     return read_robot(Path(request.settings.robot), request)
 
 
