@@ -63,12 +63,13 @@ def test_frames_go_to_the_flange_and_back(cell_file):
 
 
 @pytest.mark.parametrize("old, new, told", [
-    ('model = "UR5e"', 'model = "kuka"', r"line 4: robot\.model: is none of ur3"),
+    ('model = "UR5e"', 'model = "kuka"',
+     r"line 4: robot\.model: is not a known arm; known arms are ur3"),
     ("pose = [0.6, 0.1, 0.0, 0.0, 0.0, 1.2]", "pose = [600, 100, 0, 0, 0, 1.2]",
-     r"line 8: base\.pose: lies 600 m away: millimetres"),
+     r"line 8: base\.pose: is 600 m away; it may have been given in millimetres"),
     ("pose = [0.6, 0.1, 0.0, 0.0, 0.0, 1.2]", "pose = [0.6, 0.1, nan, 0, 0, 1.2]",
      r"line 8: base\.pose.*finite"),
-    ("mass_kg = 0.9", "mass_kg = 9.0", "ur5e carries 5"),
+    ("mass_kg = 0.9", "mass_kg = 9.0", "ur5e carries at most 5 kg"),
     ("mass_kg = 0.9", "mass = 0.9", r"line 13: tool\.mass: Extra"),
     ("hard_force_n = 15.0", "hard_force_n = 5.0", r"line 16: limits: soft_force_n must be less"),
     ("high_m = [0.5, 0.5, 1.0]", "high_m = [0.5, -0.5, 1.0]", "workspace: low_m must be below"),

@@ -130,7 +130,7 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(cb3):
         set_off(cb3, link, straight(cb3, (0.0, 0.2, 0.0)))
         cb3.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
         assert "force" in link.wait("stopped", seconds=5)["reason"]
-        assert any("wait for the next step" in each for each in link.warnings)
+        assert any("wait for the next control step" in each for each in link.warnings)
         cb3.ask("added_wrench", wrench=[0] * 6)
         assert link.retreat()["event"] == "reached"
         # The program that was uploaded anew is watched like the first.
@@ -214,7 +214,7 @@ def test_after_a_stop_only_a_choice_moves_it(e_series):
             link.start(line)
         set_off(e_series, link, line)
         link.stop()
-        assert "asked to stop" in link.wait("stopped", seconds=5)["reason"]
+        assert "a stop was requested" in link.wait("stopped", seconds=5)["reason"]
         stands_soon(e_series)
         with pytest.raises(SafetyStop, match="Choose"):
             link.start(straight(e_series, (0.0, 0.05, 0.0)))

@@ -139,6 +139,6 @@ def test_narrow_joint_limits_refuse():
 
 
 def test_unknown_arm_is_refused():
-    with pytest.raises(InputError, match="Known robots:"):
+    with pytest.raises(InputError, match="known arms are ur3,"):
         arm_named("ur7")
     assert arm_named("UR-10e").name == "ur10e"

@@ -128,7 +128,7 @@ def random_joints(count: int) -> np.ndarray:
 
 def test_it_is_known_by_its_name_and_no_other_arm_is():
     assert arm_named("Pieper 6") is ARM
-    with pytest.raises(InputError, match="There is an arm 'pieper-6' already"):
+    with pytest.raises(InputError, match="An arm named 'pieper-6' is already registered"):
         register_arm(PieperArm())
 
 
@@ -209,7 +209,8 @@ def cell_of(name: str) -> Cell:
 
 
 def test_it_is_not_moved_until_its_controller_has_a_driver():
-    with pytest.raises(InputError, match=r"No driver of controllers 'pieper'.*register_control"):
+    with pytest.raises(InputError, match=r"No driver is registered for controller 'pieper'.*"
+                                         r"register_control"):
         control_of(cell_of("pieper-6"))
     opened = object()
     register_control("pieper", lambda cell: opened)
@@ -217,9 +218,9 @@ def test_it_is_not_moved_until_its_controller_has_a_driver():
 
 
 def test_the_cell_knows_its_payload_and_joints():
-    with pytest.raises(ValueError, match="and a pieper-6 carries 4"):
+    with pytest.raises(ValueError, match="but a pieper-6 carries at most 4 kg"):
         Cell(robot={"model": "pieper-6"}, base={"pose": (0,) * 6}, tool={"mass_kg": 4.5})
-    with pytest.raises(ValueError, match="joint_limits_rad has 5 rows, and a pieper-6 6 joints"):
+    with pytest.raises(ValueError, match="joint_limits_rad has 5 rows, but a pieper-6 has 6 joints"):
         Cell(robot={"model": "pieper-6", "joint_limits_rad": [(-1, 1)] * 5},
              base={"pose": (0,) * 6})
 

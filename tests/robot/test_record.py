@@ -339,7 +339,7 @@ def test_a_point_that_is_hidden_now_and_then_still_rests_somewhere():
 
 @pytest.mark.parametrize("frames, said", [
     ([[[0.1, 0, 0], None]] * 3, "does not see point 1"),
-    ([[[0.1, 0, 0], [0.2, 0, 0]], [[0.1, 0, 0]]], "another number in 1 of 2 frames")])
+    ([[[0.1, 0, 0], [0.2, 0, 0]], [[0.1, 0, 0]]], "a different number in 1 of 2 frames")])
 def test_points_that_do_not_rest_anywhere_are_refused(frames, said):
     with pytest.raises(WorkError, match=said):
         _resting(*frames)

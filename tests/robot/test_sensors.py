@@ -100,7 +100,7 @@ def test_a_touched_gripper_is_not_tared():
         chain.wrench(sample_at(np.zeros(6)), reading_of(np.full(6, 0.1 * k)))
     with pytest.raises(WorkError, match="touched or moved"):
         chain.end_tare()
-    with pytest.raises(WorkError, match="readings for the tare"):
+    with pytest.raises(WorkError, match="readings arrived for the tare"):
         chain.end_tare()
 
 

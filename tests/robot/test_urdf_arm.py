@@ -174,27 +174,28 @@ def test_seven_joints_are_refused_where_six_are_needed(seven):
     cell = Cell(robot={"model": seven.name, "joint_limits_rad": [(-1, 1)] * 7},
                 base={"pose": (0,) * 6})
     assert cell.joint_limits == pytest.approx(np.tile([-1.0, 1.0], (7, 1)))
-    with pytest.raises(InputError, match=r"has 7 joints.*recordings of a motion have 6"):
+    with pytest.raises(InputError, match=r"has 7 joints.*recordings of a motion hold exactly 6"):
         control_of(cell)
-    with pytest.raises(InputError, match="for arms of six joints"):
+    with pytest.raises(InputError, match="six-joint arm"):
         Controller(seven.name)
 
 
 # Files
 
 @pytest.mark.parametrize("text, told", [
-    ("<robot", "is no arm: "),
-    ('<!DOCTYPE robot [<!ENTITY a "aaaa">]>' + urdf(6), "has a document type"),
+    ("<robot", "does not describe a supported arm: "),
+    ('<!DOCTYPE robot [<!ENTITY a "aaaa">]>' + urdf(6), "declares a document type"),
     ("<sdf/>", "its root is <sdf>, not <robot>"),
-    (urdf(5), "has 5 turning joints up to its flange"),
-    (urdf(6, kind="prismatic"), "joint 'j0' is prismatic"),
-    (urdf(6, limit=""), "joint 'j0' states no limit of its velocity"),
+    (urdf(5), "has only 5 revolute joints between base and flange"),
+    (urdf(6, kind="prismatic"), "joint 'j0' has type 'prismatic'"),
+    (urdf(6, limit=""), "joint 'j0' states no velocity limit"),
     (urdf(6, limit='velocity="fast"'), "could not convert string to float"),
-    (urdf(6).replace('<parent link="foot"/>', '<parent link="link3"/>'), "go in a circle"),
-    (urdf(6).replace('<link name="foot"/>', ""), "hangs on the link 'foot', which is not there"),
-    (urdf(6).replace('xyz="0 0 0.2"', 'xyz="0 0 nan"'), "not three finite numbers"),
-    (urdf(6).replace('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'), "axis without direction"),
-    (urdf(6).replace('lower="-2.9"', 'lower="2.9"'), "no range between lower and upper"),
+    (urdf(6).replace('<parent link="foot"/>', '<parent link="link3"/>'), "form a loop"),
+    (urdf(6).replace('<link name="foot"/>', ""), "refers to the link 'foot', which does not exist"),
+    (urdf(6).replace('xyz="0 0 0.2"', 'xyz="0 0 nan"'), "not a list of three finite numbers"),
+    (urdf(6).replace('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'),
+     "the axis of its joint 'j1' is zero"),
+    (urdf(6).replace('lower="-2.9"', 'lower="2.9"'), "is not below the upper limit"),
     (urdf(6).replace("<child", "<kid"), "has no <child>"),
 ])
 def test_a_file_that_is_no_arm_is_refused(tmp_path, text, told):
@@ -232,7 +233,7 @@ def test_an_arms_file_lies_beside_the_cell_and_moves_with_it(tmp_path, ur5_file)
 
 
 def test_a_missing_file_is_said(tmp_path):
-    with pytest.raises(InputError, match=r"none.urdf' is a file that cannot be read"):
+    with pytest.raises(InputError, match=r"none.urdf' cannot be read from its file"):
         arm_named(str(tmp_path / "none.urdf"))
 
 
@@ -267,7 +268,7 @@ def test_the_virtual_controller_moves_it_as_a_ur5(ur5_file):
 
 def test_an_address_elsewhere_is_refused(ur5_file):
     cell = Cell(robot={"model": str(ur5_file), "address": "192.0.2.7"}, base={"pose": (0,) * 6})
-    with pytest.raises(InputError, match="only describes an arm"):
+    with pytest.raises(InputError, match="has no driver for the controller"):
         control_of(cell)
 
 
@@ -283,4 +284,4 @@ def test_the_driver_moves_it_on_the_virtual_robot(worker_address, ur5_file):
         assert event["event"] == "reached" and event["error_m"] < 1e-3
         link.start(straight(robot, (0.0, 0.0, 0.1)))
         link.stop()
-        assert "asked to stop" in link.wait("stopped", seconds=5)["reason"]
+        assert "a stop was requested" in link.wait("stopped", seconds=5)["reason"]

@@ -21,8 +21,8 @@ def register_arm(arm: Arm) -> None:
         InputError: another arm has that name.
     """
     if _ARMS.setdefault(_plain(arm.name), arm) is not arm:
-        raise InputError(f"There is an arm {arm.name!r} already.",
-                         "A cell file would name both.", "Give it another name.")
+        raise InputError(f"An arm named {arm.name!r} is already registered.",
+                         "A cell file could not distinguish the two.", "Give it another name.")
 
 
 def arm_named(name: str) -> Arm:
@@ -39,9 +39,9 @@ def arm_named(name: str) -> Arm:
     arm = _ARMS.get(_plain(name))
     if arm is None:
         known = ", ".join(arm.name for arm in _ARMS.values())
-        raise InputError(f"Robot {name!r} is none of {known}.",
-                         "Its link lengths are needed.",
-                         "Known are these, and any arm by its URDF file.")
+        raise InputError(f"Robot {name!r} is not a known arm; known arms are {known}.",
+                         "Its joints and link lengths are needed.",
+                         "Give one of them, or the URDF file of another arm.")
     return arm
 
 
@@ -60,6 +60,6 @@ def _import_packages() -> None:
         try:
             entry.load()
         except ImportError as error:
-            raise InputError(f"The arm {entry.name!r} of {entry.value} cannot be imported "
-                             f"({error}).", "Its package is not whole.",
-                             "Install it again, or remove it.") from error
+            raise InputError(f"The arm {entry.name!r} from {entry.value} cannot be imported "
+                             f"({error}).", "Its package is incomplete.",
+                             "Install it again or remove it.") from error

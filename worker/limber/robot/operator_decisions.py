@@ -115,5 +115,5 @@ def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> Non
         input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
     elif cell.tool.gripper == "by_hand":
         progress.warn(f"The gripper is {'closed' if close else 'opened'} by hand, but there is no "
-                      "terminal to ask at, so this was assumed to be done. Run the command in a "
+                      "terminal to ask in, so this was assumed to be done. Run the command in a "
                       "terminal, or state tool.gripper in the cell file.")

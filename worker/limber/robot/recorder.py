@@ -54,7 +54,7 @@ class PullRecorder:
     def close_gripper(self) -> None:
         """The gripper has closed at the last sample's pose: rows begin."""
         if self.last is None:
-            raise WorkError("No sample of the robot yet.")
+            raise WorkError("No sample from the robot yet.")
         rest = np.eye(4)
         rest[:3, 3] = self._point
         self._offset = inverted(matrices(self.last[1:7])) @ rest
@@ -184,9 +184,9 @@ class MarkerStream:
         if not frames:
             raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
         if self.left_out:
-            raise WorkError(f"The tracker sends {self._count} points, but another number in "
+            raise WorkError(f"The tracker sends {self._count} points, but a different number in "
                             f"{self.left_out} of {len(frames) + self.left_out} frames.",
-                            "So the points cannot be told apart.",
+                            "So the points cannot be distinguished.",
                             "Make it send null for a point that it does not see.")
         seen = np.array([points for _, points in frames])
         unseen = np.flatnonzero(np.isnan(seen).any(axis=2).all(axis=0))

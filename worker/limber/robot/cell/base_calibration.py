@@ -117,7 +117,7 @@ def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
     raise InputError(
         f"The tool centre point in the controller is at about {_millimetres(seen)} in the "
         f"flange's frame, but the cell's tool.grasp_pose is at {_millimetres(grasp)}.",
-        "So the controller's pose is not that of the gripper's middle.",
+        "So the controller's pose is not the pose of the gripper's centre.",
         "Set the tool centre point to tool.grasp_pose on the pendant, or correct the cell file.")
 
 
@@ -147,7 +147,8 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
     """
     touched, on_branch = np.asarray(touched, float), np.asarray(on_branch, float)
     if touched.shape != on_branch.shape or touched.ndim != 2 or touched.shape[1] != 3:
-        raise InputError(f"{len(touched)} touched points for {len(on_branch)} on the branch.",
+        raise InputError(f"{len(touched)} points were touched, but {len(on_branch)} are given on "
+                         "the branch.",
                          "Each point needs its counterpart.", "Correct the list.")
     names = [str(number + 1) for number in range(len(touched))] if names is None else names
     require_frame(on_branch, names, "on the branch", largest_residual)
@@ -174,8 +175,8 @@ def _off(residuals: np.ndarray, mirrored: np.ndarray, names: Sequence[str],
     off = ", ".join(f"{name} {1000 * value:.1f}"
                     for name, value in zip(names, residuals, strict=True))
     if mirrored.max() <= largest_residual:
-        return InputError("The points fit only when mirrored. Without mirroring, their residuals "
-                          f"are [mm]: {off}.", "So one of the frames is left-handed.",
+        return InputError("The points fit only when mirrored. Without mirroring, the residuals "
+                          f"[mm] are: {off}.", "So one of the frames is left-handed.",
                           "Correct the signs or the order of its axes.")
     worst = int(residuals.argmax())
     return InputError(f"Point {names[worst]} has a residual of {1000 * residuals[worst]:.1f} mm; "

@@ -29,7 +29,8 @@ _FAR = 20.0
 
 def _in_metres(value: tuple[float, ...]) -> tuple[float, ...]:
     if max(abs(part) for part in value[:3]) > _FAR:
-        raise ValueError(f"lies {max(abs(part) for part in value[:3]):g} m away: millimetres?")
+        raise ValueError(f"is {max(abs(part) for part in value[:3]):g} m away; it may have been "
+                         "given in millimetres")
     return value
 
 
@@ -51,14 +52,13 @@ class RobotEntry(_Entry):
                        "ur16e; the URDF file of another arm, beside the cell file.")
     address: str = Field("127.0.0.1", min_length=1, description="Address of the controller.")
     version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
-                                description="Controller version that was seen when calibrating.")
+                                description="Controller version at the calibration.")
     pose_sigma_m: float = Field(
-        5e-5, ge=0, le=0.01, description="Repeatability of the arm over some centimetres [m].")
+        5e-5, ge=0, le=0.01, description="Repeatability of the arm over a few centimetres [m].")
     pose_sigma_rad: float = Field(3e-4, ge=0, le=0.1, description="Repeatability of the arm's "
                                                                   "rotation [rad].")
     joint_limits_rad: tuple[tuple[float, float], ...] | None = Field(
-        None, description="Narrower limits of the joints, as set in the "
-        "controller's safety.")
+        None, description="Narrower joint limits, as in the controller's safety settings.")
 
     _known = field_validator("model")(_known_model)
 
@@ -85,10 +85,10 @@ class CapsuleEntry(_Entry):
 class ToolEntry(_Entry):
     """The gripper: where it holds, what it weighs, its shape."""
 
-    grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's.")
+    grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's frame.")
     mass_kg: float | None = Field(
-        None, ge=0, le=20, description="Payload [kg]; 0 for a bare flange. Without it nothing "
-                                       "moves.")
+        None, ge=0, le=20, description="Payload [kg]; 0 for a bare flange. The robot does not "
+                                       "move without it.")
     centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="Position in the flange's frame "
                                                                   "[m].")
     parts: tuple[CapsuleEntry, ...] = ()
@@ -113,7 +113,7 @@ class ApproachEntry(_Entry):
     def _unit(cls, value: Vector) -> Vector:
         length = float(np.linalg.norm(value))
         if length < 1e-9:
-            raise ValueError("has no direction")
+            raise ValueError("is zero and has no direction")
         return tuple(float(part) / length for part in value)
 
 
@@ -121,10 +121,10 @@ class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
     kind: Literal["controller", "ft300", "replay", "none"] = Field(
-        "controller", description="replay: readings from a file, only for the virtual robot.")
+        "controller", description="replay reads a file and works only with the virtual robot.")
     file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
                              "sensor's frame.")
-    pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's.")
+    pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's frame.")
     force_range_n: float = Field(100.0, gt=0)
     torque_range_nm: float = Field(10.0, gt=0)
     force_sigma_n: float = Field(0.15, gt=0)
@@ -250,16 +250,16 @@ class Cell(_Entry):
     @model_validator(mode="after")
     def _carries_its_tool(self) -> "Cell":
         if (self.tool.mass_kg or 0.0) > self.arm.payload:
-            raise ValueError(f"tool.mass_kg is {self.tool.mass_kg:g}, and a {self.arm.name} "
-                             f"carries {self.arm.payload:g}")
+            raise ValueError(f"tool.mass_kg is {self.tool.mass_kg:g}, but a {self.arm.name} "
+                             f"carries at most {self.arm.payload:g} kg")
         return self
 
     @model_validator(mode="after")
     def _limits_each_joint(self) -> "Cell":
         limits, count = self.robot.joint_limits_rad, len(self.arm.joint_names)
         if limits is not None and len(limits) != count:
-            raise ValueError(f"robot.joint_limits_rad has {len(limits)} rows, and a "
-                             f"{self.arm.name} {count} joints")
+            raise ValueError(f"robot.joint_limits_rad has {len(limits)} rows, but a "
+                             f"{self.arm.name} has {count} joints")
         return self
 
     @property

@@ -17,7 +17,7 @@ def require_payload(cell: Cell) -> None:
         InputError: the cell does not state the gripper's mass.
     """
     if cell.tool.mass_kg is None:
-        raise InputError("The cell file states no tool.mass_kg: the payload is not set.",
+        raise InputError("The cell file does not state tool.mass_kg, so the payload is not set.",
                          "The controller and the guard would interpret the gripper's weight as a "
                          "force on it.", "Weigh the gripper and state its mass; 0 for a "
                                                 "bare flange.")
@@ -36,12 +36,13 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
         return ("The plan was made without a cell (`limber plan --cell`), so obstacles and the "
                 "gripper's shape were not checked.")
     if made_for.get("model") != cell.arm.name:
-        raise InputError(f"The plan was made for a {made_for.get('model')}, the cell has a "
-                         f"{cell.arm.name}.", "Another arm has another reach.",
+        raise InputError(f"The plan was made for a {made_for.get('model')}, but the cell has a "
+                         f"{cell.arm.name}.", "The two arms differ in reach.",
                          "Plan again with this cell.")
     if made_for.get("branch") not in (None, cell.branch):
-        raise InputError(f"The plan was made in a cell of branch {made_for['branch']}, this one is "
-                         f"of {cell.branch}.", "The robot would reach to the position of another "
+        raise InputError(f"The plan was made with a cell of branch {made_for['branch']}, but this "
+                         "cell belongs to branch "
+                         f"{cell.branch}.", "The robot would move to the position of another "
                          "branch.", "Plan again with this cell.")
     base = made_for.get("base_pose")
     if base is not None:
@@ -49,8 +50,9 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
         if off[:3].max() > _SAME_M or off[3:].max() > _SAME_RAD:
             raise InputError(
                 f"The plan was made with the robot's base {1e3 * off[:3].max():.1f} mm and "
-                f"{np.degrees(off[3:].max()):.2f} degrees from where the cell has it now.",
-                "The cell was calibrated again after that, so reach and obstacles have changed.",
+                f"{np.degrees(off[3:].max()):.2f} degrees away from its pose in the cell file.",
+                "The cell was calibrated again after planning, so reach and obstacles have "
+                "changed.",
                 "Plan again with this cell.")
     return None
 
@@ -65,7 +67,8 @@ def check_branch(cell: Cell, uuid: str | None, folder: object) -> str | None:
         return ("The cell file names no branch, so it is assumed that base.pose was calibrated "
                 "for this one. `limber robot calibrate` writes the name.")
     if cell.branch != uuid:
-        raise InputError(f"The cell was calibrated for branch {cell.branch}, {folder} is {uuid}.",
-                         "The robot would reach to the position of another branch.",
+        raise InputError(f"The cell was calibrated for branch {cell.branch}, but {folder} is "
+                         f"branch {uuid}.",
+                         "The robot would move to the position of another branch.",
                          "Calibrate it for this branch: limber robot calibrate.")
     return None

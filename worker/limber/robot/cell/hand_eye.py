@@ -86,12 +86,13 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
     """
     robot, seen = np.asarray(robot, float), np.asarray(seen, float)
     if not (np.isfinite(robot).all() and np.isfinite(seen).all()):
-        raise InputError("A view has a number that is not finite.", "", "Omit it.")
+        raise InputError("A view contains a number that is not finite.", "", "Omit it.")
     what = "board" if seen.shape[1] == 6 else "marker"
     fewest = _FEWEST[seen.shape[1]]
     if len(robot) < fewest:
-        raise InputError(f"{len(robot)} views of a {what}.", f"At least {fewest} determine camera "
-                         f"and {what}; ten also determine the "
+        raise InputError(f"Only {len(robot)} views of a {what} are "
+                         "given.", f"At least {fewest} views are needed "
+                         f"to determine camera and {what}, and ten to determine the "
                          "accuracy.", "Move the arm to more poses.")
     moves = matrices(robot) if camera_on == "stand" else inverted(matrices(robot))
     _require_turns(moves, what)

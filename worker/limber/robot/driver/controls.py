@@ -13,9 +13,10 @@ _JOINTS = 6  # of which samples and recordings have columns
 def _virtual(cell: Cell) -> ArmControl:
     """The virtual robot, which speaks as a controller of Universal Robots does."""
     if not cell.robot.address.startswith("127."):
-        raise InputError(f"{cell.arm.name} only describes an arm; robot.address is "
-                         f"{cell.robot.address}.", "Of its controller nothing is known.",
-                         "Move the virtual robot (127.0.0.x), or register a driver.")
+        raise InputError(f"{cell.arm.name} has no driver for the controller at robot.address "
+                         f"{cell.robot.address}.", "Its URDF file describes the arm, but not the "
+                                                   "controller.",
+                         "Use the virtual robot (127.0.0.x), or register a driver.")
     return UrControl(cell)
 
 
@@ -41,12 +42,13 @@ def control_of(cell: Cell) -> ArmControl:
     """
     opened = _CONTROLS.get(cell.arm.controller)
     if opened is None:
-        raise InputError(f"No driver of controllers {cell.arm.controller!r} is there, that of a "
-                         f"{cell.arm.name}.", "The arm can be planned for, not moved.",
-                         f"Drivers are there for {', '.join(_CONTROLS)}; register one with "
-                         "limber.robot.driver.controls.register_control.")
+        raise InputError(f"No driver is registered for controller {cell.arm.controller!r} of the "
+                         f"arm {cell.arm.name}.",
+                         "Limber can plan for this arm, but cannot move it.",
+                         "Register a driver with limber.robot.driver.controls.register_control. "
+                         f"Drivers exist for {', '.join(_CONTROLS)}.")
     if len(cell.arm.joint_names) != _JOINTS:
         raise InputError(f"A {cell.arm.name} has {len(cell.arm.joint_names)} joints.",
-                         f"Samples and recordings of a motion have {_JOINTS}.",
-                         "Plan with it and look at the dry run of `limber execute`.")
+                         f"Samples and recordings of a motion hold exactly {_JOINTS} joints.",
+                         "Use it only for planning and for the dry run of `limber execute`.")
     return opened(cell)

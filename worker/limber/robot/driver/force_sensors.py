@@ -98,8 +98,8 @@ class Ft300Sensor:
             self._socket = socket.create_connection((address, FT300_PORT), timeout)
         except OSError as error:
             raise WorkError(f"No FT300 answers at {address} port {FT300_PORT} ({error}).",
-                            "The cell states it as the force sensor.",
-                            "Check its cable and that its URCap is installed; or name another "
+                            "The cell file names it as the force sensor.",
+                            "Check its cable and that its URCap is installed, or name another "
                             "sensor in the cell file.") from error
         self._socket.setblocking(False)
         self.connections = (self._socket,)
@@ -143,7 +143,7 @@ class ReplayedSensor:
 
         stream = read_stream(path)
         if stream.values.shape[1] < 6:
-            raise InputError(f"{path} has {stream.values.shape[1]} columns besides the time.",
+            raise InputError(f"{path} has {stream.values.shape[1]} columns besides time.",
                              "A wrench has six.", "Give fx, fy, fz, tx, ty, tz.")
         self._frame = frame_of(np.array(cell.sensor.pose))
         self._times, self._values = stream.times - stream.times[0], stream.values[:, :6]
@@ -172,13 +172,14 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
     """
     if cell.sensor.kind == "replay":
         if not cell.robot.address.startswith("127."):
-            raise InputError(f"The cell replays forces from {cell.sensor.file} at robot "
+            raise InputError(f"The cell file replays forces from {cell.sensor.file}, but the "
+                             "robot is at "
                              f"{cell.robot.address}.", "The guard would not feel the real "
-                             "branch.", "Replay only with the virtual robot (127.0.0.x), or "
-                             "state the mounted sensor.")
+                             "branch.", "Replay only with the virtual robot (127.0.0.x), or name "
+                             "the mounted sensor.")
         return ReplayedSensor(cell, Path(cell.sensor.file))
     if cell.sensor.kind == "none":
-        raise InputError("The cell states no force sensor.",
+        raise InputError("The cell file names no force sensor.",
                          "The guard does not move a branch that it cannot feel.",
                          "Set sensor.kind to ft300 or controller.")
     if cell.sensor.kind == "ft300":
@@ -230,7 +231,8 @@ class WrenchChain:
         """
         readings, self._taring = np.array(self._taring or []), None
         if len(readings) < least:
-            raise WorkError(f"{len(readings)} readings for the tare.", f"{least} are needed.",
+            raise WorkError(f"Only {len(readings)} readings arrived for the "
+                            "tare.", f"{least} are needed.",
                             "Check the sensor's connection.")
         spread = readings.std(axis=0)
         allowed = np.r_[np.full(3, 6 * self.cell.sensor.force_sigma_n + 0.3),

@@ -26,7 +26,7 @@ _MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides p
 _PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, on a retreat
 _NO_DOUBT = np.zeros((6, 6))
 _RISES = "the {} rises during the return"
-_UNLIKE = "force unlike the predicted one [N]"
+_UNLIKE = "the force differs from the predicted one [N]"
 _SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
 _FELL = "the predicted force dropped suddenly: the branch slipped, broke or came loose [N]"
 
@@ -168,7 +168,7 @@ class Guard:
         if self.state != State.IDLE:
             raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
                              "No motion begins before a person has checked.",
-                             "Choose: hold, retreat or release.")
+                             "Choose hold, retreat or release.")
         if not self._is_tared:
             raise SafetyStop("The force sensor is not tared.", "Its bias would be taken for a "
                              "force on the branch.", "Tare it with the gripper hanging free.")
@@ -189,11 +189,11 @@ class Guard:
             SafetyStop: the robot moves, or the force is not known.
         """
         if self.state == State.MOVING:
-            raise SafetyStop("The robot is moving.", "", "Stop it before it returns.")
+            raise SafetyStop("The robot is moving.", "", "Stop it before the return.")
         if not np.isfinite(wrench).all():
-            raise SafetyStop("The force is unknown: the sensor gives no number, or is at the end "
-                             "of its range.", "So it is not visible whether the force falls "
-                             "during the return.", "Open the gripper.")
+            raise SafetyStop("The force is unknown: the sensor gives no number or is at the end "
+                             "of its range.", "So Limber cannot check that the force falls during "
+                             "the return.", "Open the gripper.")
         self.state = State.IDLE
         self.begin()
         self._memory.relief = _Relief(length(wrench[:3]), length(wrench[3:]))
@@ -297,7 +297,7 @@ class Guard:
             return _GO
         passed = sample.clock - last
         if passed <= 0:
-            return self._stop("the controller's clock went back [s]", passed, self._step)
+            return self._stop("the controller's clock ran backwards [s]", passed, self._step)
         if passed > self._settings.longest_silence + self._step:
             return self._stop("the controller's clock jumped [s]", passed,
                               self._settings.longest_silence)
@@ -307,7 +307,7 @@ class Guard:
         if sample.safety_mode != _NORMAL:
             return self._stop(_SAFETY.get(sample.safety_mode, f"safety mode {sample.safety_mode}"))
         if sample.robot_mode != _RUNNING:
-            return self._stop(f"robot mode {sample.robot_mode}: it is not running")
+            return self._stop(f"robot mode {sample.robot_mode}: the robot is not running")
         if self.state in (State.MOVING, State.PAUSED) and sample.runtime_state != PLAYING:
             return self._stop("the program on the controller was stopped")
         return _GO
@@ -419,7 +419,7 @@ class Guard:
         if sent is not None and self.state == State.MOVING:
             off = length(sample.pose[:3] - sent)
             if off > settings.off_path:
-                return self._stop("off its path [m]", off, settings.off_path)
+                return self._stop("the robot left its path [m]", off, settings.off_path)
         return _GO
 
     def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None,
@@ -450,14 +450,14 @@ class Guard:
             unsure = _DEVIATIONS * float(np.sqrt(max(
                 expected[:3] @ doubt[:3, :3] @ expected[:3], 0.0))) / wanted
             if along < (1 - settings.lost_share) * wanted - settings.least_force - unsure:
-                return self._stop("the branch slipped, broke or was never held: force along the "
-                                  "predicted one [N]", along, wanted)
+                return self._stop("the branch slipped, broke or was never held: force in the "
+                                  "predicted direction [N]", along, wanted)
         limits = settings.limits
         off = filtered - expected
         before = self._usual_off(off[:3])
         for name, part, allowed, most in (
                 (None, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
-                ("torque unlike the predicted one [N m]", slice(3, 6),
+                ("the torque differs from the predicted one [N m]", slice(3, 6),
                  settings.largest_torque_error, limits.hard_torque_nm)):
             error = length(off[part])
             if error > allowed:

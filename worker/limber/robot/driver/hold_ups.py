@@ -41,7 +41,7 @@ class HoldUps:
             self._woke = self._listened
         if moving:
             self._tell(event="warning", text="the computer delayed the robot's program by "
-                       f"{1000 * overslept:.0f} ms, and nothing was monitored in that time")
+                       f"{1000 * overslept:.0f} ms, and nothing was monitored during that time")
 
     @property
     def has_just_woken(self) -> bool:

@@ -85,8 +85,8 @@ class RobotLink:
         """
         self._sampled.clear()
         if not self._sampled.wait(seconds):
-            raise WorkError(f"The robot's driver sends no samples in {seconds:.0f} s.",
-                            "A port may be silent.", "Check the robot.")
+            raise WorkError(f"The robot's driver sent no samples within {seconds:.0f} s.",
+                            "The connection may be silent.", "Check the robot.")
         return self._latest
 
     def tare(self, seconds: float = 0.5) -> dict[str, Any]:
@@ -181,7 +181,7 @@ class RobotLink:
                 left = end - time.monotonic()
                 if left <= 0:
                     raise WorkError(f"The robot's driver reported neither {' nor '.join(kinds)} "
-                                    f"for {seconds:.0f} s.", "A port may be silent.",
+                                    f"within {seconds:.0f} s.", "The connection may be silent.",
                                     "Check the robot.")
                 self._news.wait(left)
 
@@ -193,7 +193,7 @@ class RobotLink:
         if ended_by_deadline(code):
             return SafetyStop(
                 "The robot was stopped: the controller did not answer its driver for "
-                f"{CALL_SECONDS:g} s, and the driver was ended.", "Its connection works in one "
+                f"{CALL_SECONDS:g} s, so the driver was ended.", "Its connection works in one "
                 "direction only, or not at "
                 "all.", "Check the robot, which its own watchdog has stopped. "
                 "Check cable and network before connecting again.")

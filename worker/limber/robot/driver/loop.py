@@ -156,7 +156,7 @@ class Driver:
             self._begin(_ordered(order), None if order.get("start_joints") is None
                         else np.array(order["start_joints"], float))
         elif name == "stop":
-            self._under_way.judge(self.guard.event("asked to stop"))
+            self._under_way.judge(self.guard.event("a stop was requested"))
         elif name == "resume":
             self.guard.resume()
             self.tell(event="resumed")
@@ -211,7 +211,7 @@ class Driver:
         while not (self._control.program_runs()
                    and self._require_sample().runtime_state == PLAYING):
             if not started or time.monotonic() > given_up:
-                raise WorkError("The control program does not run.", "", "See the pendant.")
+                raise WorkError("The control program is not running.", "", "See the pendant.")
             self._deadline.renew()
             for sample in self._control.read(1.0 / self._control.rate):
                 self._senses.look(sample)
@@ -237,8 +237,8 @@ class Driver:
             following.rate = 0.0
         if not self._control.servo(self._command):
             self._under_way.judge(self.guard.event(
-                "the control program took no target: it ends when it hears nothing for "
-                f"{self._control.silence:.2g} s, as where this computer is too busy"))
+                "the control program accepted no target: it ends when it receives nothing for "
+                f"{self._control.silence:.2g} s, for example because this computer is too busy"))
             return
         over = following.time >= end + 0.5 * self._control.lookahead
         still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
@@ -253,7 +253,7 @@ class Driver:
 
     def _require_sample(self) -> Sample:
         if self._last is None:
-            raise WorkError("No data of the robot yet.")
+            raise WorkError("No data from the robot yet.")
         return self._last
 
     def close(self) -> None:

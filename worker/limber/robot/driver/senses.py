@@ -83,7 +83,8 @@ class Senses:
             doubt=doubt, grasp=grasp[:3, 3], sent=sent)
         if (reading.age > _OLDEST_READING_SECONDS and decision.verdict != Verdict.STOP
                 and not self._hold_ups.has_just_woken):
-            decision = self._guard.event(f"the force sensor is silent for {reading.age:.3f} s")
+            decision = self._guard.event(f"the force sensor has been silent for {reading.age:.3f} "
+                                         "s")
         self._under_way.judge(decision, sample)
         self._batch.append(np.concatenate((
             (sample.clock,), pose_of(grasp), now, self.smooth, sample.joints,

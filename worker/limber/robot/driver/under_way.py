@@ -72,7 +72,8 @@ class UnderWay:
                 # CB3's.
                 is_slow = sample is not None and 1.0 / self._control.rate > _LONG_STEP_SECONDS
                 if at_once or is_slow:
-                    self._stop_at_once(f"it does not wait for the next step: {decision.reason}")
+                    self._stop_at_once("the stop does not wait for the next control step: "
+                                       f"{decision.reason}")
                 self._stop(self.following, decision, sample)
             else:
                 self._stopped_at = time.monotonic()
@@ -109,7 +110,7 @@ class UnderWay:
             self._was_stopped_at_once = True
             self._tell(event="second_channel", reason=why)
         except OSError as error:
-            self._tell(event="warning", text=f"stop past the control program: {error}; the "
+            self._tell(event="warning", text=f"stop without the control program: {error}; the "
                        f"controller's watchdog ends its program in {self._control.silence:.2f} s")
 
     def lose(self, reason: str) -> None:
@@ -122,12 +123,12 @@ class UnderWay:
     def stand(self, last: Sample | None) -> None:
         """Nothing is followed: keep the program alive, and see that a stopped arm stands."""
         if not self._control.keep_alive() and self._stopped_at is None:
-            self.judge(self._guard.event("the control program does not run"))
+            self.judge(self._guard.event("the control program is not running"))
         if self._stopped_at is not None and last is not None:
             late = time.monotonic() - self._stopped_at > _SECOND_CHANNEL_SECONDS
             moving = float(np.abs(last.joint_speeds).max()) > 1e-2
             if late and moving:
-                self._stop_at_once("the robot still moves after its stop")
+                self._stop_at_once("the robot still moves after the stop")
                 self._stopped_at = time.monotonic()
 
     def give_up(self) -> None:

@@ -54,8 +54,8 @@ class UrControl(SampleStream):
         if calibrated and calibrated.split(".")[:2] != version.split(".")[:2]:
             raise InputError(f"The controller has version {version}, but the cell was calibrated "
                              "with "
-                             f"{calibrated}.", "Another version may have other settings of tool, "
-                             "kinematics and safety.", "Calibrate again, or compare the settings "
+                             f"{calibrated}.", "Settings of tool, kinematics and safety may "
+                             "differ between versions.", "Calibrate again, or compare the settings "
                              "and correct robot.version in the cell file.")
         ask = self._dashboard.ask
         model = ask("get robot model")
@@ -64,7 +64,8 @@ class UrControl(SampleStream):
                  "rate_hz": self.rate, "real_time": claim_real_time()}
         known = model.lower()
         if known.startswith("ur") and known != arm.name.rstrip("e"):
-            raise InputError(f"The robot says that it is a {model}, the cell {arm.name}.",
+            raise InputError(f"The robot reports that it is a {model}, but the cell file states "
+                             f"{arm.name}.",
                              "Reach and limits would be those of another arm.",
                              "Correct robot.model in the cell file.")
         if facts["remote"] == "false":
@@ -151,8 +152,9 @@ def _ready(stream: SampleStream) -> dict[str, Any]:
     sample = samples[-1]
     if sample.safety_mode != 1 or sample.robot_mode != 7:
         raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot "
-                         f"mode {sample.robot_mode}.", "Limber does not release stops or switch "
-                         "an arm on.", "Check the robot, then do it on the pendant.")
+                         f"mode {sample.robot_mode}.", "Limber neither releases stops nor "
+                         "switches an arm on.",
+                         "Check the robot, then release or switch it on at the pendant.")
     if sample.slider <= 0.0:
         raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
                          "Raise it on the pendant.")

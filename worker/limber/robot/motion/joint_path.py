@@ -63,7 +63,7 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
     """
     frames = np.asarray(frames, float)
     if frames.ndim != 3 or frames.shape[1:] != (4, 4) or not np.isfinite(frames).all():
-        raise InputError(f"Frames of shape {frames.shape}, or not finite.",
+        raise InputError(f"The frames have shape {frames.shape} or are not finite.",
                          "A path consists of finite 4 x 4 transforms.", "Check the poses.")
     limits = arm.joint_limits if joint_limits is None else np.asarray(joint_limits, float)
     paths, refusals = [], []
@@ -107,7 +107,7 @@ def _one_branch(arm: Arm, branch: int, joints: np.ndarray, limits: np.ndarray,
     close = distance.min(axis=1) < singularity_margin
     if close.any():
         index = int(close.argmax())
-        return Refusal(branch, index, f"within {distance[index].min():.3f} of the "
+        return Refusal(branch, index, f"at a distance of {distance[index].min():.3f} from the "
                        f"{arm.singularity_names[int(distance[index].argmin())]} singularity")
     steps = np.abs(np.diff(joints, axis=0)).max(axis=1, initial=0.0)
     if (steps > _LARGEST_STEP).any():
@@ -155,7 +155,7 @@ def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
         "No configuration of the arm can follow the path. The best one ends at pose "
         f"{farthest.index + 1} of {len(frames)}, flange at ({place}) m in the robot's base frame: "
         f"{'; '.join(reasons)}.",
-        "The arm ends short of it." if reasons == [_OUT_OF_REACH] else
+        "The arm does not reach it." if reasons == [_OUT_OF_REACH] else
         ("The arm would have to change its configuration on the path, which would swing the "
          "branch."),
         "Move the robot's base, choose a path nearer to it, or rotate the tool.")

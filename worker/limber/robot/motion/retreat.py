@@ -67,7 +67,8 @@ class WayBack:
             SafetyStop: there is no way back, the arm left it, or stands otherwise than on it.
         """
         if not self._poses:
-            raise SafetyStop("There is no path to return along.", "Nothing has been followed yet.",
+            raise SafetyStop("There is no path to return along.", "The robot has not followed any "
+                                                                  "path yet.",
                              "")
         poses = np.array(self._poses)
         off = np.linalg.norm(poses[:, :3] - sample.pose[:3], axis=1) / POSITION_M
@@ -84,7 +85,7 @@ class WayBack:
                              "Free the branch by hand.")
         if told := different_joints(sample.joints, self._joints[nearest],
                                          self._names):
-            raise SafetyStop("The arm is not in the configuration in which it came: "
+            raise SafetyStop("The arm is not in the configuration in which it arrived: "
                              f"{'; '.join(told)}.",
                              "Something has moved it.", "Free the branch by hand.")
         if length(sample.pose - poses[0]) < _STANDS:

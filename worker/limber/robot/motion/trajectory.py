@@ -33,8 +33,9 @@ class Trajectory:
         shaped = (self.times.ndim == 1 and len(self.times) >= 2
                   and self.poses.shape == (len(self.times), 6))
         if not shaped or not np.isfinite(self.poses).all() or np.any(np.diff(self.times) <= 0):
-            raise InputError(f"A trajectory of {self.times.shape} times and {self.poses.shape} "
-                             "poses.", "It needs ascending times, each with one finite pose.",
+            raise InputError(f"The trajectory has times of shape {self.times.shape} and poses of "
+                             f"shape {self.poses.shape}.",
+                             "It needs increasing times, each with one finite pose.",
                              "Check the path.")
         if self.expected is not None and (
                 self.expected.wrenches.shape != self.poses.shape
@@ -44,8 +45,9 @@ class Trajectory:
                              "Each pose needs a wrench of six numbers.", "Check the plan.")
         if self.joints is not None and (self.joints.shape[:-1] != self.times.shape
                                         or not np.isfinite(self.joints).all()):
-            raise InputError(f"Joint angles of shape {self.joints.shape} for {len(self.poses)} "
-                             "poses, or not finite.", "Each pose has one a joint.",
+            raise InputError(f"The joint angles have shape {self.joints.shape} for "
+                             f"{len(self.poses)} poses, or are not "
+                             "finite.", "Each pose needs one angle per joint.",
                              "Check the path.")
 
     @property

@@ -45,7 +45,7 @@ class SampleStream:
             self._socket = socket.create_connection((address, RTDE_PORT), timeout)
         except OSError as error:
             raise WorkError(f"No robot answers at {address} port {RTDE_PORT} ({error}).",
-                            "Nothing moves without its data.",
+                            "The robot does not move without its data.",
                             "Check its power, its address and the network.") from error
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -53,12 +53,13 @@ class SampleStream:
         except (OSError, ValueError) as error:
             self._socket.close()
             raise WorkError(f"{address} port {RTDE_PORT} does not answer as a robot ({error}).",
-                            "It accepted the connection, but does not speak RTDE.",
-                            "Check the address; restart the controller if it is one.") from error
+                            "It accepted the connection, but does not use the RTDE protocol.",
+                            "Check the address. If it belongs to a controller, restart the "
+                            "controller.") from error
 
     def _handshake(self, timeout: float) -> None:
         if self._ask(rtde.VERSION_REQUEST, struct.pack(">H", 2), timeout) != b"\1":
-            raise ValueError("protocol version 2 refused")
+            raise ValueError("the controller refused protocol version 2")
         self.version = struct.unpack(">4I", self._ask(rtde.CONTROL_VERSION, b"", timeout))
         self.rate = 125.0 if self.version[0] <= 3 else 500.0
         names: tuple[str, ...] = _NAMES
@@ -70,7 +71,7 @@ class SampleStream:
             raise ValueError(f"outputs refused: {reply[1:].decode('ascii', 'replace')}")
         self._recipe = rtde.Recipe.of(reply[0], names, rtde.OUTPUT_TYPES)
         if self._ask(rtde.START, b"", timeout) != b"\1":
-            raise ValueError("data was not started")
+            raise ValueError("the controller did not start the data stream")
         self._socket.setblocking(False)
 
     def _ask(self, command: int, body: bytes, timeout: float) -> bytes:
@@ -83,7 +84,7 @@ class SampleStream:
                     return reply
             left = end - time.monotonic()
             if left <= 0 or not select.select([self._socket], [], [], left)[0]:
-                raise ValueError(f"no answer in {timeout:g} s")
+                raise ValueError(f"no answer within {timeout:g} s")
             self._fill()
 
     def _fill(self) -> None:

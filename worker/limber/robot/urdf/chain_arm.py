@@ -200,8 +200,9 @@ def arm_of_file(name: str) -> UrdfArm:
     try:
         stamp = path.stat()
     except OSError as error:
-        raise InputError(f"Robot {name!r} is a file that cannot be read ({error.strerror}).",
-                         "Its links and joints are needed.", "Give the path of its URDF.",
+        raise InputError(f"Robot {name!r} cannot be read from its file ({error.strerror}).",
+                         "It must describe the arm's links and "
+                         "joints.", "Give the path of its URDF.",
                          ) from error
     return _read(name, stamp.st_mtime_ns, stamp.st_size)
 

@@ -69,7 +69,8 @@ class Chain:
 
 class _WithoutDoctype(ElementTree.TreeBuilder):
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise ElementTree.ParseError("it has a document type, in which entities could hide")
+        raise ElementTree.ParseError("it declares a document type, which is not allowed because "
+                                     "it can define entities")
 
 
 def read_chain(path: Path) -> Chain:
@@ -86,9 +87,10 @@ def read_chain(path: Path) -> Chain:
                                ElementTree.XMLParser(target=_WithoutDoctype()))
         return _Robot(root).chain()
     except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"Robot {str(path)!r} is no arm: {error}.",
-                         "Limber moves arms of six or more turning joints in a row.",
-                         "Correct the URDF file; run xacro first if it is one.") from error
+        raise InputError(f"Robot {str(path)!r} does not describe a supported arm: {error}.",
+                         "Limber supports serial arms with six or more revolute joints.",
+                         "Correct the URDF file. If it is a xacro file, convert it with xacro "
+                         "first.") from error
 
 
 class _Robot:
@@ -105,7 +107,7 @@ class _Robot:
         """The joints from the base to the flange."""
         base = self._joints_to(_BASE) if _BASE in self._links else []
         if any(_turns(joint) for joint in base):
-            raise ValueError(f"its link {_BASE!r} moves")
+            raise ValueError(f"its link {_BASE!r} is not fixed to the root")
         frame = np.eye(4)
         for joint in base:
             frame = frame @ _origin(joint)
@@ -121,7 +123,7 @@ class _Robot:
                 link = _said(_part(element, "child"), "link")
                 rods += _rods(self._links[link], link, frame, len(joints) - 1)
         if len(joints) < _FEWEST:
-            raise ValueError(f"it has {len(joints)} turning joints up to its flange")
+            raise ValueError(f"it has only {len(joints)} revolute joints between base and flange")
         return Chain(tuple(joints), frame, tuple(rods))
 
     def _flange(self) -> str:
@@ -132,8 +134,8 @@ class _Robot:
         ends = [name for name in self._links if name not in parents
                 and sum(map(_turns, self._joints_to(name))) >= _FEWEST]
         if len(ends) != 1:
-            raise ValueError(f"it has no link {' or '.join(map(repr, _FLANGES))}, and "
-                             f"{len(ends)} chains of {_FEWEST} or more turning joints")
+            raise ValueError(f"it has no link {' or '.join(map(repr, _FLANGES))}, and {len(ends)} "
+                             f"chains of {_FEWEST} or more revolute joints")
         return ends[0]
 
     def _joints_to(self, link: str) -> list[Element]:
@@ -143,9 +145,9 @@ class _Robot:
             found.append(self._above[link])
             link = _said(_part(found[-1], "parent"), "link")
             if len(found) > len(self._above):
-                raise ValueError(f"its links go in a circle at {link!r}")
+                raise ValueError(f"its links form a loop at {link!r}")
         if link not in self._links:
-            raise ValueError(f"a joint hangs on the link {link!r}, which is not there")
+            raise ValueError(f"a joint refers to the link {link!r}, which does not exist")
         return found[::-1]
 
 
@@ -154,7 +156,8 @@ def _turns(joint: Element) -> bool:
     if kind == "fixed":
         return False
     if kind not in ("revolute", "continuous") or joint.find("mimic") is not None:
-        raise ValueError(f"its joint {joint.get('name')!r} is {kind} or goes with another one")
+        raise ValueError(f"its joint {joint.get('name')!r} has type {kind!r} or mimics another "
+                         "joint; only revolute, continuous and fixed joints are supported")
     return True
 
 
@@ -162,16 +165,16 @@ def _joint(element: Element, origin: np.ndarray) -> Joint:
     name, limit = _said(element, "name"), element.find("limit")
     speed = None if limit is None else limit.get("velocity")
     if limit is None or speed is None or not float(speed) > 0.0:
-        raise ValueError(f"its joint {name!r} states no limit of its velocity")
+        raise ValueError(f"its joint {name!r} states no velocity limit")
     limits = (-np.inf, np.inf)
     if _said(element, "type") == "revolute":
         limits = float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
         if not limits[0] < limits[1]:
-            raise ValueError(f"its joint {name!r} has no range between lower and upper")
+            raise ValueError(f"the lower limit of its joint {name!r} is not below the upper limit")
     given = element.find("axis")
     axis = _vector((1.0, 0.0, 0.0) if given is None else _said(given, "xyz").split())
     if not np.linalg.norm(axis) > 0.0:
-        raise ValueError(f"its joint {name!r} has an axis without direction")
+        raise ValueError(f"the axis of its joint {name!r} is zero")
     return Joint(name, origin, axis / np.linalg.norm(axis), limits, float(speed))
 
 
@@ -216,7 +219,7 @@ def _origin(element: Element) -> np.ndarray:
 def _vector(parts: object) -> np.ndarray:
     vector = np.array(parts, float)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{parts} are not three finite numbers")
+        raise ValueError(f"{parts} is not a list of three finite numbers")
     return vector
 
 
@@ -230,5 +233,5 @@ def _part(element: Element, tag: str) -> Element:
 def _said(element: Element, key: str) -> str:
     value = element.get(key)
     if value is None:
-        raise ValueError(f"one of its <{element.tag}> has no {key}")
+        raise ValueError(f"one of its <{element.tag}> elements has no attribute {key!r}")
     return value

@@ -231,7 +231,7 @@ def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarra
     solutions = arm.inverse(matrices(pose) @ inverted(tool), near)
     solutions = solutions[np.isfinite(solutions).all(axis=1)]
     if len(solutions) == 0:
-        raise Unreachable("no inverse kinematics")
+        raise Unreachable("the inverse kinematics has no solution")
     solutions = solutions + 2 * np.pi * np.round((near - solutions) / (2 * np.pi))
     return solutions[np.abs(solutions - near).sum(axis=1).argmin()]
 

@@ -145,7 +145,7 @@ class Controller:
             except Unreachable as reason:
                 self.protective_stop(str(reason))
             if np.any(np.abs(self.speeds) > 1.05 * np.asarray(self.arm.joint_speed)):
-                self.protective_stop("joint speed over its limit")
+                self.protective_stop("a joint exceeds its speed limit")
         self.accelerations = (self.speeds - before) / self.seconds
         limits = self.arm.joint_limits
         if np.any(self.joints < limits[:, 0]) or np.any(self.joints > limits[:, 1]):
@@ -243,7 +243,7 @@ class Controller:
             self.say("script refused: not in remote control")
             return
         if not self.can_move:
-            self.say("script refused: robot is stopped")
+            self.say("script refused: the robot is stopped")
             return
         self.stop_program("another script")
         self.watchdog = None
@@ -357,9 +357,11 @@ def _six(joints: Sequence[float] | np.ndarray) -> np.ndarray:
     """
     angles = np.array(joints, float)
     if angles.shape != (6,) or not np.isfinite(angles).all():
-        raise InputError(f"Joint angles {joints}.", "Six finite numbers [rad] are needed: the "
-                         "virtual controller is one of Universal Robots, for arms of six joints.",
-                         "Give one angle a joint.")
+        raise InputError("The joint angles are "
+                         f"{joints}.", "Six finite numbers [rad] are needed, because "
+                         "the virtual controller imitates that of a six-joint arm of Universal "
+                         "Robots.",
+                         "Give one angle per joint.")
     return angles
 
 

@@ -52,7 +52,7 @@ class VirtualCamera:
             raise WorkError(f"The connection to the virtual camera was lost ({error}).") from error
         if "error" in told or not packed:
             raise WorkError("The virtual camera returned no image: "
-                            f"{told.get('error', 'it is gone')}.")
+                            f"{told.get('error', 'it has ended')}.")
         steps = np.frombuffer(zlib.decompress(packed), "<u2")
         return steps.reshape(camera.height, camera.width) / camera.depth_scale
 
@@ -63,8 +63,9 @@ def views_around(middle: np.ndarray, distance: float, count: int,
     below.
     """
     if count < 1 or not distance > 0:
-        raise InputError(f"{count} views from {distance:g} m.", "A scan needs at least one view, "
-                         "from outside of the branch.", "Use 8 views from 0.6 m, for example.")
+        raise InputError(f"{count} views from a distance of {distance:g} m were "
+                         "requested.", "A scan needs at least one view "
+                         "from outside the branch.", "Use 8 views from 0.6 m, for example.")
     found = []
     for number in range(count):
         turn, tilt = 2 * np.pi * number / count, 0.35 * (-1) ** number
@@ -86,8 +87,7 @@ def scanned(address: str, cameras: list[Camera]) -> np.ndarray:
             parts.append(depth_to_cloud(camera, depth, _inner(depth)).points)
     points = np.concatenate(parts)
     if not len(points):
-        raise WorkError(f"The {len(cameras)} views show "
-                        "nothing.", "The cameras do not see the "
+        raise WorkError(f"The {len(cameras)} views are empty.", "The cameras do not see the "
                                                                "branch.",
                         "Give another --middle or --distance.")
     return points

@@ -242,8 +242,9 @@ class HeldBranch:
         try:
             got, content = self._pipe.recv()
         except EOFError as error:
-            raise InputError(f"The branch {self.setting.mesh} cannot be held: its solver ended.",
-                             "See what it printed.") from error
+            raise InputError(f"The branch {self.setting.mesh} cannot be held because its solver "
+                             "ended.",
+                             "See its output.") from error
         assert got == kind
         return content
 

@@ -108,7 +108,7 @@ class VirtualRobot:
         with self._news:
             if not self._news.wait_for(lambda: self._answers, seconds):
                 raise WorkError("The virtual robot does not answer.",
-                                f"{seconds:.0f} s have passed.", "See what it printed.")
+                                f"It has been silent for {seconds:.0f} s.", "See its output.")
             return self._answers.pop(0)
 
 

@@ -76,7 +76,7 @@ class ControlProgram:
         """Take a real-time command as it comes: the client clears it before the next step."""
         command = self._command(controller)
         if command in _STOPS and self._phase == "ready":
-            controller.say(f"stop command {command} came")
+            controller.say(f"stop command {command} was received")
         if command in _REAL_TIME and self._phase == "ready" and self._waiting_for is None:
             self._execute(command, controller)
 

@@ -86,7 +86,8 @@ class Server:
             await self.close()
             raise WorkError(f"Port {port} of {self.address} cannot be opened ({error}).",
                             "Another virtual robot or program uses it, and the client library "
-                            "knows no other port.", "End that program, or give --address 127.0.0.2 "
+                            "supports no other "
+                            "port.", "End that program, or give --address 127.0.0.2 "
                             "(Linux, Windows).") from error
 
     async def close(self) -> None:
