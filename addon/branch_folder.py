@@ -108,7 +108,7 @@ def folder_for(scan: Path) -> Path:
         folder = scan.with_name(f"{scan.stem}{'' if number == 1 else f'-{number}'}.branch")
         if belongs(folder, digest):
             return folder
-    raise ValueError(f"Beside {scan} are a thousand branch folders of other scans. "
+    raise ValueError(f"There are already a thousand branch folders of other scans beside {scan}. "
                      "Choose a folder yourself.")
 
 

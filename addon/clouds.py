@@ -33,11 +33,11 @@ def read_points(path: Path) -> np.ndarray:
     try:
         points = _read_ply(path) if path.suffix.lower() == ".ply" else _read_text(path)
     except (OSError, ValueError, IndexError, KeyError, StopIteration) as error:
-        raise ValueError(f"{path} cannot be shown as points ({error}). The worker reads more "
-                         "kinds of files: it may still reconstruct this one.") from error
+        raise ValueError(f"{path} cannot be shown as points ({error}). The worker reads more file "
+                         "formats, so it may still reconstruct this file.") from error
     if len(points) == 0 or not np.isfinite(points).all():
-        raise ValueError(f"{path} has no points, or points that are not finite. "
-                         "Export the scan again.")
+        raise ValueError(f"{path} has no points or has points that are not finite. Export the "
+                         "scan again.")
     return points
 
 
@@ -79,7 +79,7 @@ def _even(lines: Iterable[str], delimiter: str | None) -> Iterator[str]:
         found = len(line.split(delimiter))
         width = width or found
         if found != width:
-            raise ValueError(f"a line has {found} values, the first has {width}")
+            raise ValueError(f"a line has {found} values, but the first line has {width}")
         yield line
 
 
@@ -135,7 +135,7 @@ def _read_ply(path: Path) -> np.ndarray:
         _, count, columns = _read_ply_header(stream)
         values = _rows(itertools.islice(stream, count))
     if len(values) < count:
-        raise ValueError("it is cut short")
+        raise ValueError("it is truncated")
     names = [name for name, _ in columns]
     return values[:, [names.index(axis) for axis in "xyz"]]
 
@@ -148,17 +148,17 @@ def _binary_rows(path: Path) -> np.ndarray | None:
             return None
         kind = np.dtype([(name, order + code) for name, code in columns])
         if count * kind.itemsize > path.stat().st_size:
-            raise ValueError("it is cut short")
+            raise ValueError("it is truncated")
         content = stream.read(count * kind.itemsize)
     if len(content) < count * kind.itemsize:
-        raise ValueError("it is cut short after its header")
+        raise ValueError("it is truncated after its header")
     return np.frombuffer(content, kind)
 
 
 def _read_ply_header(stream) -> tuple[str, int, list[tuple[str, str]]]:
     """Return byte order, vertex count and the columns (name, numpy type) of the vertices."""
     if stream.readline().strip() != b"ply":
-        raise ValueError("it does not begin as a PLY file")
+        raise ValueError("it does not begin with a PLY header")
     order, count, columns, element = "", 0, [], ""
     for line in iter(stream.readline, b""):
         words = line.decode("ascii", "replace").split()

@@ -26,8 +26,8 @@ def keep(data: SceneData) -> str:
     try:
         frame_values.keep(data.folder, frames["name"], _kept[path])
     except OSError as error:
-        return (f"{data.folder} cannot be written to ({error.strerror}): colours of each frame "
-                "are there until the file is closed.")
+        return (f"{data.folder} is not writable ({error.strerror}). The colours of each frame "
+                "will be lost when this file is closed.")
     return ""
 
 

@@ -72,7 +72,7 @@ def keep(folder: Path, motion: str, values: FrameValues) -> None:
     path = path_of(folder, motion)
     if path.name != f"{motion}.npz" or path.parent.is_symlink():
         # The folder, and the name in it, may come from anybody.
-        raise OSError(errno.EPERM, "a name or a link in it leads out of it")
+        raise OSError(errno.EPERM, "a name or link in it points outside the branch folder")
     path.parent.mkdir(exist_ok=True)
     arrays = {f"{kind}:{name}": array for kind, named in (
         ("scalar", values.scalars), ("level", values.levels), ("palette", values.palettes))

@@ -33,10 +33,10 @@ _POSIX = os.name == "posix"
 def _what_to_do(code: int) -> str:
     """Return why a worker that told no reason of its own may have ended, and what to do."""
     if code < 0:
-        return ("It was killed, by somebody or because memory ran out. What was there before is "
-                "as it was: run it again.")
-    return ("If it is of another version than this add-on, name another Python in the "
-            "extension's preferences; Check the Worker tells.")
+        return ("It was killed, by a person or because memory ran out. Earlier results are "
+                "unchanged. Run it again.")
+    return ("If its version differs from that of this add-on, choose another Python in the "
+            "extension's preferences. Check the Worker shows the version.")
 
 
 class JobState(enum.Enum):
@@ -53,8 +53,8 @@ class Life(enum.Enum):
     """Whether a running worker works."""
 
     WORKING = ""
-    IDLE = "It is alive, but has computed nothing for {:.0f} s: waiting, or hung"
-    SILENT = "No sign of life for {:.0f} s: it may hang"
+    IDLE = "The worker responds, but has computed nothing for {:.0f} s. It may be waiting or hung"
+    SILENT = "The worker has not responded for {:.0f} s. It may be hung"
 
 
 class Job:
@@ -224,7 +224,7 @@ class Job:
         if self.state is not JobState.DONE and self.folder:
             # What was to go on from there has nothing to go on from.
             for job in [job for job in _waiting if job.folder == self.folder]:
-                job._give_up(f"not run: {self.title} before it did not end well")
+                job._give_up(f"not run because {self.title} failed before it")
 
     def _signal(self, *, kill: bool) -> None:
         try:
@@ -284,7 +284,7 @@ def start(title: str, command: list[str], folder: str = "") -> Job:
         OSError: the program cannot be started.
     """
     if is_running():
-        raise RuntimeError(f"{_last[0].title} is still running; wait for it or cancel it.")
+        raise RuntimeError(f"{_last[0].title} is still running. Wait for it or cancel it.")
     job = Job(title, command, folder)
     job.launch()
     _last[:] = [job]

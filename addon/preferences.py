@@ -22,8 +22,8 @@ class LimberPreferences(bpy.types.AddonPreferences):
     python_path: bpy.props.StringProperty(
         name="Python with Limber", subtype="FILE_PATH", options=compat.PATH_OPTIONS,
         description="The Python in which Limber's worker is installed, for example "
-                    ".venv/bin/python of a checkout. Empty: LIMBER_PYTHON, then what the "
-                    "extension brought along, then `limber` on the PATH")
+                    ".venv/bin/python of a checkout. If empty, Limber uses LIMBER_PYTHON, then "
+                    "the worker in this extension, then `limber` on the PATH")
     worker_status: bpy.props.StringProperty(options={"SKIP_SAVE"})
     worker_parts: bpy.props.StringProperty(options={"SKIP_SAVE"})
 
@@ -38,8 +38,8 @@ class LimberPreferences(bpy.types.AddonPreferences):
             layout.label(text=line)
         draw_parts(layout, self.worker_parts)
         column = layout.column(align=True)
-        column.label(text="The worker computes everything.", icon="INFO")
-        brought = "brought it along" if worker.bundled_command() else "came without it"
+        column.label(text="The worker does all computations.", icon="INFO")
+        brought = "includes it" if worker.bundled_command() else "does not include it"
         column.label(text=f"This extension {brought}.", icon="BLANK1")
 
 

@@ -58,30 +58,32 @@ class LimberSettings(bpy.types.PropertyGroup):
     """Choices of one scene; the settings of each stage stand below its name."""
 
     branch_folder: bpy.props.StringProperty(
-        name="Branch folder", subtype="DIR_PATH", options=compat.PATH_OPTIONS,
+        name="Branch Folder", subtype="DIR_PATH", options=compat.PATH_OPTIONS,
         get=_folder_in_sight, set=_choose_folder,
-        description="NAME.branch, where the worker keeps everything about one branch: that of the "
-                    "active object, else the one last used")
+        description="NAME.branch, the folder in which the worker keeps everything about one "
+                    "branch: that of the active object, otherwise the last one used")
     live_weight: bpy.props.BoolProperty(
-        name="Own weight", default=True,
-        description="While the branch is held: it bears its weight, and was scanned so")
+        name="Own Weight", default=True,
+        description="Apply gravity while the branch is held. The scan shows the branch bent by "
+                    "its own weight")
     fruit_mass: bpy.props.FloatProperty(
-        name="Mass of each fruit [kg]", default=0.1, min=0.0, soft_max=1.0, max=1000.0, precision=3,
-        description="Of the fruit that hang on the branch", update=_set_fruit_mass)
+        name="Mass of Each Fruit [kg]", default=0.1, min=0.0, soft_max=1.0, max=1000.0, precision=3,
+        description="Mass of each fruit on the branch", update=_set_fruit_mass)
     show_scan: bpy.props.BoolProperty(
         name="Scan", default=True, update=_show_scan,
-        description="Show imported scans; they lie over the branch that was made of them")
+        description="Show imported scans over the branches made from them")
     show_legend: bpy.props.BoolProperty(
-        name="Legend", default=True, description="Write in the 3D view what the colours mean")
+        name="Legend", default=True, description="Explain the colours in the 3D view")
     each_frame: bpy.props.BoolProperty(
-        name="Colours follow the motion", default=True, update=_color_again,
-        description="Colour by the value in the frame in sight; else by the worst of all frames")
+        name="Colours Follow the Motion", default=True, update=_color_again,
+        description="Colour by the value in the current frame; otherwise by the worst value over "
+                    "all frames")
     graph: bpy.props.EnumProperty(
-        name="Graph", description="Drawn in the lower right corner of the 3D view",
+        name="Graph", description="Graph in the lower right corner of the 3D view",
         items=[(viewport_graph.NONE, "No graph", ""),
                *((name, title, "") for name, title in viewport_graph.GRAPHS.items())])
     show_expert: bpy.props.BoolProperty(
-        name="All settings", description="Show also the settings that few need")
+        name="All Settings", description="Also show the settings that are rarely needed")
 
 
 def attribute_name(stage: str) -> str:
@@ -160,7 +162,7 @@ def stage_properties(stage: Stage, options: set[str] = frozenset()) -> dict[str,
         found[name] = _property(field, set(options))
         if field.is_optional and has_switch(field):
             found[OPEN + name] = bpy.props.BoolProperty(
-                name=field.title, description=f"{field.description} Off: left to the worker",
+                name=field.title, description=f"{field.description} Off: the worker decides",
                 options=set(options))
     return found
 

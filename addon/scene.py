@@ -218,7 +218,8 @@ def _add_skeleton(shown: ShownBranch, data: SceneData, before: _Before) -> None:
                         data.arrays["skeleton_parent"])
     mesh = before.edited
     if mesh is not None and not skeletons.is_of(mesh, skeleton):
-        data.info["notes"].append("The skeleton was made anew: edits not applied are gone")
+        data.info["notes"].append("The skeleton was made again. Edits that were not applied are "
+                                  "lost")
         bpy.data.meshes.remove(mesh)
         mesh = None
     if mesh is None:

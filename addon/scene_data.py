@@ -81,8 +81,8 @@ def read_scene_data(path: Path) -> SceneData:
     if not isinstance(info, dict) or info.get("format") != FORMAT:
         found = info.get("format") if isinstance(info, dict) else None
         raise SceneDataError(
-            f"The worker's data has format {found}, this add-on shows {FORMAT}. "
-            "Install the add-on and the worker of one version of Limber.")
+            f"The worker's data has format {found}, but this add-on reads format {FORMAT}. "
+            "Install the add-on and the worker of the same version of Limber.")
     trouble = _info_trouble(info) or _arrays_trouble(arrays) or _pairs_trouble(arrays, info)
     if trouble:
         raise SceneDataError(f"{path} cannot be shown ({trouble}).")
@@ -104,13 +104,13 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 read = {(1, 0): np.lib.format.read_array_header_1_0,
                         (2, 0): np.lib.format.read_array_header_2_0}.get(version)
                 if read is None:
-                    raise ValueError(f"{member.filename} is of an unknown version")
+                    raise ValueError(f"{member.filename} has an unknown version")
                 shape, _, kind = read(stream)
                 size = kind.itemsize
                 for count in shape:
                     size *= count
                 if kind.hasobject or size + stream.tell() != member.file_size:
-                    raise ValueError(f"{member.filename} is not what its header says")
+                    raise ValueError(f"{member.filename} does not match its header")
     with np.load(path, allow_pickle=False) as content:
         return {name: content[name] for name in content.files}
 
@@ -120,9 +120,9 @@ def _info_trouble(info: dict[str, Any]) -> str:
         if not isinstance(info.get(name), kind):
             return f"its {name} is missing"
     if np.shape(info["alignment"]) != (4, 4):
-        return "its alignment is no matrix"
-    return next((f"its graph {name} is none" for name, graph in (info.get("graphs") or {}).items()
-                 if not _is_graph(graph)), "")
+        return "its alignment is not a matrix"
+    return next((f"its graph {name} is invalid"
+                 for name, graph in (info.get("graphs") or {}).items() if not _is_graph(graph)), "")
 
 
 def _is_graph(graph: Any) -> bool:
@@ -165,21 +165,21 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
             count == (int(letter) if letter.isdigit() else sizes.setdefault(letter, count))
             for letter, count in zip(letters, array.shape, strict=True))
         if not fits:
-            return f"{name} has the shape {array.shape}"
+            return f"{name} has the invalid shape {array.shape}"
         if array.dtype.kind not in {"r": "f", "i": "iu", "b": "b"}[number]:
-            return f"{name} holds {array.dtype}"
+            return f"{name} has the invalid type {array.dtype}"
         if number == "r" and not np.isfinite(array).all():
-            return f"{name} holds values that are not finite"
+            return f"{name} contains values that are not finite"
     surfaces = [("faces", "vertices")] + [(name, name.replace("rod_faces", "rods", 1))
                                           for name in arrays if name.startswith("rod_faces:")]
     for name, vertices in surfaces:
         faces, count = arrays[name], len(arrays.get(vertices, ()))
         if len(faces) and (faces.min() < 0 or faces.max() >= count):
-            return f"{name} do not index {count} vertices"
+            return f"{name} contains indices outside the {count} vertices"
     for name, parents in arrays.items():
         if name.partition(":")[0] in ("skeleton_parent", "tree_parent") and len(parents) and (
                 parents.min() < -1 or (parents >= np.arange(len(parents))).any()):
-            return f"{name} is no tree"
+            return f"{name} is not a tree"
     return ""
 
 
@@ -194,7 +194,7 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     wanted += [f"{kind}:{name}" for name in info.get("rods") or {}
                for kind in ("rods", "rod_faces", "rod_color")]
     if len(arrays.get("targets", ())) != len(info.get("targets") or ()):
-        return "the targets do not fit their names"
+        return "the number of targets does not match the number of their names"
     for name in ("grasp", "control_points", "targets"):
         wanted += [f"{name}_radius"] * (name in arrays)
         wanted += [f"{name}_motion"] * (name in arrays and bool(info.get("frames")))
@@ -204,5 +204,5 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     frames = info.get("frames")
     times = arrays.get("frame_times")
     if frames and (times is None or len(times) != frames.get("count")):
-        return "the frames' times do not fit their number"
+        return "the number of frame times does not match the number of frames"
     return ""

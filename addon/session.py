@@ -62,7 +62,7 @@ class FrameFile:
     def __init__(self, path: Path, vertex_count: int):
         with open(path, "rb") as stream:
             if stream.read(8) != _MAGIC:
-                raise ValueError(f"{path} holds no frames that this version of the add-on reads.")
+                raise ValueError(f"{path} has no frames that this version of the add-on can read.")
             self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         vertices, _, slots, numbers, grasps, targets = np.frombuffer(
             self._map, "<u4", 6, 8).tolist()
@@ -70,12 +70,12 @@ class FrameFile:
         before = 8 * (numbers + _GRASP_COLUMNS * grasps + 3 * targets)
         if vertices != vertex_count:
             self._map.close()
-            raise ValueError(f"The branch in its folder has {vertices} surface vertices, the one "
-                             f"shown {vertex_count}. Open the result again.")
+            raise ValueError(f"The branch in its folder has {vertices} surface vertices, but the "
+                             f"shown branch has {vertex_count}. Open the result again.")
         if slots < 2 or numbers < len(_NUMBERS) or before + 12 * vertices > size or (
                 first < _HEADER_BYTES or first + slots * size > len(self._map)):
             self._map.close()
-            raise ValueError(f"{path} is cut short.")
+            raise ValueError(f"{path} is truncated.")
         self._sequence = np.frombuffer(self._map, "<u8", 1, 40)
         starts = [first + slot * size for slot in range(slots)]
         self._numbers = [np.frombuffer(self._map, "<f8", len(_NUMBERS), at) for at in starts]
@@ -144,7 +144,7 @@ class Session:
             if kind == "hello":
                 self._begin(event)
             elif kind == "compiling":
-                self.message = "compiling, this once: up to a minute"
+                self.message = "compiling once, up to a minute"
             elif kind == "failed":
                 self.error = str(event.get("message", ""))
             elif kind == "progress":
@@ -208,8 +208,9 @@ class Session:
 
     def _begin(self, hello: dict[str, Any]) -> None:
         if hello.get("protocol") != PROTOCOL:
-            self.error = (f"The worker's session speaks protocol {hello.get('protocol')}, this "
-                          f"add-on {PROTOCOL}. Install the add-on and the worker of one version.")
+            self.error = (f"The worker's session uses protocol {hello.get('protocol')}, but this "
+                          f"add-on uses protocol {PROTOCOL}. Install the add-on and the worker of "
+                          "the same version.")
             return
         try:
             self._frames = FrameFile(Path(hello["positions"]), self._vertex_count)

@@ -97,8 +97,8 @@ def _require_known(before: Skeleton, now: Nodes) -> None:
     if len(np.unique(number)) != len(number) or (
             len(number) and (number.min() < 0 or number.max() >= len(before.nodes))):
         raise SkeletonEditError(
-            "Nodes were added. The worker moves, removes and hangs over nodes that were found: "
-            "undo what added them, or discard the edits.")
+            "Nodes were added. The worker can only move, remove and reattach nodes that it found. "
+            "Undo the additions or discard the edits.")
     given = number[now.edges]
     drawn = {tuple(sorted(edge)) for edge in given.tolist()}
     there = set(number.tolist())
@@ -121,8 +121,9 @@ def _require_carried(before: Skeleton, place: dict[int, Any], marked: dict[int, 
     left = set().union(*(before.outwards(node, rehung) for node in gone)) & place.keys()
     if left:
         raise SkeletonEditError(
-            f"{len(left)} nodes hang on nothing: what carried them was deleted. Delete them too, "
-            "or undo that and hang them on another branch first (Split, Bridge).")
+            f"{len(left)} nodes are detached because the nodes that carried them were deleted. "
+            "Delete them too, or undo the deletion and attach them to another branch first "
+            "(Split, Bridge).")
 
 
 def _point(values: np.ndarray) -> list[float]:
@@ -139,7 +140,8 @@ def _moves(before: Skeleton, now: Nodes) -> Iterator[dict[str, Any]]:
 def _radii(before: Skeleton, now: Nodes) -> Iterator[dict[str, Any]]:
     for k in np.flatnonzero(before.radius[now.number].astype(np.float32) != now.radius):
         if not now.radius[k] > 0:
-            raise SkeletonEditError("A radius is not above 0. Give one with Set Radius.")
+            raise SkeletonEditError("A radius is not positive. Give a positive one with Set "
+                                    "Radius.")
         yield {"do": "radius", "at": _point(now.places[k]), "radius": float(now.radius[k])}
 
 
@@ -151,7 +153,8 @@ def _marks(now: Nodes, place: dict[int, np.ndarray]) -> Iterator[dict[str, Any]]
         if mark.has_target:
             if target not in place:
                 raise SkeletonEditError(
-                    f"The node that a {mark.name.lower()} leads to was deleted. Undo one of both.")
+                    f"The target node of a {mark.name.lower()} was deleted. Undo the deletion or "
+                    "clear the mark.")
             edit["to"] = _point(place[target])
         yield edit
 
@@ -166,6 +169,6 @@ def _deletions(before: Skeleton, gone: list[int]) -> Iterator[dict[str, Any]]:
 def _root(before: Skeleton, now: Nodes) -> Iterator[dict[str, Any]]:
     chosen = [k for k in np.flatnonzero(now.is_root) if int(now.number[k]) != before.root]
     if len(chosen) > 1:
-        raise SkeletonEditError("Several nodes are marked as the root. Leave one.")
+        raise SkeletonEditError("Several nodes are marked as the root. Keep only one.")
     for k in chosen:
         yield {"do": "root", "at": _point(now.places[k])}

@@ -194,8 +194,8 @@ def species() -> dict[str, Any]:
 def _content() -> dict[str, Any]:
     content = json.loads(_FILE.read_text(encoding="utf-8"))
     if content.get("format") != FORMAT:
-        raise RuntimeError(f"{_FILE.name} has format {content.get('format')}, this add-on reads "
-                           f"{FORMAT}. Install the add-on again.")
+        raise RuntimeError(f"{_FILE.name} has format {content.get('format')}, but this add-on "
+                           f"reads format {FORMAT}. Install the add-on again.")
     return content
 
 
@@ -255,8 +255,8 @@ def rows_of(field: Field, text: str) -> list[list[float]]:
     except ValueError as error:
         raise SettingError(f"{field.title}: {error}. {_ROWS_HELP}") from error
     if any(len(row) != field.length for row in rows):
-        raise SettingError(f"{field.title} takes {field.length} numbers each time. {_ROWS_HELP}")
+        raise SettingError(f"{field.title} needs {field.length} numbers per group. {_ROWS_HELP}")
     return rows
 
 
-_ROWS_HELP = "Write numbers with spaces between them, and ; between one and the next."
+_ROWS_HELP = "Separate numbers by spaces, and groups by semicolons."

@@ -24,7 +24,7 @@ class StepState(enum.Enum):
     RUNNING = ("running", "SORTTIME")
     WAITING = ("waiting for its turn", "TIME")
     DONE = ("done", "CHECKMARK")
-    STALE = ("out of date: what it read has changed", "FILE_REFRESH")
+    STALE = ("out of date: its input has changed", "FILE_REFRESH")
     CHANGED = ("out of date: its settings have changed", "FILE_REFRESH")
     FAILED = ("failed", "ERROR")
 
@@ -81,7 +81,7 @@ STEPS = (
          settings_of=(StageView("plan", ("start and goal",)),)),
     Step("plan", "Plan", StageView("plan", (
         "output", "weights and limits", "timing", "solver", "running"))),
-    Step("robot", "Robot", StageView("execute"), hint="A dry run first: nothing moves"),
+    Step("robot", "Robot", StageView("execute"), hint="A dry run comes first and moves nothing"),
     Step("report", "Report", StageView("report")),
 )
 

@@ -12,12 +12,12 @@ class WorkerNotFound(Exception):
 
     def __init__(self, seen: str):
         super().__init__(
-            f"{seen} Everything is computed by Limber's worker. The extension's zip for your "
-            f"system and Python {sys.version_info.major}.{sys.version_info.minor} brings it along; "
-            "this one does not. Install that zip, or the worker (a Python 3.11 or newer: `pip "
-            "install PROJECT_FOLDER`, or scripts/setup in a checkout), then name that Python in "
-            "the add-on's preferences or in LIMBER_PYTHON, or put the program `limber` on the "
-            "PATH.")
+            f"{seen} Limber's worker does all computations. The extension's zip for your system "
+            f"and Python {sys.version_info.major}.{sys.version_info.minor} includes the worker, "
+            "but this zip does not. Install that zip. Or install the worker in a Python 3.11 or "
+            "newer (`pip install PROJECT_FOLDER`, or scripts/setup in a checkout), then choose "
+            "that Python in the add-on's preferences or in LIMBER_PYTHON, or put the program "
+            "`limber` on the PATH.")
 
 
 def bundled_command() -> list[str]:

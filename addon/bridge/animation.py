@@ -40,13 +40,13 @@ def read_header(path: Path) -> CacheHeader:
             head = stream.read(_HEADER.size)
             size = stream.seek(0, 2)
     except OSError as error:
-        raise CacheError(f"{path} cannot be read ({error.strerror}). "
-                         "Open the branch folder again where it is now.") from error
+        raise CacheError(f"{path} cannot be read ({error.strerror}). Open the branch folder at "
+                         "its current location.") from error
     if len(head) < _HEADER.size or not head.startswith(b"POINTCACHE2\0"):
         raise CacheError(f"{path} is not a PC2 file. Run the stage that makes it again.")
     _, _, vertex_count, _, _, frame_count = _HEADER.unpack(head)
     if size != _HEADER.size + 12 * vertex_count * frame_count:
-        raise CacheError(f"{path} is cut short. Run the stage that makes it again.")
+        raise CacheError(f"{path} is truncated. Run the stage that makes it again.")
     return CacheHeader(vertex_count, frame_count)
 
 
@@ -65,8 +65,8 @@ def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1, *,
     header = read_header(path)
     if header.vertex_count != len(target.data.vertices):
         raise CacheError(
-            f"{path} moves {header.vertex_count} vertices; {target.name} has "
-            f"{len(target.data.vertices)}. It belongs to another mesh: open the result again.")
+            f"{path} moves {header.vertex_count} vertices, but {target.name} has "
+            f"{len(target.data.vertices)}. It belongs to another mesh. Open the result again.")
     modifier = target.modifiers.get(MODIFIER) or target.modifiers.new(MODIFIER, "MESH_CACHE")
     modifier.cache_format = "PC2"
     modifier.filepath = shown_path(path)
@@ -81,7 +81,7 @@ def cache_trouble(target: bpy.types.Object) -> str:
     """Return why the cache of ``target`` does not play, or nothing if it does."""
     modifier = target.modifiers.get(MODIFIER)
     if modifier is None:
-        return "It has no motion yet: plan a path first."
+        return "The branch has no motion yet. Plan a path first."
     path = Path(bpy.path.abspath(modifier.filepath))
     try:
         header = read_header(path)

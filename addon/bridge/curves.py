@@ -9,7 +9,7 @@ def new_tube(name: str, points: np.ndarray, radius: float) -> bpy.types.Mesh:
     """
     points = np.asarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ValueError(f"{name}: points of shape {points.shape} make no curve")
+        raise ValueError(f"{name}: points of shape {points.shape} do not form a curve")
     curve = bpy.data.curves.new(name, "CURVE")
     curve.dimensions = "3D"
     curve.bevel_depth = radius

@@ -34,7 +34,7 @@ def new_lines(name: str, vertices: np.ndarray, edges: np.ndarray) -> bpy.types.M
     """
     edges = np.asarray(edges).reshape(-1, 2)
     if len(edges) and (edges.min() < 0 or edges.max() >= len(vertices)):
-        raise ValueError(f"edges do not index {len(vertices)} vertices")
+        raise ValueError(f"edges have indices outside the {len(vertices)} vertices")
     mesh = new_mesh(name, vertices)
     mesh.edges.add(len(edges))
     mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, np.int32).ravel())
@@ -44,7 +44,8 @@ def new_lines(name: str, vertices: np.ndarray, edges: np.ndarray) -> bpy.types.M
 
 def _add_faces(mesh: bpy.types.Mesh, faces: np.ndarray, vertex_count: int) -> None:
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= vertex_count:
-        raise ValueError(f"faces of shape {faces.shape} do not index {vertex_count} vertices")
+        raise ValueError(f"faces of shape {faces.shape} have a wrong shape or indices outside the "
+                         f"{vertex_count} vertices")
     mesh.loops.add(faces.size)
     mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
     mesh.polygons.add(len(faces))
@@ -185,5 +186,5 @@ def _checked(values: np.ndarray, columns: int | None, name: str) -> np.ndarray:
     if not wanted or (columns is not None and values.shape[1] != columns):
         raise ValueError(f"{name} has shape {values.shape}")
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds values that are not finite")
+        raise ValueError(f"{name} contains values that are not finite")
     return values

@@ -20,7 +20,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("picture", type=Path, help="a PNG")
     parser.add_argument("--colour", default="young")
-    parser.add_argument("--frame", type=int, help="of the motion; the worst of all without it")
+    parser.add_argument("--frame", type=int, help="frame of the motion; without it, the worst "
+                                                  "value over all frames")
     parser.add_argument("--width", type=int, default=800)
     given = parser.parse_args(arguments)
 

@@ -10,15 +10,15 @@ from .run_stage import StageOperator, stage_operator
 
 _WIDTH = 420
 _WARNING = ("The robot will move. Clear its workspace, and keep a hand",
-            "at the emergency stop: Stop Robot below is no substitute.")
+            "at the emergency stop. The button Stop Robot does not replace it.")
 
 
 class MovesRobot(StageOperator):
     """Mix-in: a stage that moves a robot; the worker compares what was typed with ``name``."""
 
     confirm: bpy.props.StringProperty(
-        name="Type its name", options={"SKIP_SAVE"},
-        description="The name, typed by whoever stands beside the robot")
+        name="Name to Confirm", options={"SKIP_SAVE"},
+        description="The person beside the robot types the name to confirm the motion")
 
     def invoke(self, context, event):
         if bpy.app.background or context.window is None:
@@ -32,7 +32,7 @@ class MovesRobot(StageOperator):
         for number, line in enumerate(_WARNING):
             column.label(text=line, icon="BLANK1" if number else "ERROR")
         name = self.name_of(context)
-        self.layout.label(text=f"To go on, type: {name}")
+        self.layout.label(text=f"To continue, type: {name}")
         row = self.layout.row()
         row.alert = bool(self.confirm) and self.confirm != name
         row.prop(self, "confirm")
@@ -40,13 +40,13 @@ class MovesRobot(StageOperator):
     def arguments(self, context):
         if jobs.is_running() or jobs.waiting():
             # It would move when its turn comes, perhaps with nobody there any more.
-            raise ValueError("The worker is busy. A robot moves at once or not at all: try again "
-                             "when nothing runs or waits.")
+            raise ValueError("The worker is busy. The robot must move immediately or not at all. "
+                             "Try again when no job is running or waiting.")
         if trouble := self.trouble(context):
             raise ValueError(trouble)
         if not self.confirm:
-            raise ValueError("Nobody confirmed that the robot may move: "
-                             f"type {self.name_of(context)}.")
+            raise ValueError("Nobody confirmed that the robot may move. Type "
+                             f"{self.name_of(context)}.")
         given = super().arguments(context)
         return [given[0], *self.orders(), *given[1:]]
 
@@ -64,14 +64,14 @@ class MovesRobot(StageOperator):
 
 
 class LIMBER_OT_arm(MovesRobot, bpy.types.Operator):
-    """Follow the plan with the robot that the dry run was made for: approach, grasp, path and
-    back. Asks for the plan's name to be typed"""
+    """Follow the plan with the robot of the dry run: approach, grasp, follow the path and return.
+    The plan's name must be typed to confirm"""
 
     bl_idname = "limber.arm"
     bl_label = "Move the Robot"
     bl_options: ClassVar = {"REGISTER"}
     stage_name = "execute"
-    title = "Robot follows the plan"
+    title = "Robot motion along the plan"
 
     replace: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})
 
@@ -99,19 +99,19 @@ def why_not_armed(context: bpy.types.Context) -> str:
     group = properties.group_of(context.scene, stage)
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("status") != "done":
-        return "Check it with the robot first: nothing moves then"
+        return "Run the dry run with the robot first. It does not move the robot"
     try:
         given = properties.arguments_of(context.scene, stage, str(folder))
     except ValueError as error:
         return str(error)
     if outcome.get("arguments") != given:
-        return "The settings have changed since the dry run: check it with the robot again"
+        return "The settings have changed since the dry run. Repeat the dry run with the robot"
     record = branch_folder.read_record(folder)
     preview = record.stages.get(f"execute-preview:{group.name}") if record else None
     plan = f"plans/{group.name}.csv"
     if preview is None or plan not in record.files or (
             preview.reads.get(plan) != record.files[plan][0]):
-        return "The plan has changed since the dry run: check it with the robot again"
+        return "The plan has changed since the dry run. Repeat the dry run with the robot"
     return ""
 
 

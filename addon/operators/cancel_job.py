@@ -6,14 +6,14 @@ from .. import jobs
 
 
 class LIMBER_OT_cancel_job(bpy.types.Operator):
-    """Stop the worker; what was there before stays as it was"""
+    """Stop the worker. Earlier results are kept"""
 
     bl_idname = "limber.cancel_job"
     bl_label = "Cancel"
 
     waiting: bpy.props.IntProperty(
         name="Waiting", default=-1, min=-1, options={"SKIP_SAVE"},
-        description="Which of those that wait is not to run, from 0; -1: what runs")
+        description="Number of the waiting job to cancel, from 0; -1 cancels the running job")
 
     @classmethod
     def poll(cls, context):
@@ -22,7 +22,7 @@ class LIMBER_OT_cancel_job(bpy.types.Operator):
     def execute(self, context):
         queue = jobs.waiting()
         if self.waiting >= len(queue) or (self.waiting < 0 and not jobs.is_running()):
-            self.report({"WARNING"}, "It has ended, or begun, by now.")
+            self.report({"WARNING"}, "The job has already ended or started.")
             return {"CANCELLED"}
         (jobs.current() if self.waiting < 0 else queue[self.waiting]).cancel()
         return {"FINISHED"}

@@ -9,7 +9,7 @@ from .worker_operator import WorkerOperator
 
 
 class LIMBER_OT_check_worker(WorkerOperator, bpy.types.Operator):
-    """Start the worker and show its version and what is missing there"""
+    """Start the worker and show its version and any missing packages"""
 
     bl_idname = "limber.check_worker"
     bl_label = "Check the Worker"
@@ -21,7 +21,7 @@ class LIMBER_OT_check_worker(WorkerOperator, bpy.types.Operator):
 
     def finish(self, context, result):
         missing = ", ".join(result.get("missing", [])) or "nothing"
-        status = f"Python {result['python']} on {result['system']}\nMissing there: {missing}"
+        status = f"Python {result['python']} on {result['system']}\nMissing: {missing}"
         chosen = preferences.get(context)
         if chosen is not None:
             chosen.worker_status = status

@@ -11,7 +11,7 @@ from ..steps import PLACES, REGIONS
 
 
 class LIMBER_OT_from_cursor(bpy.types.Operator):
-    """Set this place to where the 3D cursor is; a list of places gets one more"""
+    """Set this position to the 3D cursor; a list of positions gets a new entry"""
 
     bl_idname = "limber.from_cursor"
     bl_label = "From 3D Cursor"
@@ -25,7 +25,7 @@ class LIMBER_OT_from_cursor(bpy.types.Operator):
         field = stage.fields.get(self.field) if stage else None
         is_list = field is not None and field.name in PLACES
         if field is None or not (is_list or (field.kind == "vector" and field.length == 3)):
-            self.report({"ERROR"}, f"{self.stage} has no place {self.field!r}.")
+            self.report({"ERROR"}, f"{self.stage} has no position {self.field!r}.")
             return {"CANCELLED"}
         group = properties.group_of(context.scene, stage)
         place = tuple(branches.in_branch(context.scene, context.scene.cursor.location))
@@ -43,7 +43,7 @@ class LIMBER_OT_from_cursor(bpy.types.Operator):
 
 class LIMBER_OT_from_object(bpy.types.Operator):
     """Take this region of the plan from the active object: its bounding box, or the ball about its
-    middle"""
+    centre"""
 
     bl_idname = "limber.from_object"
     bl_label = "From Active Object"
@@ -56,7 +56,7 @@ class LIMBER_OT_from_object(bpy.types.Operator):
     def poll(cls, context):
         thing = context.active_object
         if thing is None or branches.branch_of(thing) is not None:
-            cls.poll_message_set("Add an object where the region is, and select it")
+            cls.poll_message_set("Add an object that marks the region, and select it")
             return False
         return True
 

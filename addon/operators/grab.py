@@ -23,14 +23,14 @@ from .needs_result import NeedsBranchInObjectMode
 _INTERVAL_SECONDS = 1 / 120
 """Between two looks for a frame: the session makes up to 60 a second, and half of this is how long
 one waits on average before it is seen."""
-_KEYS = ("Drag: bend | F: hang a fruit | C: cut here | Enter: keep for a simulation | "
-         "S, G: keep as the plan's start, goal | Esc: let go and leave")
+_KEYS = ("Drag: bend | F: add a fruit | C: cut here | Enter: keep for a simulation | S, G: keep "
+         "as the plan's start, goal | Esc: release and exit")
 _PLACED = {"F": "fruit", "C": "cut"}
 _PANEL_SECONDS = 0.2
 _NAVIGATION = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WHEELINMOUSE", "WHEELOUTMOUSE",
                "TRACKPADPAN", "TRACKPADZOOM", "MOUSEROTATE", "MOUSESMARTZOOM", "NDOF_MOTION"}
 _WORDS = {"learning": "full model, slow; learning", "reduced": "learnt model",
-          "full": "full model", "untrusted": "NOT TO BE RELIED ON"}
+          "full": "full model", "untrusted": "NOT RELIABLE"}
 _NORMAL, _OVER = (1.0, 1.0, 1.0, 1.0), (1.0, 0.25, 0.2, 1.0)
 
 
@@ -67,15 +67,15 @@ class Hold:
 
 
 class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
-    """Bend the branch by hand: press on it and drag. Force and energy stand at the mouse"""
+    """Bend the branch by hand: press on it and drag. Force and energy are shown at the mouse"""
 
     bl_idname = "limber.grab"
     bl_label = "Grab the Branch"
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     radius: bpy.props.FloatProperty(
-        name="Grasp radius [m]", default=0.01, min=0.0, soft_max=0.1,
-        description="The branch is held within this distance of the place that was pressed")
+        name="Grasp Radius [m]", default=0.01, min=0.0, soft_max=0.1,
+        description="The branch is held within this distance of the point under the mouse")
 
     _session: Session | None = None
     _surface: bpy.types.Object | None = None
@@ -83,8 +83,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
     _frame: HeldFrame | None = None
 
     def execute(self, context):
-        self.report({"ERROR"}, "A grab needs the mouse in a 3D view. From a script use "
-                               "limber.session.client, or limber.simulate.")
+        self.report({"ERROR"}, "Grab the Branch needs the mouse in a 3D view. In a script, use "
+                               "limber.session.client or limber.simulate.")
         return {"CANCELLED"}
 
     def invoke(self, context, event):
@@ -272,16 +272,16 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         hold = self._hold
         if hold is None and kept is Kept.MOTION and self._loads.acts:
             self._end(context, is_kept=True)
-            self.report({"INFO"}, "Kept: Material, Wind, Snow, Fruit, Cuts has these loads.")
+            self.report({"INFO"}, "The loads are kept in Material, Wind, Snow, Fruit, Cuts.")
             return {"FINISHED"}
         if hold is None or hold.position is None or self._target is None:
-            self.report({"WARNING"}, "Nothing is bent yet: press on the branch and drag.")
+            self.report({"WARNING"}, "The branch is not bent yet. Press on the branch and drag.")
             return {"RUNNING_MODAL"}
         marked = self._surface.get(branches.GRASP_KEY)
         is_marked = marked is not None and (
             (Vector(marked[:3]) - hold.rest).length <= marked[3] + self.radius)
         if kept is not Kept.MOTION and not is_marked:
-            self.report({"WARNING"}, "A plan moves the marked grasp: bend the branch there, or "
+            self.report({"WARNING"}, "A plan moves the marked grasp. Bend the branch there, or "
                                      "press Enter to keep this grab for a simulation.")
             return {"RUNNING_MODAL"}
         target = tuple(self._target)
@@ -291,7 +291,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._give(context, "simulate", grasp_point=tuple(hold.rest), move=moved)
             group = properties.group_of(context.scene, stages()["simulate"])
             group.grasp_radius, group.grasp_mode = self.radius, "pinned"
-            self.report({"INFO"}, "Kept: Material, Simulate a Motion bends it so.")
+            self.report({"INFO"}, "Kept for Simulate a Motion in Material.")
         else:
             name = "start" if kept is Kept.START else "goal"
             self._give(context, "plan", **{name: target})
@@ -385,7 +385,7 @@ class LIMBER_TOOL_grab(bpy.types.WorkSpaceTool):
     bl_context_mode = "OBJECT"
     bl_idname = "limber.grab_tool"
     bl_label = "Grab the Branch"
-    bl_description = "Press on the branch and drag: it bends as the real one would"
+    bl_description = "Press on the branch and drag it. It bends like the real branch"
     bl_icon = "ops.pose.push"
     bl_keymap = (("limber.grab", {"type": "LEFTMOUSE", "value": "PRESS"}, None),)
 

@@ -97,8 +97,8 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         unit = settings.reconstruct.unit
         size = f"{scan.extent:.4g} {unit} across"
         if guessed:
-            self.report({"WARNING"}, f"{size}: taken for millimetres. Set Unit, and import again, "
-                                     "if it is not.")
+            self.report({"WARNING"}, f"{size}. The unit was assumed to be millimetres. If it is "
+                                     "another, set Unit and import the scan again.")
         told = [f"{len(scan.points)} points, {size}", *([hidden] if hidden else [])]
         self.report({"INFO"}, "; ".join(told))
         return {"FINISHED"}

@@ -85,11 +85,11 @@ class LiveLoads:
     def tell(self, frame: HeldFrame) -> None:
         """Write down for the panel what the loads do."""
         lines[:] = [f"Sag {1000 * frame.sag:.3g} mm",
-                    f"Greatest strain {100 * frame.strain:.3g} %"]
+                    f"Maximum strain {100 * frame.strain:.3g} %"]
         if self._reply.get("wind_force_n"):
             force = sum(value * value for value in self._reply["wind_force_n"]) ** 0.5
-            lines.append(f"Wind {force:.3g} N, hung {self._reply['added_mass_kg']:.3g} kg, "
-                         f"cut {1000 * self._reply['cut_mass_kg']:.3g} g")
+            lines.append(f"Wind {force:.3g} N, added {self._reply['added_mass_kg']:.3g} kg, cut "
+                         f"{1000 * self._reply['cut_mass_kg']:.3g} g")
         if self.error:
             lines.append(self.error)
 

@@ -13,7 +13,7 @@ _KNOWN = {name: known for name, known in species()["presets"].items() if known["
 class LIMBER_OT_material(bpy.types.Operator):
     bl_idname = "limber.material"
     bl_label = "Material"
-    bl_description = (f"Set Young's modulus to start from, density and strength. {_SOURCE}")
+    bl_description = (f"Set the initial Young's modulus, the density and the strength. {_SOURCE}")
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     material: bpy.props.EnumProperty(name="Material", items=[
@@ -25,7 +25,7 @@ class LIMBER_OT_material(bpy.types.Operator):
         known, settings = _KNOWN[self.material], context.scene.limber
         settings.reconstruct.young, settings.reconstruct.density = known["young"], known["density"]
         settings.scene.strength, settings.scene.use_strength = known["strength"], True
-        self.report({"INFO"}, f"{known['title']}: reconstruct again to use it. {_SOURCE}")
+        self.report({"INFO"}, f"{known['title']} is set. Reconstruct again to use it. {_SOURCE}")
         return {"FINISHED"}
 
 

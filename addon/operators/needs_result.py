@@ -24,9 +24,9 @@ def needed_folder(scene: bpy.types.Scene) -> Path:
         raise ValueError("This scene has no branch folder. Choose a branch folder with Open "
                          "Result in the panel Branch, or enter its path under Folder there.")
     if not (folder / branch_folder.MANIFEST).is_file() and not jobs.works_in(str(folder)):
-        raise ValueError(f"{folder} holds no file {branch_folder.MANIFEST}. Choose a branch folder "
-                         "under Folder in the panel Branch. If it was moved, Find the Folder "
-                         "Again there looks for it.")
+        raise ValueError(f"{folder} has no file {branch_folder.MANIFEST}. Choose a branch folder "
+                         "under Folder in the panel Branch. If the folder was moved, use Find the "
+                         "Folder Again there.")
     return folder
 
 

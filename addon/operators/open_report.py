@@ -14,7 +14,7 @@ class LIMBER_OT_open_report(bpy.types.Operator):
     def execute(self, context):
         folder = branches.current_folder(context.scene)
         if folder is None or not (folder / "report.html").is_file():
-            self.report({"ERROR"}, "There is no report yet: write it first.")
+            self.report({"ERROR"}, "There is no report yet. Write it first.")
             return {"CANCELLED"}
         page = (folder / "report.html").resolve()
         if not bpy.app.background:

@@ -43,7 +43,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         if self.directory:
             folder = Path(bpy.path.abspath(self.directory))
             if not (folder / branch_folder.MANIFEST).is_file():
-                raise ValueError(f"{folder} is not a branch folder: it holds no file "
+                raise ValueError(f"{folder} is not a branch folder because it has no file "
                                  f"{branch_folder.MANIFEST}. Choose another folder.")
         else:
             folder = needed_folder(context.scene)
@@ -57,7 +57,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
     def finish(self, context, result):
         with self._temporary:
             if not self._data_path.is_file():
-                raise ValueError(f"The worker ended well but wrote nothing to show. It said: "
+                raise ValueError("The worker succeeded but wrote nothing to show. Its output was: "
                                  f"{json.dumps(result)} {' '.join(self._job.log)}")
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)

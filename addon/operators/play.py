@@ -10,7 +10,7 @@ from .needs_result import NeedsBranch
 
 
 class LIMBER_OT_play(NeedsBranch, bpy.types.Operator):
-    """Play or stop the branch's motion along the path"""
+    """Play or stop the branch's motion"""
 
     bl_idname = "limber.play"
     bl_label = "Play"
@@ -34,11 +34,11 @@ class LIMBER_OT_retime(NeedsBranch, bpy.types.Operator):
     bl_label = "Start and Speed"
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
-    frame_start: bpy.props.IntProperty(name="First frame", default=1, soft_min=1,
-                                       description="Of the scene, where the motion begins")
+    frame_start: bpy.props.IntProperty(name="First Frame", default=1, soft_min=1,
+                                       description="Frame of the scene in which the motion starts")
     speed: bpy.props.FloatProperty(
         name="Speed", default=1.0, min=0.001, soft_max=10.0,
-        description="1: in its own time (a path: one pose a frame); 0.1: slow motion")
+        description="1 plays in real time (a path: one pose per frame), 0.1 in slow motion")
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)

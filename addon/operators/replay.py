@@ -11,8 +11,8 @@ from .worker_operator import WorkerOperator
 
 
 class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
-    """Move the branch, as the model has it now, as this recording moved the real one; what was
-    measured is shown over it, frame by frame"""
+    """Move the current model of the branch as this recording moved the real branch, and show the
+    measured points over it in each frame"""
 
     bl_idname = "limber.replay_pull"
     bl_label = "Replay a Pull"
@@ -25,7 +25,7 @@ class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
     def arguments(self, context):
         folder = needed_folder(context.scene)
         if self.pull not in pulls_of(branch_folder.read_record(folder)):
-            raise ValueError(f"The branch has no pull {self.pull!r}: import one first.")
+            raise ValueError(f"The branch has no pull {self.pull!r}. Import one first.")
         self._folder = folder
         return ["simulate", "--pull", self.pull, "--", str(folder)]
 

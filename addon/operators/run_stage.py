@@ -76,7 +76,7 @@ class StageOperator(WorkerOperator):
         if self.stage_name == "predict":
             position = result.get("grasp_position_m") or result.get("position_m")
             if position:
-                self.report({"INFO"}, f"It comes to rest at {position} m")
+                self.report({"INFO"}, f"The grasp comes to rest at {position} m")
         if self.stage_name == "suggest-pull" and (best := result.get("best")):
             self.report({"INFO"}, f"Hold it at {best['grasp_point_m']} m and pull to "
                                   f"{best['end_m']} m")
@@ -133,7 +133,7 @@ class StageOperator(WorkerOperator):
         folder = branches.current_folder(context.scene)
         if folder is None or branch_folder.belongs(folder, branch_folder.file_sha256(source)):
             return ""
-        return f"{folder.name} was not made of {source.name}: its results would be overwritten."
+        return f"{folder.name} was not made from {source.name}. Its results would be overwritten."
 
 
 def _is_seen(stage: Stage) -> bool:
@@ -148,7 +148,7 @@ def stage_operator(name: str, base: type = StageOperator) -> type:
     return type(f"LIMBER_OT_{properties.attribute_name(name)}", (base, bpy.types.Operator), {
         "__annotations__": _own_properties(stage) | {"replace": bpy.props.BoolProperty(
             name="Replace", options={"HIDDEN", "SKIP_SAVE"},
-            description="Also where the folder holds the branch of another scan")},
+            description="Replace the branch even if the folder belongs to another scan")},
         "__doc__": stage.summary.rstrip("."), "__module__": __name__, "stage_name": name,
         "bl_idname": f"limber.{properties.attribute_name(name)}", "bl_label": stage.label})
 

@@ -24,8 +24,8 @@ GROUPS = {
     "rest": ("Rest Shape", ("rest",)),
     "base": ("Fixed Base", ("base",))}
 """What can be shown and hidden: its title, and the keys of the objects that show it."""
-NO_FRAMES = ("Its values in each frame are not beside the branch: open the result again. The worst "
-             "of all frames is shown.")
+NO_FRAMES = ("The values of each frame are missing from the branch folder, so the worst value "
+             "over all frames is shown. Open the result again.")
 
 
 def things_of(branch: bpy.types.Collection, group: str) -> list[bpy.types.Object]:
@@ -65,9 +65,10 @@ class LIMBER_OT_color_by(NeedsBranch, bpy.types.Operator):
 
     scalar: bpy.props.StringProperty(
         name="Quantity", description="young, strain_energy, strain, stress, stress_over_strength, "
-                                     "det_f or residual, as far as the branch has it")
+                                     "det_f or residual, if the branch has it")
     each_frame: bpy.props.BoolProperty(
-        name="In each frame", description="Colours follow the motion; else the worst of all frames")
+        name="In Each Frame", description="Show the values of the current frame; otherwise the "
+                                          "worst value over all frames")
 
     def execute(self, context):
         surface = branches.find_surface(context.scene)
@@ -100,7 +101,7 @@ class LIMBER_OT_graph(NeedsBranch, bpy.types.Operator):
 
     def execute(self, context):
         if self.graph not in viewport_graph.graphs_of(branches.find_surface(context.scene)):
-            self.report({"ERROR"}, "The branch in sight has no such graph: open the result again.")
+            self.report({"ERROR"}, "The current branch has no such graph. Open the result again.")
             return {"CANCELLED"}
         settings = context.scene.limber
         settings.graph = viewport_graph.NONE if settings.graph == self.graph else self.graph

@@ -15,7 +15,7 @@ _MOST_LOOKED_AT = 2000
 
 
 class LIMBER_OT_choose_branch(NeedsBranch, bpy.types.Operator):
-    """Make this the branch that the panels are about"""
+    """Show this branch in the panels"""
 
     bl_idname = "limber.choose_branch"
     bl_label = "Choose Branch"
@@ -36,14 +36,14 @@ class LIMBER_OT_choose_branch(NeedsBranch, bpy.types.Operator):
 
 
 class LIMBER_OT_side_by_side(NeedsBranch, bpy.types.Operator):
-    """Put the branches of the scene side by side, or back to where they grew"""
+    """Put the branches of the scene side by side, or back where they were scanned"""
 
     bl_idname = "limber.side_by_side"
     bl_label = "Side by Side"
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
-    back: bpy.props.BoolProperty(name="In place", options={"SKIP_SAVE"},
-                                 description="Each where it was scanned")
+    back: bpy.props.BoolProperty(name="In Place", options={"SKIP_SAVE"},
+                                 description="Put each branch where it was scanned")
 
     def execute(self, context):
         shown = [branch for branch in branches.branches(context.scene)
@@ -69,8 +69,8 @@ def _span(surface: bpy.types.Object) -> tuple[float, float]:
 
 
 class LIMBER_OT_relink(NeedsBranch, bpy.types.Operator):
-    """Find the branch's folder again where it was moved or renamed: beside this file, else where
-    you say"""
+    """Find the moved or renamed folder of the branch: beside this file, otherwise in a folder that
+    you choose"""
 
     bl_idname = "limber.relink"
     bl_label = "Find the Folder Again"
@@ -89,13 +89,14 @@ class LIMBER_OT_relink(NeedsBranch, bpy.types.Operator):
         branch = self._branch(context)
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else _beside_file(branch)
         if folder is None:
-            self.report({"ERROR"}, f"No folder of {branch.name} lies beside this file. Give its "
-                                   "place.")
+            self.report({"ERROR"}, f"There is no folder of {branch.name} beside this file. Choose "
+                                   "its folder.")
             return {"CANCELLED"}
         record = branch_folder.read_record(folder)
         if record is None or not _is_of(branch, record):
-            what = "no branch folder" if record is None else f"the folder of {record.name}"
-            self.report({"ERROR"}, f"{folder} is {what}, not that of {branch.name}.")
+            what = "not a branch folder" if record is None else (
+                f"the folder of another branch, {record.name}")
+            self.report({"ERROR"}, f"{folder} is {what}. Choose the folder of {branch.name}.")
             return {"CANCELLED"}
         _set_folder(branch, folder)
         branches.use_folder(context.scene, branch[branches.FOLDER_KEY])

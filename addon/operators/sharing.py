@@ -15,7 +15,7 @@ RIG = "Turntable"
 
 
 class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
-    """Write the moving branch, with its values at each vertex, as Alembic (.abc) or USD"""
+    """Write the moving branch, with its values at each vertex, to an Alembic (.abc) or USD file"""
 
     bl_idname = "limber.export_motion"
     bl_label = "Export Motion"
@@ -24,8 +24,8 @@ class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{kind}" for kind in _KINDS),
                                           options={"HIDDEN"})
     whole: bpy.props.BoolProperty(
-        name="Whole branch", default=False,
-        description="Also marks, paths, skeleton and robot; else the branch alone")
+        name="Whole Branch", default=False,
+        description="Also export marks, paths, skeleton and robot; otherwise only the branch")
 
     def invoke(self, context, event):
         if not self.filepath:
@@ -38,7 +38,8 @@ class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
         path = Path(bpy.path.abspath(self.filepath))
         kind = path.suffix.lower()
         if kind not in _KINDS:
-            self.report({"ERROR"}, f"{path.name}: name it .abc, or .usd, .usda, .usdc or .usdz.")
+            self.report({"ERROR"}, f"{path.name} has an unsupported ending. Use .abc, .usd, "
+                                   ".usda, .usdc or .usdz.")
             return {"CANCELLED"}
         built = bpy.app.build_options.alembic if kind == ".abc" else bpy.app.build_options.usd
         if not built:
@@ -71,8 +72,8 @@ class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
 
 
 class LIMBER_OT_turntable(NeedsBranchInObjectMode, bpy.types.Operator):
-    """Add a camera that goes once round the branch, and look through it; pressed again, it fits
-    the branch as it is shown now"""
+    """Add a camera that circles the branch once, and look through it. Press again to fit the camera
+    to the branch as it is shown now"""
 
     bl_idname = "limber.turntable"
     bl_label = "Turntable"
@@ -80,10 +81,10 @@ class LIMBER_OT_turntable(NeedsBranchInObjectMode, bpy.types.Operator):
 
     frames: bpy.props.IntProperty(
         name="Frames", default=120, min=2, soft_max=1000,
-        description="For one turn, from the scene's first frame on")
+        description="Number of frames of one turn, from the scene's first frame")
     above: bpy.props.FloatProperty(
         name="Above [deg]", default=15.0, min=-80.0, max=80.0,
-        description="How far the camera looks down on the branch")
+        description="Elevation of the camera above the branch")
 
     def execute(self, context):
         current = context.scene

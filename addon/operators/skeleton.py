@@ -18,15 +18,17 @@ from .needs_result import NeedsSkeleton
 from .worker_operator import WorkerOperator
 
 _ACTIONS = (
-    ("DELETE", "Delete Branch", "Cut the branch off, from the chosen nodes outwards"),
-    ("BRIDGE", "Bridge", "Hang the whole branch of the first node on the last one chosen"),
-    ("MERGE", "Merge", "Up to the first node it is one with the branch of the last one chosen"),
-    ("SPLIT", "Split", "Cut at the first node; what lies beyond hangs on the last one chosen"),
-    ("ROOT", "Set Root", "The chosen node is the root"),
-    ("RADIUS", "Set Radius", "Give the chosen nodes this radius"),
-    ("CONFIRM", "Confirm", "The branch of the chosen nodes is there: no more doubt"),
-    ("NONE", "Take Mark Away", "Take bridges, merges, splits and confirmations of the chosen "
-                               "nodes back"))
+    ("DELETE", "Delete Branch", "Delete the selected nodes and everything that they carry"),
+    ("BRIDGE", "Bridge", "Attach the whole branch of the first node to the node selected last"),
+    ("MERGE", "Merge", "Merge the branch, up to the first node, with the branch of the node "
+                       "selected last"),
+    ("SPLIT", "Split", "Cut at the first node and attach the part beyond it to the node selected "
+                       "last"),
+    ("ROOT", "Set Root", "Make the selected node the root"),
+    ("RADIUS", "Set Radius", "Set the radius of the selected nodes"),
+    ("CONFIRM", "Confirm", "Confirm that the branch of the selected nodes exists"),
+    ("NONE", "Clear Mark", "Remove bridges, merges, splits and confirmations from the "
+                           "selected nodes"))
 
 
 class LIMBER_OT_edit_skeleton(NeedsSkeleton, bpy.types.Operator):
@@ -52,7 +54,8 @@ class LIMBER_OT_edit_skeleton(NeedsSkeleton, bpy.types.Operator):
 
 
 class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
-    """Change how the chosen nodes hang; the worker does it when the edits are applied"""
+    """Change how the selected nodes are attached. The worker changes the branch when you apply the
+    edits"""
 
     bl_idname = "limber.edit_node"
     bl_label = "Edit Node"
@@ -61,13 +64,13 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
     action: bpy.props.EnumProperty(name="What", items=_ACTIONS)
     radius: bpy.props.FloatProperty(
         name="Radius [m]", default=0.005, min=1e-5, soft_max=0.5, precision=5,
-        description="Of the chosen nodes")
+        description="Radius of the selected nodes")
     node: bpy.props.IntProperty(
         name="Node", default=-1, min=-1, options={"SKIP_SAVE"},
-        description="Number of the node; -1: what is chosen in the view")
+        description="Number of the node; -1 uses the nodes selected in the view")
     target: bpy.props.IntProperty(
         name="Target", default=-1, min=-1, options={"SKIP_SAVE"},
-        description="Number of the node that it leads to; -1: the last one chosen in the view")
+        description="Number of the node to attach to; -1 uses the node selected last in the view")
 
     @classmethod
     def description(cls, _context, properties):
@@ -107,7 +110,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
                 vertex[builder.verts.layers.float["radius"]] = self.radius
         elif self.action == "ROOT":
             if len(chosen) != 1:
-                raise SkeletonEditError("Choose one node to be the root.")
+                raise SkeletonEditError("Select exactly one node to be the root.")
             skeletons.set_root(builder, chosen[0])
         else:
             for vertex in chosen:
@@ -120,20 +123,20 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
         by_number = {vertex[number]: vertex for vertex in builder.verts}
         for given in (self.node, self.target):
             if given >= 0 and given not in by_number:
-                raise SkeletonEditError(f"There is no node {given}.")
+                raise SkeletonEditError(f"Node {given} does not exist.")
         target = by_number.get(self.target)
         if has_target and target is None and self.node < 0:
             target = builder.select_history.active
             if not isinstance(target, bmesh.types.BMVert):
-                raise SkeletonEditError("Choose the node of the branch first, then with Shift "
-                                        "the node that it leads to.")
+                raise SkeletonEditError("Select the node of the branch first, then with Shift the "
+                                        "node to attach it to.")
         chosen = [by_number[self.node]] if self.node >= 0 else [
             vertex for vertex in builder.verts
             if vertex.select and not (has_target and vertex is target)]
         if not chosen or (has_target and target is None):
-            raise SkeletonEditError("Choose nodes of the skeleton first, in Edit Mode"
-                                    + (": that of the branch, then with Shift the one that it "
-                                       "leads to." if has_target else "."))
+            raise SkeletonEditError("Select nodes of the skeleton in Edit Mode first"
+                                    + (": first the node of the branch, then with Shift the node "
+                                       "to attach it to." if has_target else "."))
         return chosen, target if has_target else None
 
     def _delete(self, thing, builder: bmesh.types.BMesh, chosen) -> None:
@@ -146,13 +149,15 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
         gone = set().union(*(skeleton.outwards(vertex[layers["node"]], stops)
                              for vertex in chosen))
         if skeleton.root in gone:
-            raise SkeletonEditError("The root carries all: nothing would be left.")
+            raise SkeletonEditError("The root carries the whole skeleton, so nothing would be "
+                                    "left.")
         bmesh.ops.delete(builder, geom=[by_number[number] for number in gone
                                         if number in by_number], context="VERTS")
 
 
 class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator):
-    """Make surface and mesh anew with the edits of the skeleton; they stay through a reconstruct"""
+    """Make surface and mesh again with the edits of the skeleton. Later reconstructions keep the
+    edits"""
 
     bl_idname = "limber.apply_skeleton"
     bl_label = "Apply Edits"
@@ -160,7 +165,7 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
 
     restore: bpy.props.BoolProperty(
         name="Restore", options={"SKIP_SAVE"},
-        description="Take all edits back instead: the skeleton as it was found")
+        description="Undo all edits instead, also the applied ones")
     _temporary = None
 
     @classmethod
@@ -173,7 +178,7 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
         edits = [] if self.restore else edits_of(
             skeletons.as_given(thing.data), skeletons.nodes_of(thing))
         if not edits and not self.restore:
-            raise ValueError("Nothing is changed: move or delete nodes first.")
+            raise ValueError("Nothing has been edited yet. Move or delete nodes first.")
         self._folder = bpy.path.abspath(branches.branch_of(thing)[branches.FOLDER_KEY])
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-edits-")
         path = Path(self._temporary.name) / "edits.json"
@@ -198,7 +203,7 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
 
 
 class LIMBER_OT_discard_skeleton(NeedsSkeleton, bpy.types.Operator):
-    """Forget the edits that are not applied yet"""
+    """Discard the edits that are not yet applied"""
 
     bl_idname = "limber.discard_skeleton"
     bl_label = "Discard"

@@ -20,20 +20,20 @@ def example_folder() -> Path | None:
 
 
 class LIMBER_OT_open_example(bpy.types.Operator):
-    """Copy the example that comes along to a folder of yours, and open it: a branch with its pull,
-    estimate, energy field and paths"""
+    """Copy the included example to a folder of yours and open it: a branch with its pull, estimate,
+    energy field and paths"""
 
     bl_idname = "limber.open_example"
     bl_label = "Open the Example"
 
     directory: bpy.props.StringProperty(
         name="Folder", subtype="DIR_PATH", options={"SKIP_SAVE"},
-        description="Where the copy goes. Empty: the extension's own folder")
+        description="Folder of the copy. Empty: the extension's own folder")
 
     @classmethod
     def poll(cls, context):
         if example_folder() is None:
-            cls.poll_message_set("The example did not come along with this installation")
+            cls.poll_message_set("This installation does not include the example")
             return False
         return True
 
@@ -54,16 +54,16 @@ class LIMBER_OT_open_example(bpy.types.Operator):
             return bpy.ops.limber.open_result(
                 "EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT", directory=str(branch))
         if bpy.data.is_dirty:
-            self.report({"ERROR"}, "Without a worker the example opens as a file of its own: save "
-                                   "or close yours first.")
+            self.report({"ERROR"}, "Without a worker, the example replaces the open file. Save or "
+                                   "close your file first.")
             return {"CANCELLED"}
         bpy.ops.wm.open_mainfile(filepath=str(target / f"{EXAMPLE}.blend"))
         return {"FINISHED"}
 
 
 class LIMBER_OT_workspace(bpy.types.Operator):
-    """Go to the workspace Limber, made of the one in use: views in the branch's colours, with the
-    tab in sight"""
+    """Open the workspace Limber, a copy of the current one: its views show the branch's colours and
+    the tab Limber"""
 
     bl_idname = "limber.workspace"
     bl_label = "Limber Workspace"
@@ -79,7 +79,7 @@ class LIMBER_OT_workspace(bpy.types.Operator):
             window.workspace = known
             return {"FINISHED"}
         if bpy.app.background:
-            self.report({"ERROR"}, "A workspace is made in a window.")
+            self.report({"ERROR"}, "A workspace can only be added in a window.")
             return {"CANCELLED"}
         bpy.ops.workspace.duplicate()
         # Blender goes to the copy when it next draws.

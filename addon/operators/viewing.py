@@ -11,7 +11,7 @@ def clear_view(scene: bpy.types.Scene) -> str:
     if cube is None:
         return ""
     startup_cube.hide(scene, cube)
-    return f"Blender's startup cube ({cube.name}) is hidden, Undo brings it back"
+    return f"Blender's startup cube ({cube.name}) was hidden. Undo shows it again"
 
 
 def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:

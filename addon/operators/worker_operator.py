@@ -119,8 +119,9 @@ class WorkerOperator:
 
 def _no_result(job: jobs.Job) -> str:
     said = " ".join(line for line in list(job.log)[-2:] if line.strip())[:200]
-    return ("The worker ended without a result, so nothing is shown. Is the Python in the "
-            f"extension's preferences Limber's, and of this version? It said: {said or 'nothing'}")
+    return ("The worker ended without a result, so nothing is shown. Check that the Python in the "
+            "extension's preferences has Limber in this version. The worker's output was: "
+            f"{said or 'nothing'}")
 
 
 def redraw_sidebars(context: bpy.types.Context) -> None:

@@ -17,7 +17,7 @@ EDITED, DOUBTFUL = 128, 32 | 64
 COLORS = {"root": (0.25, 0.9, 0.3, 1.0), "edited": (1.0, 0.5, 0.1, 1.0),
           "doubtful": (1.0, 0.9, 0.2, 1.0), "pending": (0.95, 0.3, 1.0, 1.0)}
 WORDS = {"root": "green: root", "edited": "orange: edited", "doubtful": "yellow: doubtful",
-         "pending": "violet: not applied yet"}
+         "pending": "violet: not yet applied"}
 
 
 @dataclass(frozen=True)

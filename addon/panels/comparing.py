@@ -32,7 +32,7 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
                      f"{'longer' if longer >= 0 else 'shorter'}")
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
-                 f"Proven: {gap:.1f} % over the least at most",
+                 f"Proven: at most {gap:.1f} % above the minimum",
                  icon="QUESTION" if gap is None else "CHECKMARK")
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (
         record.stages.items() if record else ()) if key.startswith(_PLAN)}
@@ -59,7 +59,7 @@ def draw_branches(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     surface = branches.find_surface(context.scene)
     chosen = branches.branch_of(surface) if surface is not None else None
     if chosen is not None and several.is_lost(chosen):
-        layout.label(text="Its folder is not where it was", icon="ERROR")
+        layout.label(text="The folder has moved or been renamed", icon="ERROR")
         layout.operator("limber.relink", icon="FILE_REFRESH")
     if len(shown) < 2:
         return

@@ -86,7 +86,7 @@ def number_lines(numbers: dict) -> list[str]:
     """Return what a worker says beside its progress, in words: the loss and E of a fit."""
     lines = []
     if isinstance(numbers.get("best_m2"), int | float):
-        lines.append(f"Loss {numbers['best_m2']:.3g} m² at best")
+        lines.append(f"Lowest loss {numbers['best_m2']:.3g} m²")
     young, factor = numbers.get("young_mpa"), numbers.get("young_factor")
     if isinstance(young, str):
         values = young.split()
@@ -103,7 +103,7 @@ def _with_interval(value: str, factor: str) -> str:
     except ValueError:
         return value
     return f"{value} ({middle / times:.3g} to {middle * times:.3g})" if times < _OPEN else (
-        f"{value} (not known yet)")
+        f"{value} (not yet known)")
 
 
 def register() -> None:

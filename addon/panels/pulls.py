@@ -29,7 +29,8 @@ def _draw_timeline(layout: bpy.types.UILayout, context: bpy.types.Context, info:
     frames, scene = info["frames"], context.scene
     count = sum(thing.get(branches.SHOWS_KEY) == "observed" for thing in scene.objects)
     column = layout.column(align=True)
-    column.label(text=f"{(frames['count'] - 1) / frames['rate_hz']:.3g} s, {count} points seen"
+    column.label(text=(f"{(frames['count'] - 1) / frames['rate_hz']:.3g} s, {count} points "
+                       "observed")
                  if count else "No points were observed", icon="TIME")
     row = column.row(align=True)
     playing = bool(context.screen) and context.screen.is_animation_playing
@@ -39,5 +40,5 @@ def _draw_timeline(layout: bpy.types.UILayout, context: bpy.types.Context, info:
         column.operator("limber.graph", text="Force over Time", icon="GRAPH",
                         depress=scene.limber.graph == "force").graph = "force"
     if "residual" in (info.get("frame_scalars") or {}):
-        button = column.operator("limber.color_by", text="Colour by the Distance", icon="COLOR")
+        button = column.operator("limber.color_by", text="Colour by Distance", icon="COLOR")
         button.scalar, button.each_frame = "residual", True

@@ -32,7 +32,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         if not preferences.has_worker():
             column = self.layout.column(align=True)
             column.label(text="No worker was found.", icon="ERROR")
-            column.label(text="Name the Python that has limber:")
+            column.label(text="Choose the Python that has limber:")
             column.operator("preferences.addon_show", text="Preferences",
                             icon="PREFERENCES").module = preferences.KEY
         if surface is not None:
@@ -49,7 +49,7 @@ def _draw_live(layout: bpy.types.UILayout, settings) -> None:
     if body is None:
         return
     column = body.column(align=True)
-    for line in live_loads.lines or ["Grab the branch: these act at once"]:
+    for line in live_loads.lines or ["Grab the branch to see these loads act"]:
         column.label(text=line)
     body.prop(settings, "live_weight")
     body.prop(settings.load, "use_wind")

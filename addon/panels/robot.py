@@ -26,7 +26,7 @@ def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         row.scale_y = 2.0
         row.alert = True
         row.operator("limber.cancel_job", text="Stop Robot", icon="CANCEL")
-        layout.label(text="No emergency stop: that is the robot's own", icon="INFO")
+        layout.label(text="Not an emergency stop: use the robot's own", icon="INFO")
         return
     trouble = why_not_armed(context)
     column = layout.column()

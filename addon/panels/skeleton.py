@@ -24,8 +24,8 @@ def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     if thing.mode != "EDIT":
         body.operator("limber.edit_skeleton", icon="EDITMODE_HLT")
     else:
-        body.label(text="Move: G. Bridge, merge, split:", icon="INFO")
-        body.label(text="the branch first, then Shift its new carrier", icon="BLANK1")
+        body.label(text="Move: G. To bridge, merge or split, select", icon="INFO")
+        body.label(text="the branch, then with Shift the node to attach to", icon="BLANK1")
         for pair in _BUTTONS:
             row = body.row(align=True)
             for action in pair:

@@ -27,7 +27,7 @@ BAD = {
                 "ended without a result"),
     "rubbish, and an end": ("sys.stderr.write('\\x00' * 5000); sys.exit(7)", "exit code 7"),
     "another version": ("sys.exit('Error: No such option: --progress')",
-                        "No such option: --progress If it is of another version"),
+                        "No such option: --progress If its version differs"),
     "deep": ("print('[' * 100000)", "ended without a result")}
 
 
@@ -87,7 +87,7 @@ def test_a_worker_that_hangs(bpy, use, monkeypatch):
         time.sleep(0.02)
     time.sleep(0.4)
     job.poll()
-    assert any("No sign of life" in text for text in _draw(panel, bpy.context).names("label"))
+    assert any("has not responded" in text for text in _draw(panel, bpy.context).names("label"))
     job.cancel()
     assert job.wait() is jobs.JobState.CANCELLED
     use(GOOD)

@@ -96,7 +96,7 @@ def test_damaged_caches_are_refused(animation, meshes, beam, bpy, tmp_path):
     """Missing, cut short, foreign, of another mesh: Blender would show the rest shape silently."""
     thing = bpy.data.objects.new("beam", meshes.new_mesh("beam", beam.surface))
     whole = (beam.folder / "frames" / "to-goal.pc2").read_bytes()
-    for name, content, words in (("cut", whole[:-1], "cut short"),
+    for name, content, words in (("cut", whole[:-1], "truncated"),
                                  ("head", whole[:20], "not a PC2"),
                                  ("other", b"x" * len(whole), "not a PC2")):
         path = tmp_path / name

@@ -226,7 +226,7 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
         assert f"{result[key]['energy_sum_nmm']:.3g}" in texts
         assert f"{1e3 * result[key]['length_m']:.3g}" in texts
     gap = result["certificate"]["gap_percent"]
-    assert f"Proven: {gap:.1f} % over the least at most" in texts
+    assert f"Proven: at most {gap:.1f} % above the minimum" in texts
     estimated = json.loads((EXAMPLE / "estimate.json").read_text())
     low, high = estimated["young_interval_pa"][0]
     for value in (low, high):
@@ -256,14 +256,14 @@ def test_jobs_that_wait_are_listed(bpy, panels):
     drawn = _draw(panels("job"), bpy.context)
     texts = drawn.names("label")
     assert ["Then: Planning", "Then: Reporting"] == [text for text in texts if "Then" in text]
-    assert "Loss 2.5e-05 m² at best" in texts and {
-        "E 70 (63.6 to 77), 30 (not known yet) MPa"} <= set(texts)
+    assert "Lowest loss 2.5e-05 m²" in texts and {
+        "E 70 (63.6 to 77), 30 (not yet known) MPa"} <= set(texts)
     assert any(text.endswith("so far") for text in texts)
     assert bpy.ops.limber.cancel_job(waiting=1) == {"FINISHED"}
     assert [waiting.title for waiting in jobs.waiting()] == ["Planning"]
     job._heard_at -= 100
     texts = _draw(panels("job"), bpy.context).names("label")
-    assert any("No sign of life" in text for text in texts)
+    assert any("has not responded" in text for text in texts)
 
 
 def test_a_running_and_a_failed_job(bpy, panels):

@@ -115,7 +115,7 @@ def test_the_panel_plays_recordings(bpy, opened, pulled):
 
     drawn = _draw_step(bpy, "pulls")
     assert ("operator", "limber.replay_pull", "p") in drawn.calls
-    assert "2.5 s, 1 points seen" in drawn.names("label")
+    assert "2.5 s, 1 points observed" in drawn.names("label")
     assert "frame_current" in drawn.names("prop")
     with pytest.raises(RuntimeError, match="no pull 'q'"):
         bpy.ops.limber.replay_pull(pull="q")

@@ -47,7 +47,7 @@ def test_a_checked_plan_is_followed_once_its_name_is_typed(bpy, checked):
     """The worker gets what was typed, and compares it itself; a stop is held, not gone back on."""
     _, asked = checked
     assert bpy.ops.limber.arm.poll()
-    with pytest.raises(RuntimeError, match="type to-goal"):
+    with pytest.raises(RuntimeError, match="Type to-goal"):
         bpy.ops.limber.arm()
     assert "--arm" not in asked()
     bpy.ops.limber.arm(confirm="to-gaol")
@@ -77,7 +77,7 @@ def test_not_without_a_dry_run_of_the_same(bpy, checked, tmp_path):
         stage.path("plans/to-goal.csv").write_text("x_m,y_m,z_m\n0,0,0\n0,0,1\n")
     assert "plan has changed" in arming.why_not_armed(bpy.context)
     bpy.context.scene.limber.branch_folder = str(tmp_path / "another.branch")
-    assert "Check it" in arming.why_not_armed(bpy.context)
+    assert "Run the dry run" in arming.why_not_armed(bpy.context)
 
 
 def test_a_robot_never_waits_for_its_turn(bpy, checked):
@@ -86,7 +86,7 @@ def test_a_robot_never_waits_for_its_turn(bpy, checked):
     jobs.start("Estimating", [sys.executable, "-c", "import time; time.sleep(30)"])
     operator = part("operators.arming").LIMBER_OT_arm
     moves = type("Moves", (), {"trouble": lambda *_: "", "confirm": "to-goal"})()
-    with pytest.raises(ValueError, match="at once or not at all"):
+    with pytest.raises(ValueError, match="immediately or not at all"):
         operator.arguments(moves, bpy.context)
     jobs.forget()
 
@@ -96,7 +96,7 @@ def test_a_recording_asks_for_its_name(bpy, checked):
     _, asked = checked
     settings = bpy.context.scene.limber.record
     settings.cell, settings.name = bpy.context.scene.limber.execute.cell, "pull-2"
-    with pytest.raises(RuntimeError, match="type pull-2"):
+    with pytest.raises(RuntimeError, match="Type pull-2"):
         bpy.ops.limber.record()
     bpy.ops.limber.record(confirm="pull-2")
     assert asked()[0] == "record" and "--confirm pull-2 --after-stop hold" in " ".join(asked())
@@ -143,7 +143,7 @@ def test_while_it_moves_there_is_a_stop(bpy, checked, tmp_path):
     assert ("operator", "limber.cancel_job", "Stop Robot") in drawn.calls
     assert ("progress", 0.325, "3.25 N of 10 N") in drawn.calls
     assert "limber.arm" not in drawn.names("operator")
-    assert any("No emergency stop" in text for text in drawn.names("label"))
+    assert any("Not an emergency stop" in text for text in drawn.names("label"))
     jobs.forget()
 
 

@@ -128,10 +128,10 @@ def test_values_of_a_motion_stay_in_their_folder(addon, tmp_path):
     branch.mkdir()
     elsewhere.mkdir()
     for name in ("../../out", "sub/out", str(tmp_path / "out")):
-        with pytest.raises(OSError, match="leads out"):
+        with pytest.raises(OSError, match="points outside"):
             frame_values.keep(branch, name, values)
     (branch / ".viewport").symlink_to(elsewhere)
-    with pytest.raises(OSError, match="leads out"):
+    with pytest.raises(OSError, match="points outside"):
         frame_values.keep(branch, "swing", values)
     assert sorted(path.name for path in tmp_path.rglob("*")) == [".viewport", "a.branch",
                                                                  "elsewhere"]
@@ -205,7 +205,7 @@ def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
     manifest.write_text(json.dumps(content | {"uuid": "another"}))
     beam.folder.rename(tmp_path / "renamed.branch")
     assert several.is_lost(branch)
-    with pytest.raises(RuntimeError, match="not that of beam"):
+    with pytest.raises(RuntimeError, match="the folder of another branch, beam"):
         bpy.ops.limber.relink(directory=str(tmp_path / "other.branch"))
     assert bpy.ops.limber.relink() == {"FINISHED"}
     assert not several.is_lost(branch)
@@ -214,7 +214,7 @@ def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
     away = tmp_path / "a" / "b" / "c"
     away.mkdir(parents=True)
     (tmp_path / "renamed.branch").rename(away / "beam.branch")
-    with pytest.raises(RuntimeError, match="lies beside this file"):
+    with pytest.raises(RuntimeError, match=r"no folder of .* beside this file"):
         bpy.ops.limber.relink()
     assert bpy.ops.limber.relink(directory=str(away / "beam.branch")) == {"FINISHED"}
     assert bpy.ops.limber.play() == {"FINISHED"}

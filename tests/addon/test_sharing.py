@@ -38,7 +38,7 @@ def test_the_motion_is_in_the_file(bpy, opened, beam, tmp_path, kind):
 
 @pytest.mark.slow
 def test_a_kind_that_is_none_is_refused(bpy, opened, tmp_path):
-    with pytest.raises(RuntimeError, match=r"name it \.abc"):
+    with pytest.raises(RuntimeError, match=r"Use \.abc"):
         bpy.ops.limber.export_motion(filepath=str(tmp_path / "motion.fbx"))
 
 

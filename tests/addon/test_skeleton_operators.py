@@ -90,7 +90,7 @@ def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_pat
     assert [edit["do"] for edit in done] == ["move", "confirm"]
     assert bpy.ops.limber.discard_skeleton() == {"FINISHED"}
     np.testing.assert_allclose(_places(skeleton())[5], was, atol=1e-7)
-    with pytest.raises(RuntimeError, match="Nothing is changed"):
+    with pytest.raises(RuntimeError, match="Nothing has been edited"):
         bpy.ops.limber.apply_skeleton()
 
 
@@ -102,9 +102,9 @@ def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
     before = (folder / "skeleton.csv").read_bytes()
     with pytest.raises(RuntimeError, match="There is no node 99999"):
         bpy.ops.limber.edit_node(action="ROOT", node=99999)
-    with pytest.raises(RuntimeError, match="The root carries all"):
+    with pytest.raises(RuntimeError, match="The root carries the whole skeleton"):
         bpy.ops.limber.edit_node(action="DELETE", node=0)
-    with pytest.raises(RuntimeError, match="Choose nodes"):
+    with pytest.raises(RuntimeError, match="Select nodes"):
         bpy.ops.limber.edit_node(action="BRIDGE", node=tip)
     bpy.ops.limber.edit_node(action="BRIDGE", node=1, target=tip)
     with pytest.raises(RuntimeError, match="circle"):

@@ -19,7 +19,7 @@ def test_it_makes_way_for_a_branch(bpy, cube, beam, capfd):
     """Hidden in view and picture, and named; camera and light stay. Shown again, it stays."""
     assert bpy.ops.limber.open_result(directory=str(beam.folder)) == {"FINISHED"}
     assert cube.hide_get() and cube.hide_render
-    assert "startup cube (Cube) is hidden" in capfd.readouterr().out
+    assert "startup cube (Cube) was hidden" in capfd.readouterr().out
     assert all(_is_in_sight(bpy.data.objects[name]) for name in ("Camera", "Light", "beam"))
     cube.hide_set(False)
     cube.hide_render = False
@@ -33,7 +33,7 @@ def test_it_makes_way_for_a_scan(bpy, cube, tmp_path, capfd):
     (tmp_path / "twig.xyz").write_text("0 0 0\n0 0 0.1\n0 0 0.2\n")
     assert bpy.ops.limber.import_cloud(filepath=str(tmp_path / "twig.xyz")) == {"FINISHED"}
     assert cube.hide_get() and cube.hide_render
-    assert "startup cube (Cube) is hidden" in capfd.readouterr().out
+    assert "startup cube (Cube) was hidden" in capfd.readouterr().out
 
 
 def _bevel(cube):
