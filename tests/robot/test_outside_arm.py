@@ -220,7 +220,7 @@ def test_it_is_not_moved_until_its_controller_has_a_driver():
 def test_the_cell_knows_its_payload_and_joints():
     with pytest.raises(ValueError, match="but a pieper-6 carries at most 4 kg"):
         Cell(robot={"model": "pieper-6"}, base={"pose": (0,) * 6}, tool={"mass_kg": 4.5})
-    with pytest.raises(ValueError, match="joint_limits_rad has 5 rows, but a pieper-6 has 6 joints"):
+    with pytest.raises(ValueError, match="joint_limits_rad has 5 rows, but a pieper-6 has 6"):
         Cell(robot={"model": "pieper-6", "joint_limits_rad": [(-1, 1)] * 5},
              base={"pose": (0,) * 6})
 
