@@ -1,4 +1,4 @@
-"""The core in ten lines: bend a branch at its grasp and print energy and force.
+"""The core in ten lines: bends a branch at its grasp and prints energy and force.
 
     python bend.py NAME.branch
 """

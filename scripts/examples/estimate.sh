@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Young's modulus of one branch from recordings, without a window:
+# Estimates Young's modulus of one branch from recordings, without a window:
 #   estimate.sh NAME.branch RECORDING...
 # In Blender instead: LIMBER="blender -b --command limber" estimate.sh ...
-# Run again it keeps what is up to date. Options of the two stages: IMPORT="--unit mm",
+# A second run keeps results that are up to date. Options of the two stages: IMPORT="--unit mm",
 # ESTIMATE="--fractions 0.3,0.7" (see --help).
 set -euo pipefail
 limber=${LIMBER:-limber}

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# A Blender scene and a picture of each branch, without a window:
+# Makes a Blender scene and a picture of each branch, without a window:
 #   render.sh NAME.branch...
 # COLOR is young, strain, stress, strain_energy or det_f; WIDTH is in pixels; SIDES=48 also makes a
-# turntable (.webp) of so many sides.
+# turntable (.webp) with 48 views.
 set -euo pipefail
 limber=${LIMBER:-limber}
 for branch in "$@"; do
