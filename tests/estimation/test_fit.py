@@ -166,7 +166,7 @@ def test_a_pull_of_another_branch_shows(small_bench, noisy):
     wrong = seen.positions[:, ::-1] - seen.positions[0, ::-1] + seen.positions[0]
     found = small_bench.fit([replace(noisy, observations=Observations(seen.times, wrong))],
                             SETTINGS)
-    assert any("pull of this branch" in message for message in found.warnings)
+    assert any("the pull was recorded on this branch" in message for message in found.warnings)
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_force_in_another_unit_shows(small_bench, noisy):
             "force_sigma_n": noisy.entry.sensor.force_sigma_n * 1e-4})}))
     found = small_bench.fit([pull], SETTINGS)
     assert any("another unit than newtons" in message for message in found.warnings)
-    assert "ran to a bound" in found.is_bad
+    assert "reached a bound" in found.is_bad
 
 
 def test_a_stopped_estimate_keeps_its_best_and_resumes(tmp_path, small_bench, noisy):

@@ -41,9 +41,9 @@ def test_close_vibrations_are_parted_by_a_long_record():
 
 
 @pytest.mark.parametrize(("change", "told"), [
-    ({"size": (0.0, 0.0), "noise": 1.0}, "Nothing rings"),
+    ({"size": (0.0, 0.0), "noise": 1.0}, "no free vibration"),
     ({"seconds": 1.1}, "free decay"),
-    ({"frequencies": (0.15, 0.15), "seconds": 9.0}, "few turns"),
+    ({"frequencies": (0.15, 0.15), "seconds": 9.0}, "several oscillations"),
 ])
 def test_what_does_not_ring_is_told(change, told):
     times, channels = record(np.random.default_rng(3), **change)

@@ -103,7 +103,7 @@ def test_where_the_force_leads_nowhere_the_path_leads(scanned, pull, monkeypatch
     found = fit_branch([pull], start, EstimateSettings(**SETTINGS), log=EvaluationLog(None, ""),
                        progress=Progress(on_warning=messages.append))
     assert [forward.drive for forward in found.objective.forwards] == ["pose"]
-    assert any("So the gripper's recorded path leads" in text for text in messages)
+    assert any("The gripper's recorded path is prescribed" in text for text in messages)
     np.testing.assert_allclose(found.values.young, TRUTH, rtol=2e-3)
 
 

@@ -64,13 +64,13 @@ class _Pull(_Told):
         shown, count = len(self.times_s), len(self.all_times_s)
         widths = {len(frame) for frame in (*self.observed_m, *self.simulated_m)}
         if {len(self.observed_m), len(self.simulated_m)} != {shown} or len(widths) > 1:
-            raise ValueError("frames of unequal size")
+            raise ValueError("the frames have different numbers of points")
         if {len(self.measured_force_n), len(self.simulated_force_n)} != {count}:
-            raise ValueError("as many forces as times were expected")
+            raise ValueError("the numbers of forces and of times differ")
         if len(self.point_residual) not in (0, count) or len(self.force_residual) not in (0, count):
-            raise ValueError("as many residuals as times were expected")
+            raise ValueError("the numbers of residuals and of times differ")
         if len({len(row) for row in self.point_residual}) > 1:
-            raise ValueError("residuals of unequal length")
+            raise ValueError("the residuals have different numbers of points")
         return self
 
 
@@ -126,9 +126,9 @@ class _Estimate(_Told):
                 raise ValueError(f"{name} has {len(values)} entries for {count} moduli")
         size = len(self.parameters)
         if len(self.covariance) != size or any(len(row) != size for row in self.covariance):
-            raise ValueError(f"a covariance of {size} parameters was expected")
+            raise ValueError(f"the covariance does not have the size of its {size} parameters")
         if any(group >= size for group in self.groups):
-            raise ValueError("a modulus in a group that is no parameter")
+            raise ValueError("a modulus belongs to a group that is not a parameter")
         return self
 
 

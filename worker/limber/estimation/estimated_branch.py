@@ -76,7 +76,7 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     if len(wrong) and settings.young is None:
         raise InputError(
             f"Young's modulus is {mesh.cell_data['young'][wrong[0]]:g} Pa in tetrahedron "
-            f"{wrong[0]} of mesh.vtu.", "A modulus to start from must be positive.",
+            f"{wrong[0]} of mesh.vtu.", "The initial modulus must be positive.",
             "Give --young, or correct the mesh.")
     young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
     poisson = _given(settings.poisson, mesh.cell_data["poisson"])

@@ -60,7 +60,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         Cancelled: stopped before the first step.
     """
     if log.resumed_count:
-        progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
+        progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
 
     def once(branch: Subject, chosen: EstimateSettings, log: EvaluationLog) -> Estimate:
         forwards = forwards_of(pulls, branch, chosen, progress)
@@ -74,7 +74,8 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         try:
             return once(branch, settings, log)
         except _ForceLeadsNowhereError as error:
-            progress.warn(f"{error.seen} {error.why} So the gripper's recorded path leads instead.")
+            progress.warn(f"{error.seen} {error.why} The gripper's recorded path is prescribed "
+                          "instead.")
             # What was evaluated by force says nothing of this.
             led = settings.model_copy(update={"drive": "pose"})
             try:
@@ -112,8 +113,8 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
         return present(heavy, "estimate with the weight")
     found.is_weightless = True
     progress.warn(
-        "The branch is too soft to carry its own weight in the scanned shape: its weight is left "
-        "out of the estimate. Check density, gravity and the force's unit.")
+        "The branch is too soft to carry its own weight in the scanned shape. The estimate "
+        "ignores its weight. Check the density, gravity and the unit of the force.")
     return found
 
 
@@ -192,20 +193,21 @@ def _force_is_measured(objective: Objective) -> bool:
 
 
 def _without_equilibrium(objective: Objective) -> WorkError:
-    seen = "The simulation finds no equilibrium for any Young's modulus tried."
+    seen = "The simulation finds no equilibrium for any of the tested Young's moduli."
     by_force = [forward for forward in objective.forwards if forward.watches_pose]
     if not by_force:
-        return WorkError(seen, "The recorded poses or forces are out of this branch's reach.",
+        return WorkError(seen,
+                         "This branch cannot reach the recorded poses or bear the recorded forces.",
                          "Check the grasp point, the frame of reference and the units.")
     known = calibration_of(by_force[0].entry)
     peak = np.nanmax(np.linalg.norm(by_force[0].frames.wrenches[:, :3], axis=1))
     return _ForceLeadsNowhereError(
-        seen, f"The measured force drives it: {peak:.2g} N at most, with a zero known to "
-        f"{known.force_bias_sigma_n:g} N that drifts by {known.force_drift_sigma_n:g} N. So far "
-        "off, it may fold a branch up that is soft at its end.",
-        "Tare the sensor before the pull and say so ([calibration] in pull.toml), pull farther, or "
-        "let a gripper whose frame is known well lead it (--drive pose). Else check the grasp "
-        "point, the frame of reference and the units.")
+        seen, f"The measured force drives the simulation. It is at most {peak:.2g} N. Its zero is "
+        f"known to {known.force_bias_sigma_n:g} N and drifts by {known.force_drift_sigma_n:g} N. "
+        "With such an error, the force may fold a branch with a soft end.",
+        "Tare the sensor before the pull and state it ([calibration] in pull.toml). Or pull "
+        "farther. Or prescribe the gripper's pose if its frame is known well (--drive pose). "
+        "Otherwise check the grasp point, the frame of reference and the units.")
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
@@ -251,8 +253,8 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
         if not coarse or settings.method == "nelder-mead":
             if coarse:
                 progress.warn(
-                    "Frames between the simulated ones are off by more than a third of the "
-                    "noise; use more --key-frames.")
+                    "The error of the interpolated frames exceeds a third of the noise. Increase "
+                    "--key-frames.")
             return fit
         for forward in coarse:
             forward.refine()
@@ -271,13 +273,13 @@ def best_so_far(objective: Objective) -> Fit:
     """
     best = objective.log.best
     if best is None or len(best.parameters) != objective.space.size:
-        raise Cancelled("The estimate was stopped before its first fit step.",
-                        "There is nothing to keep yet.", "Run it again.")
+        raise Cancelled("The estimate was stopped before the first step of the fit.",
+                        "There is no result to keep yet.", "Run it again.")
     quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
     evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
     if evaluation is None:
-        raise Cancelled("The estimate was stopped before any parameters gave an equilibrium.",
-                        "There is nothing to keep yet.", "Run it again.")
+        raise Cancelled("The estimate was stopped before it found an equilibrium.",
+                        "There is no result to keep yet.", "Run it again.")
     return Fit(evaluation, FitStatus.stopped, "stopped")
 
 

@@ -34,9 +34,10 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
             entry.rest_points_m)
         if frames.positions.shape[1] not in (0, len(rest)):
             raise InputError(
-                f"{pull.name} watches {frames.positions.shape[1]} points, {len(rest)} are known.",
-                "Each observed point needs its place at rest.",
-                "Give rest_points_m in pull.toml, or as many --fractions as markers.")
+                f"{pull.name} observes {frames.positions.shape[1]} points, but {len(rest)} rest "
+                "positions are known.",
+                "Each observed point needs a rest position.",
+                "Give rest_points_m in pull.toml, or one value of --fractions for each marker.")
         rest = rest if frames.positions.shape[1] else np.empty((0, 3))
         _check_rest(pull, frames, rest, progress)
         forwards.append(_forward(pull.name, entry, frames, rest, subject, settings))
@@ -56,9 +57,9 @@ def require_scale_in_principle(forwards: list[Forward]) -> None:
             return
     raise InputError(
         "No pull has a measured force, gravity or inertia.",
-        "A branch that is moved slowly to given poses takes the same shape whether it is soft or "
-        "stiff: only the ratios of Young's modulus along it show, and a fit would look perfect "
-        "with every modulus wrong.",
+        "A branch that moves slowly to prescribed poses takes the same shape whether it is soft "
+        "or stiff. Only the ratios of Young's modulus along the branch can be determined. A fit "
+        "would look perfect with every modulus wrong.",
         "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 or motion in "
         "pull.toml).")
 
@@ -66,8 +67,8 @@ def require_scale_in_principle(forwards: list[Forward]) -> None:
 def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
              settings: EstimateSettings) -> Forward:
     if entry.motion == "swing":
-        raise InputError(f"{name} is a swing: nothing led the branch or held it.",
-                         "Its release, load and damping are fitted together, in time.",
+        raise InputError(f"{name} is a free swing: no gripper holds the branch.",
+                         "Its release, load and damping are fitted together over time.",
                          f"Use `limber swing --pull {name}`, or name other pulls with --pull.")
     if entry.motion == "dynamic":
         from limber.estimation.forward.dynamic_pull import DynamicForward
@@ -141,13 +142,15 @@ def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress
     size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
     if np.nanmin(off) > max(2 * size, 0.1):
         raise InputError(
-            f"{pull.name}: at rest the observed points lie {np.nanmin(off):.3g} to "
-            f"{np.nanmax(off):.3g} m from where this branch, about {size:.2g} m long, has them.",
-            "The recording is in another unit or another frame of reference.",
-            "Import it with --unit, or with --nominal (where on the branch the markers are).")
+            f"{pull.name}: at rest, the observed points are {np.nanmin(off):.3g} to "
+            f"{np.nanmax(off):.3g} m away from their positions on this branch, which is about "
+            f"{size:.2g} m long.",
+            "The recording uses another unit or another frame of reference.",
+            "Import it with --unit, or with --nominal (the positions of the markers on the "
+            "branch).")
     limit = 5e-3 + 5 * pull.entry.sensor.position_sigma_m
     if np.nanmax(off) > limit:
         progress.warn(
-            f"{pull.name}: at rest the observed points lie up to {np.nanmax(off) * 1e3:.0f} mm "
-            "from where this branch has them: another branch, another frame of reference, or "
-            "markers in another order.")
+            f"{pull.name}: at rest, the observed points are up to {np.nanmax(off) * 1e3:.0f} mm "
+            "away from their positions on this branch. Possible causes are another branch, "
+            "another frame of reference, or another order of the markers.")

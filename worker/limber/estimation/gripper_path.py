@@ -153,9 +153,9 @@ def _released(model: BranchModel, grasp: Grasp, wanted: MotionWanted,
 
 def _require(result: DynamicResult) -> None:
     if not result.converged:
-        raise WorkError("The motion of the true branch cannot be followed.",
-                        "It is too fast or goes too far for this branch.",
-                        "Pull less far (--reach), or slower (--duration).")
+        raise WorkError("The motion of the simulated branch cannot be computed.",
+                        "It is too fast or too far for this branch.",
+                        "Reduce --reach, or increase --duration.")
 
 
 def _poses(model: BranchModel, grasp: Grasp, point: np.ndarray,
@@ -250,7 +250,7 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
     if low > 0:
         return low
     raise WorkError(f"No sideways force moves the grasp by {travel:.3g} m.",
-                    "The branch is too short or too stiff there.", "Pull less far (--reach).")
+                    "The branch is too short or too stiff at the grasp.", "Reduce --reach.")
 
 
 def _shift_at_rest(model: BranchModel, grasp: Grasp) -> np.ndarray:

@@ -128,14 +128,14 @@ class Estimate:
         bound = [name for name in space.on_bound(self.fit.evaluation.free)
                  if name not in {prior for prior, _, _ in space.priors}]
         if bound:
-            return (f"{', '.join(bound)} ran to a bound: the data ask for a value beyond it, as "
-                    "they do with a wrong unit, grasp point or frame of reference, or with "
-                    "markers that are mirrored or mistaken for each other.")
+            return (f"{', '.join(bound)} reached a bound. The data require a value beyond it. "
+                    "Typical causes are a wrong unit, grasp point or frame of reference, and "
+                    "markers that are mirrored or interchanged.")
         if error := unlikely(self.cell_errors):
             return error
         scale = identifiability(self.fit.evaluation, space).scale_deviation
         if not np.isfinite(scale) or scale > SCALE_DEVIATION:
-            return ("The data do not tell the moduli: all of them together are known only to "
+            return ("The data do not determine the moduli: their common scale is known only to "
                     f"within a factor of {np.exp(min(2 * scale, 20)):.2g}.")
         if not self.fit.converged:
             return f"The optimiser did not converge: {self.fit.reason}"
@@ -146,14 +146,15 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
     """Say how well the model fits, which errors of the cell it found, and which data are off."""
     if found.uncertainty.variance_factor > MISFIT_FACTOR:
         progress.warn(
-            f"The fit is poor: residuals are {found.uncertainty.variance_factor**0.5:.1f} times "
-            "the stated noise, and the intervals do not hold. Is this a pull of this branch, in "
-            "its frame of reference? Does the skeleton run where the branch does?")
+            f"The fit is poor: the residuals are {found.uncertainty.variance_factor**0.5:.1f} "
+            "times the stated noise, and the intervals are not valid. Check that the pull was "
+            "recorded on this branch and in its frame of reference. Check that the skeleton "
+            "follows the branch.")
     elif found.uncertainty.variance_factor > UNEXPLAINED_FACTOR:
         progress.warn(
-            f"Residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated noise: "
-            "something acts that is not in the model, or the sensors are worse than stated. The "
-            "intervals were widened by as much.")
+            f"The residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated "
+            "noise. Either the model lacks an effect, or the sensors are noisier than stated. The "
+            "intervals are widened by this factor.")
     for sentence in in_words(found.cell_errors):
         progress.warn(sentence)
     named = outliers(found.fit.evaluation, found.objective)
@@ -211,8 +212,8 @@ def require_result(found: Estimate) -> None:
     if reason is not None:
         young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
         raise WorkError("The pulls give no estimate.", reason,
-                        f"The fit stood at {young} MPa; nothing was written. Check what the "
-                        "warnings say of the recording, or use more pulls.")
+                        f"The fit ended at {young} MPa. Nothing was written. Check the warnings "
+                        "about the recording, or use more pulls.")
 
 
 def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,
@@ -227,7 +228,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
     subject = subject.without_weight() if found.is_weightless else subject
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
     if settings.mesh_check:
-        progress(1.0, "how much the mesh is too stiff")
+        progress(1.0, "measuring the excess stiffness of the mesh")
         held = grasp_on(subject.mesh, grasp)
         model = subject.model.with_parameters(poisson=found.values.poisson,
                                               density=found.values.density)
@@ -250,14 +251,14 @@ def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
     if not led:
         return None
     error = path_error(found.fit.evaluation, found.objective)
-    grown = ("how much that matters could not be found, and is NOT in the intervals"
+    grown = ("Its effect could not be computed and is NOT in the intervals"
              if error is None else
-             f"that adds up to {100 * error.max():.0f} % to the standard deviations")
+             f"It adds up to {100 * error.max():.0f} % to the standard deviations")
     progress.warn(
-        f"{', '.join(forward.name for forward in led)}: the gripper's recorded path leads the fit, "
-        "where its frame counts as exact. By its calibration it may be off: "
-        f"{grown}. Record the force (of a clamped grasp also the torque, with torque_sigma_nm) and "
-        "let it lead, or state a better [calibration] in pull.toml.")
+        f"{', '.join(forward.name for forward in led)}: the fit prescribes the gripper's recorded "
+        "path and takes its frame as exact. According to [calibration], the frame may have an "
+        f"error. {grown}. Record the force and use it to drive the fit (of a clamped grasp also "
+        "the torque, with torque_sigma_nm), or state a better [calibration] in pull.toml.")
     return error
 
 
@@ -289,5 +290,5 @@ def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None
                                            for name, part in parts.items()}))
     progress.warn(
         f"E at control point {worst + 1} has a standard deviation of "
-        f"{100 * min(total[worst], 99.0):.0f} %. Most of it comes from, and would be less with: "
+        f"{100 * min(total[worst], 99.0):.0f} %. Its main causes, each with a remedy, are: "
         f"{each}.")

@@ -213,10 +213,10 @@ def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
     if not kept:
         least = min((one.peak_strain for one in made), default=np.inf)
         raise WorkError(
-            f"No pull keeps the limits: of {len(found)}, {len(found) - len(made)} cannot be made "
-            f"and the gentlest strains the branch by {100 * least:.2g} %.",
-            "Even short pulls are too much for it, or it has no room.",
-            "Allow more with --max-strain or --max-force, or hold it farther out (--fractions).")
+            f"No pull keeps the limits: {len(found) - len(made)} of {len(found)} are impossible, "
+            f"and the gentlest one strains the branch by {100 * least:.2g} %.",
+            "Even short pulls load the branch too much, or it has no room to move.",
+            "Increase --max-strain or --max-force, or grasp the branch farther out (--fractions).")
     return Suggested(kept, [one for one, keeps in zip(made, fit, strict=True) if not keeps],
                      len(found) - len(made))
 
@@ -224,7 +224,7 @@ def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
 def _all(choices: list[PullChoice], subject: Subject, values: Values, known: Known, cell: Cell,
          workers: int | None, progress: Progress) -> list[ExpectedPull | None]:
     return run_tasks(_tried, [(choice, subject, values, known, cell) for choice in choices],
-                     workers=workers, progress=progress, message="pulls to think of")
+                     workers=workers, progress=progress, message="evaluating candidate pulls")
 
 
 def _tried(choice: PullChoice, subject: Subject, values: Values, known: Known, cell: Cell,
@@ -252,7 +252,8 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
     objective = Objective(forwards, space, force_sigma=[simulated.sensor.force_sigma_n])
     evaluation = objective.evaluate(space.pack(values), jacobian=True)
     if evaluation is None:
-        raise WorkError("The pull's forces lead nowhere.", "Its branch finds no rest under them.",
+        raise WorkError("The forces of the pull give no valid simulation.",
+                        "The branch has no equilibrium under them.",
                         "Choose another pull.")
     told = evaluation.slopes[:len(evaluation.slopes) - space.own_row_count]
     form_count = len(known.measured) - space.group_count

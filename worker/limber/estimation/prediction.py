@@ -23,7 +23,8 @@ def require_one_load(settings: PredictSettings) -> None:
         InputError: there is not one.
     """
     if (settings.weight is None) == (settings.load is None):
-        raise InputError("One load is needed.", "It is what differs from the recording.",
+        raise InputError("A prediction needs exactly one load.",
+                         "The prediction differs from the recording by this load.",
                          "Give --weight NEWTONS or --load X Y Z.")
 
 
@@ -49,12 +50,13 @@ def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down
     """
     load = np.array(settings.load) if settings.load else settings.weight * down
     forward, values = _forward(known, subject, entry, load)
-    progress(0.1, "finding the branch's rest under the load")
+    progress(0.1, "finding the equilibrium under the load")
     space = _space(known, values)
     found = forward.simulate(values, space.extra, True)
     if found is None:
-        raise WorkError(f"The branch finds no rest under {np.linalg.norm(load):.3g} N.",
-                        "It may be far more than it can carry.", "Check the load's unit.")
+        raise WorkError(f"The branch has no equilibrium under {np.linalg.norm(load):.3g} N.",
+                        "The load may be far more than the branch can carry.",
+                        "Check the unit of the load.")
     moved = found.positions[0] - forward.rest_points
     slopes = present(found.d_positions, "derivative of the rest")[0]
     drop, sigma, drop_sigma = _uncertain(moved, slopes, down, space, known)

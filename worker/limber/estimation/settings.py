@@ -31,16 +31,15 @@ class EstimateSettings(Settings):
         "the full model. Its basis is kept in the branch folder, so further estimates take "
         "seconds.")
     drive: Literal["pose", "force"] | None = Field(
-        None, description="pose: the gripper's pose moves the branch, and its force is compared. "
-        "force: the measured force pulls, as in the paper. Default: as each pull states.")
+        None, description="pose: the gripper's pose is prescribed, and its force is compared. "
+        "force: the measured force is prescribed, as in the paper. Default: as each pull states.")
     motion: Literal["quasi_static", "dynamic"] | None = Field(
         None, description="dynamic: simulate inertia and damping. Default: as each pull states.")
     fractions: tuple[float, ...] = Field(
         (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
             "main path.")
     young: float | None = Field(
-        None, gt=0, description="Young's modulus to start from [Pa]. Default: from the measured "
-            "force.")
+        None, gt=0, description="Initial Young's modulus [Pa]. Default: from the measured force.")
     poisson: float | None = Field(
         None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --fit-poisson is "
             "given.")
@@ -59,27 +58,27 @@ class EstimateSettings(Settings):
     fit_density: bool = Field(False, description="Estimate the density too.")
     fit_damping: bool = Field(False, description="Estimate Rayleigh damping too (dynamic only).")
     key_frames: int = Field(
-        12, ge=3, description="Number of frames that are simulated; a spline interpolates the "
-        "others. It is doubled if that changes the result.")
+        12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
+        "number is doubled if that changes the result.")
     evaluations: int = Field(400, ge=1, description="Largest number of forward simulations of "
         "all pulls.")
     delta_m2: float | None = Field(
         None, gt=0, description="Nelder-Mead stops at this mean squared distance [m^2].")
     robust: bool = Field(True, description="Reduce the weight of outliers (Gauss-Newton).")
     hold_out: bool = Field(
-        True, description="With several pulls, fit without each one in turn and score the "
-            "prediction of it.")
+        True, description="With several pulls, fit without each one in turn, and compare it with "
+            "its prediction.")
     mesh_check: bool = Field(
-        True, description="Measure on a finer mesh how much too stiff this mesh is, and include "
+        True, description="Measure the excess stiffness of this mesh on a finer mesh, and include "
         "it in the intervals.")
     hung_sigma: float = Field(
         0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
         "outside the mesh. The default is the difference between two programs' volumes of one "
         "crown.")
     shapes: int = Field(
-        16, ge=0, description="Number of other branch shapes, equally consistent with the scan, "
-        "that are pulled to include the shape's uncertainty in the intervals. 0: only that of "
-        "the radii.")
+        16, ge=0, description="Number of posterior samples of the branch's shape given the scan. "
+        "The pulls are simulated on each one to include the uncertainty of the shape in the "
+        "intervals. 0: only the uncertainty of the radii.")
 
 
 class SwingSettings(Settings):
@@ -100,8 +99,8 @@ class SwingSettings(Settings):
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     density_sigma: float = Field(
-        0.1, ge=0, description="Relative standard deviation of the density. A swing gives the "
-        "modulus by inertia, so this enters the modulus in full.")
+        0.1, ge=0, description="Relative standard deviation of the density. A swing determines "
+        "the modulus through inertia, so this uncertainty enters the modulus in full.")
 
 
 class VirtualPullSettings(Settings):
@@ -124,11 +123,11 @@ class VirtualPullSettings(Settings):
         "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
         "the branch; with --drive force it pulls and releases it.")
     drive: Literal["pose", "force"] = Field(
-        "pose", description="What the recording states to move the branch: the gripper's pose, "
-            "or its force as in the paper.")
+        "pose", description="Quantity that drives the branch according to the recording: the "
+            "gripper's pose, or its force as in the paper.")
     weight: float | None = Field(
         None, gt=0, description="Instead of pulling sideways, hang a weight on the grasp that "
-        "grows to this value [N] (slow, driven by force).")
+        "grows to this value [N]. The pull is slow and force-driven.")
     damping: tuple[float, float] = Field(
         (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
     frames: int | None = Field(
@@ -139,18 +138,18 @@ class VirtualPullSettings(Settings):
         "pull.")
     grasp_fraction: float = Field(
         0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
-        "must lie beyond the last control point: what is beyond the grasp is not bent and cannot "
-        "be estimated.")
+        "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
+        "modulus there cannot be estimated.")
     mode: Literal["clamped", "pinned"] = Field(
-        "pinned", description="pinned: held in a loop that lets the branch turn. clamped: turned "
-        "less than it would turn freely, so that a torque acts.")
+        "pinned", description="pinned: a loop holds the branch and lets it turn. clamped: the "
+        "gripper turns the branch less than it would turn freely, so that a torque acts.")
     reach: float = Field(
         0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
             "length.")
     turn: float = Field(2.0, description="Angle by which the direction of the pull turns [rad].")
     phase: float | None = Field(
         None, description="Initial direction of the pull [rad]. Default: drawn from the seed.")
-    position_noise: float = Field(1e-3, ge=0, description="Noise of observed points [m].")
+    position_noise: float = Field(1e-3, ge=0, description="Noise of the observed points [m].")
     force_noise: float = Field(
         0.02, ge=0, description="Noise of the force as a fraction of its largest value.")
     torque_noise: float = Field(
@@ -158,16 +157,16 @@ class VirtualPullSettings(Settings):
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     own_weight: bool = Field(
-        False, description="The shape is unloaded, as drawn: gravity bends the branch out of it, "
-        "as for `limber import-pull --own-weight`.")
+        False, description="The shape is unloaded, as drawn. Gravity then bends the branch, as "
+        "for `limber import-pull --own-weight`.")
     shape: Literal["likely", "fitted"] = Field(
-        "likely", description="The branch that is pulled if only a scan is known. likely: "
-        "another shape that is equally consistent with the scan, drawn from the seed. fitted: "
-        "the reconstructed shape.")
+        "likely", description="Branch that is pulled if only a scan is known. likely: a posterior "
+        "sample of the shape given the scan, drawn from the seed. fitted: the reconstructed "
+        "shape.")
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Fraction of points displaced by 5 cm.")
-    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property
     def frame_count(self) -> int:
@@ -192,8 +191,8 @@ class PredictSettings(Settings):
     common = ("weight", "load")
 
     pull: str | None = Field(
-        None, description="The pull whose points, grasp and gravity are used. Default: the first "
-        "one.")
+        None, description="Name of the pull whose points, grasp and gravity are used. Default: "
+        "the first one.")
     weight: float | None = Field(None, ge=0, description="Weight that hangs on the grasp [N].")
     load: tuple[float, float, float] | None = Field(
         None, description="Steady force in any direction, in the branch's frame [N].")

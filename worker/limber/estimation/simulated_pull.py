@@ -94,7 +94,7 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
         young = settings.young
         if len(young) != len(fractions):
             raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
-                             "Each control point needs one.", "Give --young A,B,C,D.")
+                             "Each control point needs one modulus.", "Give --young A,B,C,D.")
     if body is not None:
         mesh = refined(body) if 8 * body.tet_count <= BODY_LIMIT and body.is_quadratic else body
     else:
@@ -115,8 +115,8 @@ def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random
         moved = reshaped(mesh, skeleton, shape)
         if moved.volumes.min() > 0:
             return shape, moved
-    raise WorkError(f"None of {SHAPE_TRIES} other shapes that the scan allows can be pulled.",
-                    "The scan leaves so much open that their tetrahedra turn inside out.",
+    raise WorkError(f"None of {SHAPE_TRIES} posterior samples of the shape can be pulled.",
+                    "The scan is so uncertain that their tetrahedra are inverted.",
                     "Scan with less noise, or give --shape fitted.")
 
 
@@ -177,9 +177,9 @@ def _kind(settings: VirtualPullSettings,
           ) -> Literal["pull", "turned", "shake", "release", "weight"]:
     if settings.weight is not None:
         if settings.motion == "dynamic":
-            raise InputError("A weight that is hung on in motion.",
-                             "A hung weight is a slow pull that its force drives.",
-                             "Leave --weight or --motion dynamic out.")
+            raise InputError("A hung weight cannot be combined with a dynamic motion.",
+                             "A hung weight is a slow, force-driven pull.",
+                             "Omit --weight or --motion dynamic.")
         return "weight"
     if settings.motion == "dynamic":
         return "release" if settings.drive == "force" else "shake"

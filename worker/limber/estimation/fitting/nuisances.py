@@ -208,8 +208,8 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
             found.append(_Source(tuple(names), unit, each, is_shared, slopes))
 
     if forward.frames.positions.shape[1]:
-        add([f"camera place {axis}" for axis in AXES], "m", known.camera_sigma_m, True, _shifted)
-        add([f"camera turn about {axis}" for axis in AXES], "rad", known.camera_sigma_rad, True,
+        add([f"camera position {axis}" for axis in AXES], "m", known.camera_sigma_m, True, _shifted)
+        add([f"camera rotation about {axis}" for axis in AXES], "rad", known.camera_sigma_rad, True,
             _turned)
         if len(forward.frames) > 3:
             add(["camera clock"], "s", known.clock_sigma_s, False, _late)
@@ -220,18 +220,18 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
             lambda pull: {"forces": _alike(pull, np.ones(len(pull.frames)))})
         add([f"force drift {axis}" for axis in AXES], "N", known.force_drift_sigma_n, False,
             lambda pull: {"forces": _alike(pull, pull.share)})
-        add([f"bend of the force drift {axis}" for axis in AXES], "N",
+        add([f"curvature of the force drift {axis}" for axis in AXES], "N",
             BEND_OF_DRIFT * known.force_drift_sigma_n, False,
             lambda pull: {"forces": _alike(pull, 4 * pull.share * (1 - pull.share))})
         if forward.uses_torque:
             add([f"torque zero {axis}" for axis in AXES], "N m", known.torque_bias_sigma_nm,
                 False, lambda pull: {"torques": _alike(pull, np.ones(len(pull.frames)))})
     if forward.watches_pose:
-        add([f"gripper place {axis}" for axis in AXES], "m", known.pose_sigma_m, True,
+        add([f"gripper position {axis}" for axis in AXES], "m", known.pose_sigma_m, True,
             lambda pull: {"grasps": _alike(pull, np.ones(len(pull.frames)))})
-        add([f"gripper turn about {axis}" for axis in AXES], "rad", known.pose_sigma_rad, True,
+        add([f"gripper rotation about {axis}" for axis in AXES], "rad", known.pose_sigma_rad, True,
             lambda pull: {"grasps": _rotations(pull.frames.poses[:, :3] - pull.pivot)})
-        add(["grasp place along the branch"], "m", known.pose_sigma_m, False,
+        add(["grasp position along the branch"], "m", known.pose_sigma_m, False,
             lambda pull: {"grasps": pull.grip_axis[..., None]})
         add(["slip of the grasp along the branch"], "m", known.slip_sigma_m, False,
             lambda pull: {"grasps": (pull.share[:, None] * pull.grip_axis)[..., None]})
@@ -302,9 +302,10 @@ def unlikely(listed: Sequence[dict]) -> str | None:
         return None
     scale, unit = _SHOWN[worst["unit"]]
     whose = f"{worst['pull']}: the" if worst["pull"] else "The"
-    return (f"{whose} {worst['name']} would be {scale * worst['value']:+.2g} {unit} off, "
-            f"{deviations(worst):.0f} deviations of what the pull's [calibration] states: the fit "
-            "may have ended in a wrong place, or the cell is not as it is stated.")
+    return (f"{whose} {worst['name']} would have an error of {scale * worst['value']:+.2g} "
+            f"{unit}. That is {deviations(worst):.0f} times the standard deviation in the pull's "
+            "[calibration]. The fit may have found a wrong solution, or the [calibration] may be "
+            "wrong.")
 
 
 _SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "N": (1.0, "N"),
@@ -315,5 +316,6 @@ def _sentence(each: dict) -> str:
     scale, unit = _SHOWN[each["unit"]]
     width = scale * (each["interval"][1] - each["value"])
     whose = f"{each['pull']}: the" if each["pull"] else "The"
-    return (f"{whose} {each['name']} seems {scale * each['value']:+.2g} {unit} off (to within "
-            f"{width:.1g} {unit}; it was allowed for, and is not in the moduli).")
+    return (f"{whose} {each['name']} seems to have an error of {scale * each['value']:+.2g} "
+            f"{unit} (± {width:.1g} {unit}). The fit corrects for it, so that it does not affect "
+            "the moduli.")

@@ -148,8 +148,8 @@ class _Search:
                 max_nfev=self._limit)
         except _SettledError as end:
             return scipy.optimize.OptimizeResult(
-                x=end.moved, status=1, message="The step that is still wanted is shorter than "
-                f"{self._shortest:g} standard deviations.")
+                x=end.moved, status=1, message=f"The next step is shorter than {self._shortest:g} "
+                "standard deviations.")
 
     def _residual(self, moved: np.ndarray) -> np.ndarray:
         # Nearly every step is taken, and its derivative is cheapest right after the solve.
@@ -256,13 +256,13 @@ class _Settling:
             return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not (self._has_settled or is_small):
             return FitStatus.out_of_evaluations, (
-                f"{limit} simulations were not enough: {error} still falls. Allow more "
-                "(--evaluations), or use --method gauss-newton")
+                f"{limit} simulations were not enough: {error} is still falling. Increase "
+                "--evaluations, or use --method gauss-newton")
         if self._delta is None:
             return FitStatus.converged, f"{error} settled"
         return FitStatus.misfit, (
-            f"{error} settled above the {self._delta:.3g} m2 asked for (--delta-m2): noise or the "
-            "model's error is larger than that")
+            f"{error} settled above the requested {self._delta:.3g} m2 (--delta-m2). The noise or "
+            "the error of the model is larger")
 
 
 def _required(objective: Objective, free: np.ndarray) -> Evaluation:
@@ -271,6 +271,7 @@ def _required(objective: Objective, free: np.ndarray) -> Evaluation:
         values = objective.space.unpack(free)
         young = ", ".join(f"{value:.3g}" for value in values.young)
         raise WorkError(f"The simulation finds no equilibrium with E = {young} Pa.",
-                        "The pull may be impossible for this branch (poses out of its reach).",
-                        "Check the grasp point and the poses, or start from another --young.")
+                        "This branch may not be able to reach the recorded poses.",
+                        "Check the grasp point and the poses, or give another --young to start "
+                        "from.")
     return found

@@ -147,8 +147,8 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
             fit = _settled(corrected, free, optimise, progress)
         except WorkError:
             progress.warn(
-                "The reduced model loses the branch at one of the recorded poses; the full model "
-                "was used instead.")
+                "The reduced model finds no equilibrium at one of the recorded poses. The full "
+                "model is used instead.")
             return optimise(objective, free), objective
         objective.forward_count = corrected.forward_count
         free = fit.evaluation.free
@@ -171,8 +171,8 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progres
         if not all(forward.correct(values, corrected.space.extra)
                    for forward in corrected.forwards if isinstance(forward, CorrectedForward)):
             progress.warn(
-                "The full model finds no equilibrium at the reduced model's fit: it could not be "
-                "checked. Use --forward full.")
+                "The full model finds no equilibrium at the solution of the reduced model. The "
+                "solution is therefore not confirmed. Use --forward full.")
             return replace(fit, status=FitStatus.unconfirmed)
         # What was evaluated before belongs to another correction.
         corrected.forget()
@@ -184,8 +184,8 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progres
         if np.all(moved <= np.maximum(SETTLED, SETTLED_DEVIATIONS * deviation)):
             return fit
     progress.warn(
-        "The corrections of the reduced model did not settle: the last one changed a free value "
-        f"by {moved.max():.2g} (1 is a factor of 2.7).")
+        "The corrections of the reduced model did not converge. The last one changed a free "
+        f"parameter by {moved.max():.2g} (1 is a factor of 2.7).")
     return replace(fit, status=FitStatus.unconfirmed)
 
 
@@ -193,7 +193,7 @@ def _required(forward: Forward) -> QuasiStaticForward:
     if not isinstance(forward, QuasiStaticForward) or forward.drive != "pose":
         entry = forward.entry
         raise InputError(f"{forward.name} is {entry.drive}-driven and {entry.motion}.",
-                         "The reduced model is held at poses, slowly.",
+                         "The reduced model supports only slow pulls with prescribed poses.",
                          "Use the full model for this pull (--forward full).")
     return forward
 

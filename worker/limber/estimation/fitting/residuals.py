@@ -67,7 +67,7 @@ class Residuals:
             slope = torques / self._torque_sigma()[:, None, None]
             rows.append(slope[torque].reshape(-1, slope.shape[-1]))
         if self._forward.compares_grasp:
-            slope = present(grasps, "derivative of the grasp's place") / self._forward.pose_sigma
+            slope = present(grasps, "derivative of the grasp's position") / self._forward.pose_sigma
             rows.append(slope.reshape(-1, slope.shape[-1]))
         return np.vstack(rows)
 
@@ -78,7 +78,7 @@ class Residuals:
         kinds += ["noise of the force"] * (3 * sum(
             int(known.sum()) for known in (force, torque) if known is not None))
         if self._forward.compares_grasp:
-            kinds += ["single poses of the gripper"] * (3 * len(self._forward.frames))
+            kinds += ["noise of the gripper's poses"] * (3 * len(self._forward.frames))
         return kinds
 
     def span(self) -> tuple[np.ndarray, np.ndarray] | None:

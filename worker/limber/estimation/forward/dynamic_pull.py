@@ -36,15 +36,16 @@ class DynamicForward(Forward):
         super().__init__(name, entry, frames, rest_points)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if entry.drive == "force" and not measured.all():
-            raise InputError(f"{name}: the force is missing in {np.sum(~measured)} frames.",
-                             "A force-driven motion needs it throughout.", "Use --drive pose.")
+            raise InputError(f"{name}: {np.sum(~measured)} frames have no force.",
+                             "A force-driven motion needs the force in every frame.",
+                             "Use --drive pose.")
         if self.drive == "force" and entry.grasp.mode == "clamped":
             raise InputError(
-                f"{name}: the force of a clamped gripper is to drive a motion.",
-                "Such a gripper bends the branch by a torque as well; here only a force drives "
-                "what moves fast.",
-                'Use --drive pose; or set mode = "pinned" under [grasp] of pull.toml if the '
-                "branch could turn.")
+                f"{name}: the force of a clamped gripper drives a dynamic simulation.",
+                "A clamped gripper also bends the branch by a torque, but only a force can drive "
+                "a dynamic simulation.",
+                'Use --drive pose. If the branch could turn in the gripper, set mode = "pinned" '
+                "under [grasp] in pull.toml.")
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
         self.weights = weights

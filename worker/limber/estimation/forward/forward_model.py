@@ -136,7 +136,7 @@ class Forward(ABC):
         Args:
             change: Of the unknowns, in the order of the response's columns, shape [L].
         """
-        raise NotImplementedError(f"{type(self).__name__} is driven by no measured force.")
+        raise NotImplementedError(f"{type(self).__name__} is not driven by a measured force.")
 
     def under_readings(self, simulated: Simulated) -> Simulated:
         """Foretell a pull from its force's readings alone, without what its points say of it."""
@@ -160,7 +160,8 @@ class Forward(ABC):
         """Return the same pull, on the full model, with other recorded poses [m, rad], [f, 6]; a
         slow one at few key frames, enough to see a difference.
         """
-        raise NotImplementedError(f"{type(self).__name__} is corrected by a full model.")
+        raise NotImplementedError(f"{type(self).__name__} cannot be simulated with other recorded "
+                                  "poses.")
 
     def until(self, count: int) -> "Forward":
         """Return what a first fit is to see of a pull that is fitted part by part: the first

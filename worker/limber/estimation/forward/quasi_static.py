@@ -83,8 +83,9 @@ class QuasiStaticForward(Forward):
         super().__init__(name, entry, frames, rest_points)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if self.drive == "force" and measured.sum() < 2:
-            raise InputError(f"{name}: a force-driven simulation without measured force.",
-                             "Nothing would pull.", "Use --drive pose, or record the force.")
+            raise InputError(f"{name} has no measured force for a force-driven simulation.",
+                             "Nothing would pull the branch.",
+                             "Use --drive pose, or record the force.")
         if self.drive == "force" and entry.grasp.mode == "clamped":
             _require_torque(name, entry, frames)
         self.weights = weights
@@ -460,11 +461,13 @@ def _require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
     """
     if not uses_torque(entry, frames):
         raise InputError(
-            f"{name}: the force of a clamped gripper is to drive, but its torque is not known.",
-            "A gripper that holds the branch's rotation bends it by a torque as well; a simulation "
-            "with the force alone would be of another pull.",
-            "Use --drive pose; or record the torque, with torque_sigma_nm under [sensor] of "
-            "pull.toml; or set mode = \"pinned\" under [grasp] if the branch could turn.")
+            f"{name}: the force of a clamped gripper drives the simulation, but its torque is not "
+            "known.",
+            "A clamped gripper also bends the branch by a torque. A simulation with the force "
+            "alone would not reproduce the pull.",
+            "Use --drive pose, or record the torque and give torque_sigma_nm under [sensor] in "
+            'pull.toml. If the branch could turn in the gripper, set mode = "pinned" under '
+            "[grasp].")
 
 
 def equal_values(one: Values | None, other: Values) -> bool:

@@ -44,7 +44,7 @@ class ReducedForward(Forward):
                  key_count: int = 100):
         if entry.drive != "pose" or entry.motion != "quasi_static":
             raise InputError(f"{name} is {entry.drive}-driven and {entry.motion}.",
-                             "The reduced model is held at poses, slowly.",
+                             "The reduced model supports only slow pulls with prescribed poses.",
                              "Use the full model for this pull (--forward full).")
         super().__init__(name, entry, frames, rest_points)
         self.uses_torque = uses_torque(entry, frames)

@@ -32,9 +32,9 @@ from limber.reduced.state import ReducedSettings
 from limber.reduced.training import TrainingSettings
 
 SAID = {
-    "enough": "every modulus is known to 2 %; another pull would add nothing that matters.",
-    "idle": "going on like this adds nothing: the last tenth of the frames narrowed no interval "
-    "by 1 %. A pull farther, elsewhere or another way might."}
+    "enough": "every modulus is known to 2 %. Another pull would hardly improve the estimate.",
+    "idle": "continuing this pull adds nothing: the last tenth of the frames narrowed no interval "
+    "by 1 %. Pull farther, at another point or in another direction."}
 QUIET_SECONDS = 3.0
 """A recording that has not grown for so long has ended."""
 BLIND_DEVIATION = 1.5
@@ -68,7 +68,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
     size = _size(where())
     first = read_pull(where())
     if first.observations is None:
-        raise InputError(f"{name} has images.", "They are tracked when the pull is over.",
+        raise InputError(f"{name} has images.", "Images can be tracked only after the pull.",
                          "Follow a pull with markers, or run `limber estimate` afterwards.")
     begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count)
     if _size(where()) != size:
@@ -92,12 +92,14 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
             if not states:
                 raise
             stopped = True
-            progress.warn(f"Stopped at {states[-1].time:.2f} s; what was known then is kept.")
+            progress.warn(f"Stopped at {states[-1].time:.2f} s. The estimate up to this time is "
+                          "kept.")
     if not states:
-        raise InputError(f"{name} has no frames.", "Nothing could be followed.", "Record a pull.")
+        raise InputError(f"{name} has no frames.", "There is nothing to estimate from.",
+                         "Record a pull.")
     if estimator.refresh_count:
-        progress.warn(f"{name}: the moduli left what the reduced model knew; it was made again "
-             f"{estimator.refresh_count} times on the way.")
+        progress.warn(f"{name}: the moduli left the range of the reduced model. The model was "
+             f"rebuilt {estimator.refresh_count} times during the pull.")
     result = _result(name, states, slowest) | _with_radii(axes, subject, states[-1]) | {
         "frame_count": estimator.frame_count, "stopped": stopped,
         "model_error": estimator.model_error, "refresh_count": estimator.refresh_count}
@@ -169,8 +171,8 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
         if rough is None:
             deviation, spread = BLIND_DEVIATION, 4.0
             progress.warn(
-                f"{pull.name}: nothing has moved yet. The reduced model is made around "
-                f"E = {start.young[0] / 1e6:.3g} MPa throughout (--young gives another).")
+                f"{pull.name}: nothing has moved yet. The reduced model is built for a uniform E "
+                f"= {start.young[0] / 1e6:.3g} MPa (use --young for another value).")
         else:
             start = rough
     grasp = grasp_on(subject.mesh, pull.entry.grasp)

@@ -51,12 +51,11 @@ def require_scale(found: Identifiability) -> None:
     if found.scale_deviation <= SCALE_DEVIATION:
         return
     raise InputError(
-        "These pulls do not determine the overall scale of Young's modulus: multiplying every "
-        f"modulus by 2 would change what was measured by {0.7 / found.scale_deviation:.1g} "
-        "standard deviations.",
-        "A branch that is moved slowly, without measured force and without weight or inertia in "
-        "play, takes the same shape whether it is soft or stiff: a fit would look perfect with "
-        "every modulus wrong.",
+        "These pulls do not determine the overall scale of Young's modulus: twice as large moduli "
+        f"would change the measurements by only {0.7 / found.scale_deviation:.1g} standard "
+        "deviations.",
+        "Without measured force, weight or inertia, a branch that moves slowly takes the same "
+        "shape whether it is soft or stiff. A fit would look perfect with every modulus wrong.",
         "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 in pull.toml, "
         "--motion dynamic).")
 
@@ -91,10 +90,10 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
         partner = min(beside, key=lambda k: deviations[k])
         links.append((worst, partner))
         messages.append(
-            f"{space.names[worst]} cannot be told well from these pulls (its logarithm only to "
-            f"within {min(deviations[worst], 99.0):.1f}): that it lies within a factor of ten of "
-            f"{space.names[partner]} was added. Pull at a point farther out, drive by the pose, "
-            "or let gravity bend the tip, to tell it.")
+            f"These pulls do not determine {space.names[worst]} well: the standard deviation of "
+            f"its logarithm is {min(deviations[worst], 99.0):.1f}. The fit therefore assumes that "
+            f"it is within a factor of ten of {space.names[partner]}. To determine it, pull at a "
+            "point farther out, prescribe the pose, or let gravity bend the tip.")
     return space.linked(tuple(links)), messages
 
 

@@ -82,11 +82,11 @@ class _Profile:
         low, _ = self._limit(group, -1.0, max(limit_of(bend, -self._quantile), -self._quantile))
         if high > self._quantile and high == self._farthest(group, 1.0):
             self._progress.warn(
-                f"{self._objective.space.names[group]} has no upper limit by these pulls: the "
-                "stiffer it were, the less they would see of it. Its interval ends where hardly "
-                "any modulus lies above its neighbour's (a factor of "
-                f"{np.exp(self._quantile * LINK_DEVIATION):.2g}). Pull at a point farther out, or "
-                "farther, to tell it.")
+                f"These pulls give no upper limit of {self._objective.space.names[group]}: a "
+                "stiffer piece would hardly change the measurements. Its interval ends at the "
+                "largest plausible ratio to its neighbour's modulus (a factor of "
+                f"{np.exp(self._quantile * LINK_DEVIATION):.2g}). To determine it, pull at a "
+                "point farther out, or pull farther.")
         deviation = self.deviations[group]
         return -low * deviation, high * deviation
 
@@ -96,7 +96,7 @@ class _Profile:
         farthest, bend = self._farthest(group, side), 0.0
         at, others = side * min(abs(first), abs(farthest)), np.zeros(len(self._best.free))
         for _ in range(TRIES):
-            self._progress(1.0, "how far wide moduli may be off")
+            self._progress(1.0, "finding the limits of wide intervals")
             found = self._rise(objective, group, at, others)
             if found is None:
                 # Nothing stands there, or is not found from so far away.

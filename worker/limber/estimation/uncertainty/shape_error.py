@@ -44,7 +44,7 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     """
     if count < FEWEST:
         return None
-    progress(0.0, "other shapes that the scan allows")
+    progress(0.0, "evaluating posterior samples of the shape")
     meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in likely_skeletons(
         subject.skeleton, points, count, np.random.default_rng(seed))]
     steps = taken_up(evaluation, objective,

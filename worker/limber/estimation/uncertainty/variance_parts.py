@@ -14,36 +14,38 @@ import numpy as np
 from limber.estimation.fitting.objective import Evaluation, Objective
 
 ADVICE = {
-    "noise of the points": "more frames, more pulls, or markers that are seen better",
-    "noise of the force": "a larger pull, or a slower one with more readings",
-    "single poses of the gripper": "more pulls",
+    "noise of the points": "use more frames, more pulls, or more visible markers",
+    "noise of the force": "pull farther, or slower with more readings",
+    "noise of the gripper's poses": "use more pulls",
     "gripper frame": "calibrate the gripper's frame against the branch's (hand-eye), and state "
-                     "the deviation under [calibration] of pull.toml",
+                     "its standard deviation under [calibration] in pull.toml",
     "force gain": "check the sensor with a known weight",
-    "zero of the force": "tare before each pull, and state it under [calibration]",
+    "zero of the force sensor": "tare the sensor before each pull, and state it under "
+                                "[calibration]",
     "camera frame": "register the camera to the branch (fixed markers), or add a second view",
-    "clock": "record all on one clock",
-    "slip of the grasp": "clamp without slip, or put a marker at the grasp",
-    "form of the modulus between the control points": "markers at more places along the branch, "
-                                                      "or a pull at another point",
-    "Poisson's ratio": "no pull tells it; give it (--poisson, --poisson-sigma)",
+    "clock": "record all sensors with one clock",
+    "slip of the grasp": "grasp without slip, or put a marker at the grasp",
+    "modulus between the control points": "add markers along the branch, or pull at another point",
+    "Poisson's ratio": "give it (--poisson, --poisson-sigma); pulls do not determine it",
     "density": "weigh a piece of the branch (--density, --density-sigma)",
-    "moduli that the pulls leave open": "pull at a point farther out",
-    "shape of the scan": "a scan from more sides, or with less noise",
-    "mass of twigs and leaves": "weigh what hangs on the branch, and state it "
-                                "(--hung-sigma); or mesh more twigs (--twig-radius of reconstruct)",
-    "length in the gripper": "measure it, and state it under [grasp] (radius_m: its half) and "
-                             "[calibration] (held_length_sigma_m) of pull.toml",
-    "mesh": "a finer mesh (--mesh-spacing of reconstruct)",
-    "clamp": "scan farther down, so that the clamped place is known",
+    "moduli that the pulls do not determine": "pull at a point farther out",
+    "shape of the scan": "scan from more sides, or with less noise",
+    "mass of twigs and leaves": "weigh the twigs and leaves, and state the uncertainty "
+                                "(--hung-sigma); or mesh more twigs (--twig-radius of "
+                                "reconstruct)",
+    "length in the gripper": "measure it, and state it under [grasp] (radius_m: half of it) and "
+                             "[calibration] (held_length_sigma_m) in pull.toml",
+    "mesh": "use a finer mesh (--mesh-spacing of reconstruct)",
+    "clamp": "scan farther down, so that the clamped position is known",
 }
 """What would narrow an interval, by cause."""
 
 _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
-           ("grasp place", "gripper frame"), ("slip", "slip of the grasp"),
-           ("force gain", "force gain"), ("force", "zero of the force"),
-           ("bend of the force", "zero of the force"), ("torque", "zero of the force"),
-           ("form", "form of the modulus between the control points"),
+           ("grasp position", "gripper frame"), ("slip", "slip of the grasp"),
+           ("force gain", "force gain"), ("force", "zero of the force sensor"),
+           ("curvature of the force", "zero of the force sensor"),
+           ("torque", "zero of the force sensor"),
+           ("form", "modulus between the control points"),
            ("poisson", "Poisson's ratio"), ("density", "density"))
 
 
@@ -128,7 +130,7 @@ def _information(evaluation: Evaluation, objective: Objective, scale: float,
         rows.append(_Rows(cause_of(nuisance.name), row))
     own, _ = space.own_rows()
     causes = [cause_of(name) for name, _, _ in space.priors]
-    causes += ["moduli that the pulls leave open"] * len(space.links)
+    causes += ["moduli that the pulls do not determine"] * len(space.links)
     for cause, row in zip(causes, own, strict=True):
         rows.append(_Rows(cause, np.r_[row, np.zeros(width - space.size)][None]))
     return rows

@@ -145,9 +145,9 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
     far = way[:, np.argmax(np.nan_to_num(way).max(axis=0))]
     far = np.where(np.isfinite(far), far, 0.0)
     if far.max() < 10 * seen.noise:
-        raise InputError("Nothing swings in the recording.",
+        raise InputError("The recording shows no swing.",
                          f"No marker moves by more than {1e3 * far.max():.2g} mm.",
-                         "Start the recording before the branch is let go.")
+                         "Start the recording before the branch is released.")
     gone = int(np.argmax(far > _GONE * far.max()))
     at_rest = np.flatnonzero(far[:gone] < max(6 * seen.noise, 0.02 * far.max()))
     start = int(at_rest[-1]) + 1 if len(at_rest) else 0
@@ -162,9 +162,9 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
     away, times = away[:large[-1] + 1], times[:large[-1] + 1]
     turns = np.flatnonzero((away[:-1] < 0) != (away[1:] < 0))
     if len(turns) < 3:
-        raise InputError("The branch does not swing to and fro.",
-                         f"It passes its place of rest {len(turns)} times.",
-                         "Let it go at once, or fit the place of rest: --motion quasi_static.")
+        raise InputError("The branch does not oscillate.",
+                         f"It passes its rest position only {len(turns)} times.",
+                         "Release it abruptly, or fit the rest position: --motion quasi_static.")
     cross = times[turns] - away[turns] * (times[turns + 1] - times[turns]) / (
         away[turns + 1] - away[turns])
     # Over whole turns: where it rests may be a little beside, as of a branch that creeps.
@@ -172,7 +172,7 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
     rate = float(np.median(np.diff(seen.times)))
     if period < 6 * rate:
         raise InputError(f"The branch swings {1 / period:.3g} times a second.",
-                         f"At {1 / rate:.3g} frames a second that is too fast to be seen.",
+                         f"This is too fast for {1 / rate:.3g} frames a second.",
                          "Record with more frames a second.")
     return float(seen.times[max(start - 1, 0)]), period
 
@@ -275,9 +275,9 @@ class _Swing:
             sensitivity_nodes=self.nodes)
         self.forward_count += 1
         if not result.converged:
-            raise WorkError(f"The simulated swing fails: {result.message}.",
-                            "Load, mass or modulus do not fit the branch.",
-                            "Check --weight, units and density.")
+            raise WorkError(f"The simulation of the swing failed: {result.message}.",
+                            "The load, mass or modulus does not suit the branch.",
+                            "Check --weight, the units and the density.")
         count = len(times)
         moved = (self.operator @ result.displacement.reshape(count, -1).T).T.reshape(count, -1, 3)
         slopes = np.stack([(self.near @ frame.reshape(-1, 4)).reshape(-1, 3, 4)

@@ -79,11 +79,12 @@ def read_record(path: Path) -> Stream:
             and not re.fullmatch(_COUNTS, split_title(title).plain)]
     times = stream.times
     if not used:
-        raise InputError(f"{path} has no column of readings beside its times that is whole.",
-                         "A record has one.", "Correct the file.")
+        raise InputError(f"{path} has no complete column of readings beside its times.",
+                         "A record needs at least one.", "Correct the file.")
     if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
-        raise InputError(f"{path} has gaps that are far longer than its steps.",
-                         "It is taken in even steps.", "Give a part of it without gaps.")
+        raise InputError(f"{path} has gaps that are far longer than its time steps.",
+                         "The analysis needs uniform time steps.",
+                         "Give a part of the record without gaps.")
     return replace(stream, values=stream.values[:, used],
                    columns=tuple(stream.columns[number] for number in used))
 
@@ -107,19 +108,21 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     if len(times) < _LEAST_READINGS:
         raise InputError(f"The record has {len(times)} readings of a free decay.",
                          f"At least {_LEAST_READINGS} are needed.",
-                         "Record longer, or say when it begins with --start.")
+                         "Record longer, or state the start of the decay with --start.")
     guess = _peak(times, channels, step)
     used = times <= times[0] + _PERIODS / guess
     times, channels = times[used], channels[used] - channels[used].mean(axis=0)
     found = _fitted(times - times[0], channels, step)
     if (times[-1] - times[0]) * found.frequencies[0] < _LEAST_TURNS:
-        raise InputError(f"The branch swings {(times[-1] - times[0]) * found.frequencies[0]:.1f} "
-                         "times in the record.", "A frequency needs a few turns.",
-                         "Record longer.")
+        raise InputError("The branch oscillates only "
+                         f"{(times[-1] - times[0]) * found.frequencies[0]:.1f} times in the "
+                         "record.",
+                         "A frequency needs several oscillations.", "Record longer.")
     if found.left_over > 0.9:
-        raise InputError("Nothing rings in the record.",
-                         f"Vibrations that die away explain {100 * (1 - found.left_over**2):.0f} "
-                         "% of it.", "Let the branch go at once; say when with --start.")
+        raise InputError("The record shows no free vibration.",
+                         f"Decaying vibrations explain only {100 * (1 - found.left_over**2):.0f} "
+                         "% of it.",
+                         "Release the branch abruptly, and state the time of release with --start.")
     return Ringing(**{**vars(found), "start": float(times[0]),
                       "duration": float(times[-1] - times[0])})
 
