@@ -198,7 +198,7 @@ def test_no_path_is_proven_where_a_limit_separates(well_field):
     accepted = well_field.samples.positions
     accepted = accepted[np.abs(accepted[:, 0]) > 0.05]
     walled = replace(well_field, region=TrustRegion.of(accepted, _wall()))
-    with pytest.raises(NoPathError, match=r"No path exists.*Proven on a grid"):
+    with pytest.raises(NoPathError, match=r"No path exists.*proven on a grid"):
         plan_gentle(problem_on(walled, start=start, goal=goal))
 
 

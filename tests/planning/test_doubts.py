@@ -94,7 +94,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     if UNPROVEN in seen:
         found = two_paths.plan_within(*arguments, progress=progress)
         assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + doubt)
-        assert any("as its error allows (strain 0." in words for words in told)
+        assert any("extended by the field's error (strain 0." in words for words in told)
     else:
         with pytest.raises(NoWayError, match="No path exists"):
             two_paths.plan_within(*arguments, progress=progress)
@@ -132,5 +132,5 @@ def test_a_field_of_an_older_program_opens_and_proves_nothing(rough_field, tmp_p
     assert not judge(problem_on(old, limits)).proven
     far = TargetGoal(Ball((0.0, 0.0, 2.0), 0.01))
     assert not judge(problem_on(old, Limits(), far)).proven
-    with pytest.raises(InputError, match="knows no strain"):
+    with pytest.raises(InputError, match="contains no strain"):
         Limits(strain=0.9).margins(EnergyField.read(tmp_path / "oldest.npz"))

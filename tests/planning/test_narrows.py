@@ -65,7 +65,7 @@ def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_fie
     assert found.cost == wide.cost(found.points) < np.inf
     none = problem_on(shell_field, max_force=0.8 * held)
     assert judge(none).proven
-    with pytest.raises(NoWayError, match=r"No path exists.*Proven on a grid"):
+    with pytest.raises(NoWayError, match=r"No path exists.*proven on a grid"):
         plan_gentle(none)
 
 
@@ -150,8 +150,8 @@ def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
     if blind == 1:
         found = made()
         assert np.linalg.norm(found.plan.solved.forces, axis=1).max() <= 1.3 * held
-        assert counts[1] > counts[0] and "Poses are added where" in warnings[0]
+        assert counts[1] > counts[0] and "poses are added" in warnings[0]
     else:
-        with pytest.raises(NoWayError, match=r"No path exists.*Poses were added .* of .* N, at \("):
+        with pytest.raises(NoWayError, match=r"No path exists.*poses were added .* of .* N, at \("):
             made()
         assert len(counts) <= 3

@@ -116,6 +116,6 @@ def test_a_goal_from_outside_has_its_option(planned_branch, tmp_path, monkeypatc
 def test_it_is_refused_beside_another_goal(planned_branch):
     """By the name of its option, as any two; a target needs one that is of a target."""
     for more, words in (({"goal": (0, 0, 1)}, "--goal and --goal-side"),
-                        ({"target": "flower"}, "without a place")):
+                        ({"target": "flower"}, "without a goal for it")):
         with pytest.raises(InputError, match=words):
             plan_paths(planned_branch, SideSettings(goal_side=0.1, **more), name="bad")

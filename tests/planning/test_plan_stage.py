@@ -121,7 +121,7 @@ def test_a_plan_whose_goal_is_its_start_saves_nothing(copied, place):
     for change in ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent"):
         assert plan[change] is None
     assert len(plan["rounds"]) == 1
-    assert [words for words in told if "The start lies in the goal" in words] == told
+    assert [words for words in told if "The start already lies in the goal" in words] == told
     assert report_figures(Branch.open(copied), "stay") == []
 
 
@@ -168,7 +168,7 @@ def test_refusals_leave_the_folder_as_it_was(copied):
     before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
     with pytest.raises(NoPathError, match="misses it by"):
         plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
-    with pytest.raises(NoPathError, match=r"force .* where 0.01 .*is allowed"):
+    with pytest.raises(NoPathError, match=r"force .* its limit is 0.01 "):
         plan_paths(copied, PlanSettings(max_force=0.01, replans=0, iterations=300), name="bad",
                    workers=1)
     with pytest.raises(NoPathError, match=r"in millimetres\?"):
@@ -275,7 +275,7 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
         return fit_field(samples, field.chart.pivot, field.chart.radius)
 
     monkeypatch.setattr(EnergyField, "read", promising)
-    with pytest.raises(NoPathError, match=r"force \[N\] .* is allowed, at \(.*\) m") as refused:
+    with pytest.raises(NoPathError, match=r"force \[N\] .* exceeds .* at \(.*\) m") as refused:
         plan_paths(copied, PlanSettings(max_force=cap, replans=0, start=tuple(
             plan["plan"]["poses"][0][:3]), goal=tuple(plan["plan"]["poses"][-1][:3])),
             name="refused", workers=1)
@@ -289,7 +289,7 @@ def test_a_field_too_coarse_for_the_asked_bound_is_told():
                "plan": {"field_energy_error": 0.05, "length_m": 0.11},
                "certificate": {"gap_percent": 1.0}, "planner": "eikonal"}
     told = doubts_of(summary, 3.0)
-    assert len(told) == 1 and "5 %" in told[0] and "over the 3 %" in told[0]
+    assert len(told) == 1 and "5 %" in told[0] and "exceeds the limit of 3 %" in told[0]
     assert doubts_of(summary, 6.0) == []
 
 

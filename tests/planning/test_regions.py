@@ -92,11 +92,11 @@ def test_a_start_in_the_goal_stays_there(ridge_field):
 
 @pytest.mark.parametrize(("settings", "words"), [
     ({"goal": (0, 0, 1), "target_box": (0, 0, 0, 1, 1, 1)}, "--goal and --target-box"),
-    ({"target": "flower"}, "without a place"),
-    ({"target": "flower", "tip_goal": (0, 0, 1)}, "no target flower"),
+    ({"target": "flower"}, "without a goal for it"),
+    ({"target": "flower", "tip_goal": (0, 0, 1)}, "no target named flower"),
     ({"target_box": (0, 0, 1, 1, 1, 0)}, "empty"),
-    ({"in_view": True}, r"no cell with a \[camera\]"),
-    ({"second_arm": True}, r"no cell with a \[second_arm\]"),
+    ({"in_view": True}, r"without a cell that has a \[camera\]"),
+    ({"second_arm": True}, r"without a cell that has a \[second_arm\]"),
 ])
 def test_goals_that_make_no_sense_are_refused(small_model, ridge_field, settings, words):
     with pytest.raises(InputError, match=words):

@@ -51,7 +51,7 @@ def test_positions_follow_the_seed():
 
 def test_no_room_is_an_error():
     """A grasp at the base has nowhere to go, and the message says what to change."""
-    with pytest.raises(WorkError, match="farther out"):
+    with pytest.raises(WorkError, match="farther from its base"):
         sample_positions(Reach(np.zeros(3), 0.4, 0.38, REST), np.array([0, 0, -0.5]), 50,
                          Valley(np.zeros(3), 0.5), deflection=0.4)
 

@@ -82,8 +82,8 @@ def test_gusts_bend_it_further_than_an_even_wind(tmp_path):
 
 
 @pytest.mark.parametrize(("content", "settings", "told"), [
-    ("", {"gust": 0.2}, "without wind"),
-    ("", {"wind": (0.0, 0.0, 0.0), "gust": 0.2}, "without wind"),
+    ("", {"gust": 0.2}, "without a wind"),
+    ("", {"wind": (0.0, 0.0, 0.0), "gust": 0.2}, "without a wind"),
     ("time_s,speed_m_s\n0,1\n", {"wind": (1.0, 0.0, 0.0)}, "at least 16"),
     ("t,v\n0,1\n", {"wind": (1.0, 0.0, 0.0)}, "no column time_s"),
     ("time_s,speed_m_s\n" + "0,1\n" * 20, {"wind": (1.0, 0.0, 0.0)}, "ascending"),

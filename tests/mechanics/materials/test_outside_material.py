@@ -361,7 +361,7 @@ def test_an_installed_package_gives_its_law_to_commands(capsys, folder, tmp_path
     code, told = simulated(capsys, folder, "spruce", "--kind", "static")
     assert code == 0 and json.loads(told.out.splitlines()[-1])["converged"]
     code, told = simulated(capsys, folder, "pine")
-    assert code == 2 and "is called 'spruce'" in told.err
+    assert code == 2 and "has the name 'spruce'" in told.err
 
 
 def test_what_cannot_use_it_refuses(mesh):
@@ -406,9 +406,10 @@ def _law(**parts):
 
 
 WRONG = {
-    "cannot be called": {"name": "linear"},
+    "not a valid material name": {"name": "linear"},
     "built-in": {"is_hookean": True},
-    "without strain": {"energy": lambda self, e, lam, mu: mu * (e[..., 0] + contracted(e, e))},
+    "energy or stress at zero strain": {"energy": lambda self, e, lam, mu: (
+        mu * (e[..., 0] + contracted(e, e)))},
     "not the derivative of its energy": {"energy": lambda self, e, lam, mu: (
         lam + mu) * np.abs(contracted(e, e))},
     "not the derivative of its stress": {"moduli": lambda self, e, lam, mu: (

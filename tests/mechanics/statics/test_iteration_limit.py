@@ -21,4 +21,4 @@ def test_a_branch_far_too_soft_is_given_up_in_time():
                                     settings=settings)
     assert found[1e9].converged
     assert not found[2e4].converged and found[2e4].iterations < 30 + 40
-    assert "no end after" in found[2e4].message
+    assert "not finished after" in found[2e4].message

@@ -141,7 +141,7 @@ def test_search_trees(tmp_path, mesh):
     np.testing.assert_array_equal(data.arrays["tree_parent:baseline"], [-1, 0, 1])
     assert data.info["trees"] == {"baseline": {"title": "RRT*", "node_count": 3}}
     assert scene_data(_branch(tmp_path / "b", mesh, plan__p=plan)).info["trees"] == {}
-    with pytest.raises(BranchFolderError, match=r"no search trees .* no tree"):
+    with pytest.raises(BranchFolderError, match=r"not contain search trees .* not form a tree"):
         scene_data(_branch(tmp_path / "c", mesh, plan__p=plan | {
             "plans/p-trees.csv": table.format(2)}))
 

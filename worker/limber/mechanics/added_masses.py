@@ -122,7 +122,7 @@ def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weigh
     found = []
     for one in added:
         if not (np.isfinite(one.mass) and one.mass >= 0):
-            raise InputError(f"An added mass of {one.mass} kg.", "It must be 0 or more.",
+            raise InputError(f"An added mass is {one.mass} kg.", "It must be 0 or more.",
                              "Give the mass in kilograms.")
         if not isinstance(one, HungTwig):
             distance = np.linalg.norm(mesh.nodes - np.asarray(one.position), axis=1)

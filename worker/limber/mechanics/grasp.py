@@ -77,7 +77,8 @@ class Grasp:
         if not len(nodes):
             raise InputError(
                 f"No node lies within {radius:g} m of ({', '.join(f'{x:.4g}' for x in point)}) m;"
-                f" the nearest is {distance.min():.4g} m away.", "The gripper would hold nothing.",
+                f" the nearest is {distance.min():.4g} m away.",
+                "The gripper would not hold any node.",
                 "Move the point onto the branch or widen the radius; check the units (metres).")
         grasp = cls.of_nodes(mesh, nodes, mode, point if radius > 0 else None)
         wider = radius
@@ -136,7 +137,8 @@ class Grasp:
         """
         nodes = np.flatnonzero(mesh.point_data.get("grasp", np.zeros(mesh.node_count)))
         if not len(nodes):
-            raise InputError("The mesh marks no grasp.", "Point data `grasp` is missing or 0.",
+            raise InputError("The mesh does not mark a grasp.",
+                             "Point data `grasp` is missing or 0.",
                              "Reconstruct again, or give a grasp point.")
         return cls.of_nodes(mesh, nodes, mode, point)
 
@@ -154,14 +156,14 @@ class Grasp:
         """
         if mode not in ("clamped", "pinned"):
             raise InputError(f"Grasp mode {mode!r} is unknown.",
-                             "A grasp holds position and rotation, or position alone.",
+                             "A grasp holds position and rotation, or position only.",
                              "Use 'clamped' or 'pinned'.")
         nodes = np.unique(np.asarray(nodes, np.int64))
         fixed = mesh.point_data.get("fixed")
         if fixed is not None and np.any(fixed[nodes]):
             raise InputError("The grasp lies in the fixed base.",
                              f"{np.count_nonzero(fixed[nodes])} of its {len(nodes)} nodes cannot"
-                             " move.", "Grasp farther out, or with a smaller radius.")
+                             " move.", "Grasp farther from the base, or use a smaller radius.")
         weights = _patch_weights(mesh, nodes)
         if point is not None:
             weights = _centred(weights, mesh.nodes[nodes] - np.asarray(point, float))
@@ -240,7 +242,7 @@ def check_pose(pose: np.ndarray) -> np.ndarray:
     """
     pose = np.asarray(pose, float)
     if pose.shape != (6,) or not np.isfinite(pose).all():
-        raise InputError(f"A pose of shape {pose.shape} or with values that are not finite.",
+        raise InputError(f"The pose has shape {pose.shape} or values that are not finite.",
                          "A pose is x, y, z [m] and a rotation vector [rad].",
                          "Give six numbers.")
     return pose

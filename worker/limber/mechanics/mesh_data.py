@@ -75,8 +75,8 @@ class MeshData:
                 where = "the fixed base" if self.fixed[grasp.nodes].any() else "another grasp"
                 raise InputError(f"A grasp overlaps {where}.",
                                  "A node cannot follow two masters.",
-                                 "Move the grasp, or make its radius smaller.")
+                                 "Move the grasp, or reduce its radius.")
             taken[grasp.nodes] = True
         if taken.all():
-            raise InputError("Every node is fixed or grasped.", "Nothing is left to compute.",
+            raise InputError("Every node is fixed or grasped.", "No free node remains to compute.",
                              "Use a smaller grasp or a finer mesh.")

@@ -446,7 +446,8 @@ class BranchModel:
         changed = density is not before
         self.density = per_tet("Density", density, count)
         if self.density.min() <= 0:
-            raise InputError(f"Density is {self.density.min():g} kg/m3.", "It must be positive.",
+            raise InputError(f"The density is {self.density.min():g} kg/m3.",
+                             "It must be positive.",
                              "Green wood has 500 to 1100 kg/m3.")
         self.lame_lambda, self.lame_mu = lame(self.young * self.stiffening, self.poisson)
         if changed:

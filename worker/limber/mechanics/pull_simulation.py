@@ -98,9 +98,9 @@ def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> No
     """
     moves = settings.move is not None or settings.turn is not None
     if (settings.grasp_force is not None) + moves + (along is not None) > 1:
-        raise InputError("More than one of a motion, a way and a force were given.",
-                         "A grasp follows poses or takes a force.",
-                         "Give --move and --turn, --along, or --grasp-force.")
+        raise InputError("More than one of a motion, a path and a force is given.",
+                         "A grasp follows poses or exerts a force.",
+                         "Give --move and --turn, or --along, or --grasp-force.")
 
 
 def motion_of(case: LoadCase, settings: SimulateSettings,

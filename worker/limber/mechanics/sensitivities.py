@@ -198,9 +198,9 @@ def young_shares(model: BranchModel, wanted: ParameterSet) -> np.ndarray:
         control = np.linalg.lstsq(wanted.weights, model.young, rcond=None)[0]
     mapped = wanted.weights @ control
     if np.abs(mapped / model.young - 1).max() > 1e-6:
-        raise InputError("Young's modulus is not what the weights give.",
+        raise InputError("Young's modulus differs from what the weights give.",
                          "The model's field must be weights @ control_young.",
-                         "Make the model by with_young(weights @ control_young).")
+                         "Create the model with with_young(weights @ control_young).")
     return (wanted.weights * control).T / mapped
 
 
@@ -287,5 +287,5 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name not in PARAMETERS:
             raise InputError(f"There is no parameter {name!r}.",
-                             f"Known are {', '.join(PARAMETERS)}.", "Choose of those.")
+                             f"The parameters are {', '.join(PARAMETERS)}.", "Choose one of those.")
     return tuple(names)

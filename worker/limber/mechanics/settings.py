@@ -52,16 +52,16 @@ class SimulateSettings(Settings):
         (), description="A force FX FY FZ [N] at X Y Z [m] that grows with the pull. May be "
         "given several times.", json_schema_extra={"metavar": "X Y Z FX FY FZ"})
     mass_at: tuple[PlacedMass, ...] = Field(
-        (), description="A mass KG [kg] (a fruit, a flower) that hangs at X Y Z [m] from the "
-        "start. May be given several times.", json_schema_extra={"metavar": "X Y Z KG"})
+        (), description="A mass KG [kg] (a fruit, a flower) at X Y Z [m], present from the start. "
+        "May be given several times.", json_schema_extra={"metavar": "X Y Z KG"})
     duration: float = Field(1.0, gt=0, description="Duration of the pull [s].")
     hold: float = Field(0.5, ge=0, description="Duration of the hold at the end of the pull [s] "
         "(dynamic).")
-    frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames a second.")
+    frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames per second.")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
     scheme: Literal["energy_momentum", "newmark"] = Field(
-        "energy_momentum", description="Time integration (dynamic). energy_momentum: keeps the "
-        "energy at any amplitude. newmark: the paper's.")
+        "energy_momentum", description="Time integration (dynamic). energy_momentum: conserves "
+        "the energy at any amplitude. newmark: the paper's.")
     newmark_beta: float = Field(
         0.25, gt=0, le=0.5, description="Newmark's beta (--scheme newmark).")
     newmark_gamma: float = Field(

@@ -159,8 +159,9 @@ class _Rounds:
         if not broken and is_near:
             return True
         if stopped:
-            raise Cancelled("The search was stopped.", f"The best path so far is none: "
-                            f"{'; '.join(broken)}.", "Run it again when there is time for it.")
+            raise Cancelled("The search was stopped.",
+                            "The best path found so far is not allowed: "
+                            f"{'; '.join(broken)}.", "Run it again and let it finish.")
         if is_last:
             raise _refused(broken, self.settings)
         self.field = refit(self.field, learnt(self.field, self.grasp_model, plan, self.limits))
@@ -182,8 +183,8 @@ class _Rounds:
                 raise
             self.narrows.append(found)
             self.progress.warn(
-                f"{none.seen} Poses are added where the energy field's error leaves that in "
-                f"doubt: {found.told}.")
+                f"{none.seen} The energy field's error makes this uncertain, so poses are added: "
+                f"{found.told}.")
             self.field = refit(self.field, found.learnt)
             return None
 
@@ -243,8 +244,8 @@ class _Rounds:
             summary["in_motion"] = self.moving.describe()
             if self.moving.slowings:
                 self.progress.warn(
-                    f"The motion was slowed down to {1e3 * self.pace.speed:.1f} mm/s: faster, the "
-                    "branch's inertia breaks a limit.")
+                    f"The motion was slowed down to {1e3 * self.pace.speed:.1f} mm/s. At a higher "
+                    "speed the branch's inertia breaks a limit.")
         for message in doubts_of(summary, self.settings.field_error, baseline, plan):
             self.progress.warn(message)
         trees = {name: path.tree for name, path in pair.trees.items() if path.tree is not None}
@@ -261,8 +262,8 @@ def _knowing(field: EnergyField, grasp_model: GraspModel, limits: Limits, worker
     """
     nodes, rest = grasp_model.mesh.nodes, grasp_model.rest.displacement
     if met := limits.met(field.rest[None], nodes + rest[None]):
-        raise NoPathError(f"The branch cannot start where it hangs: {'; '.join(met)}.",
-                          "No path begins there.",
+        raise NoPathError(f"The branch breaks a limit at its rest pose: {'; '.join(met)}.",
+                          "No path can start there.",
                           "Correct the obstacles in the cell file, or the limit.")
     grasps = field.samples.positions
     displacements = displacements_at(grasp_model, grasps, workers=workers,
@@ -273,7 +274,7 @@ def _knowing(field: EnergyField, grasp_model: GraspModel, limits: Limits, worker
 def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:
     return NoPathError(
         f"No plan keeps the limits on the full model: {'; '.join(broken)}.",
-        f"Planned {settings.replans + 1} times, each time with the states found there added to the "
-        "energy field.",
+        f"The path was planned {settings.replans + 1} times. After each plan, the states found on "
+        "the full model were added to the energy field.",
         "Raise the limit, choose a gentler goal, sample more poses with `limber energy --samples`, "
         "or allow more --replans.")

@@ -134,8 +134,8 @@ class ResolvedPath:
         kinds = ", ".join(f"{self.reasons.count(kind)} {kind}"
                           for kind in sorted(set(self.reasons)))
         raise ConvergenceError(
-            f"Along a path {len(self.reasons)} poses have no acceptable solution ({kinds}).",
-            "The energy field promised more than the branch can do.",
+            f"{len(self.reasons)} poses along a path have no acceptable solution ({kinds}).",
+            "The energy field allows motion that the branch cannot follow.",
             "Sample more poses with `limber energy --samples`, or choose a gentler goal.")
 
 

@@ -236,8 +236,8 @@ def read_plan(path: Path) -> PlanFile:
     except AttributeError as error:
         raise _not_a_plan(path, str(error)) from error
     if version not in (1, FORMAT):
-        raise InputError(f"{path} is a plan of format {version}.",
-                         f"This program knows formats 1 and {FORMAT}.", "Update Limber.")
+        raise InputError(f"{path} is a plan in format {version}.",
+                         f"This program reads formats 1 and {FORMAT}.", "Update Limber.")
     try:
         ways = {name: _way(content[name]) for name in _WAYS}
         motion = _way(content["motion"]) if version > 1 else None

@@ -41,8 +41,8 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
                     "distance": pair.cost.distance,
                     "energy_scale_j": pair.cost.energy_scale,
                     "length_scale_m": pair.cost.length_scale},
-        "zero_of_energy": "the hanging state: the branch as scanned, the gripper open; an energy "
-        "is the potential of strain and weight, and the gripper's force is its gradient",
+        "zero_of_energy": "the rest state: the branch as scanned, the gripper open; an energy is "
+        "the potential of strain and weight, and the gripper's force is its gradient",
         "baseline": asdict(before) | _checked(field, baseline),
         "plan": asdict(after) | _checked(field, plan),
         **(dict.fromkeys(_CHANGES) if pair.stays else dict(zip(_CHANGES, (
@@ -95,12 +95,12 @@ def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
 def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
     """Return warnings about a plan, with a field that may be off by ``field_error`` [%]."""
     if summary["plan"]["length_m"] <= _STILL:
-        return ["The start lies in the goal already: the path has no length, and there is nothing "
-                "to save."]
+        return ["The start already lies in the goal. The path has no length, and there is no "
+                "energy to save."]
     doubts = [
-        f"Along the {label} path the energy field was off by {error:.2g} % of the full model's "
-        f"energy, over the {most:g} % that may be: sample more poses with `limber energy "
-        "--samples`."
+        f"Along the {label} path the energy field has an error of {error:.2g} % of the full "
+        f"model's energy, which exceeds the limit of {most:g} %. Sample more poses with `limber "
+        "energy --samples`."
         for key, label, most in (("baseline", "shortest", 15.0), ("plan", "gentle", field_error))
         if (error := 100.0 * summary[key]["field_energy_error"]) > most]
     gap = summary["certificate"]["gap_percent"]
@@ -109,13 +109,13 @@ def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath)
             "." if summary["planner"] == "eikonal" else "; `--planner eikonal` comes closest."))
     shortest, gentle = (summary[key]["length_m"] for key in ("baseline", "plan"))
     if shortest > _LONGER * gentle:
-        doubts.append("The path that is called shortest is longer than the gentle one: in a large "
-                      "goal RRT* aims at a few drawn poses. What is saved against it says little; "
-                      "name one goal pose (--goal) to compare paths.")
+        doubts.append("The path called shortest is longer than the gentle one: in a large goal "
+                      "region RRT* aims at only a few random poses. The saving against it means "
+                      "little. Give one goal pose (--goal) to compare paths.")
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
-        doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution and "
-                      "are left out of its measures.")
+        doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution. Its "
+                      "measures exclude them.")
     return doubts
 
 

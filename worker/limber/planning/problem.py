@@ -13,7 +13,7 @@ from limber.planning.goals.goal import Goal
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
 
 
-UNPROVEN = "nor is it proven that none exists"
+UNPROVEN = "but it is not proven that none exists"
 """Of what is said without a path: more samples may show one. Across processes the words tell."""
 
 
@@ -85,18 +85,18 @@ def no_way(problem: GentleProblem, proof: str) -> NoWayError:
     """Return what is said where no path exists, and how that is proven."""
     counted = _in_words(problem, problem.sure_limits)
     if counted:
-        proof += (" The largest error of the energy field on samples left out is counted: none "
-                  f"leads there with{counted} on the field either.")
+        proof += (" The proof includes the largest cross-validation error of the energy field: no "
+                  f"path exists with{counted} on the field either.")
     return NoWayError(
-        "No path exists in the sampled region: with"
-        f"{problem.limits_in_words() or ' poses that the branch accepts'} no "
-        "way leads from the start to the goal.", proof,
+        "No path exists in the sampled region: no path "
+        f"with{problem.limits_in_words() or ' accepted poses'} leads from the start to the "
+        "goal.", proof,
         "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")
 
 
 def not_found(problem: GentleProblem, why: str) -> NoWayError:
     """Return what is said where no path was found, and ``why`` that proves nothing."""
     return NoWayError(
-        f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} "
-        f"was found, {UNPROVEN}.", why,
-        "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
+        f"No path to the goal with{problem.limits_in_words() or ' known poses'} was found, "
+        f"{UNPROVEN}.", why,
+        "Relax the limits slightly, or sample more poses with `limber energy --samples`.")

@@ -15,7 +15,7 @@ from limber.core.errors import BranchFolderError
 from limber.core.files.reading import read_arrays, read_text, require_shapes
 
 _POSITION = ("x_m", "y_m", "z_m")
-_WHAT = "a plan's bound"
+_WHAT = "the bound of a plan"
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,12 @@ def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
             raise _damaged(path, str(error)) from error
         if not np.isfinite(nodes).all() or parents[0] != -1 or (
                 (parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
-            raise _damaged(path, f"the nodes of {planner} are no tree")
+            raise _damaged(path, f"the nodes of {planner} do not form a tree")
         found[planner] = nodes, parents
     return found
 
 
 def _damaged(path: Path, why: str) -> BranchFolderError:
-    return BranchFolderError(f"{path} holds no search trees ({why}).", "The file is damaged.",
+    return BranchFolderError(f"{path} does not contain search trees ({why}).",
+                             "The file is damaged.",
                              "Run `limber plan` again with --force.")

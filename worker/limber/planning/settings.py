@@ -19,7 +19,7 @@ class EnergySettings(Settings):
         "Number of grasp positions to solve. Two thirds are spread evenly; the others are placed "
         "where neighbouring solutions disagree."))
     field_error: float | None = Field(None, gt=0, description=(
-        "Largest error of the energy [%] at samples left out of the fit (root mean square). "
+        "Largest error of the energy [%] at samples excluded from the fit (root mean square). "
         "Poses are added where the error is largest, up to four times --samples."))
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
         "Largest distance from the rest position, as a fraction of the branch's length up to the "
@@ -28,9 +28,9 @@ class EnergySettings(Settings):
         "The branch carries its own weight, as when it was scanned. Otherwise it has no weight."))
     seed: int = Field(0, ge=0, description="Seed of the sampled positions.")
     forward: Literal["full", "reduced"] = Field("full", description=(
-        "full: solve every pose on the full model. reduced: use the model that `limber session "
-        "--mode pinned` learns, and learn it first if there is none. The full model corrects "
-        "each state once and solves doubtful ones."))
+        "full: solve every pose on the full model. reduced: use the reduced model of `limber "
+        "session --mode pinned`, and train it first if there is none. The full model corrects "
+        "each state once and solves uncertain ones."))
 
 
 class PlanSettings(Settings):
@@ -59,13 +59,13 @@ class PlanSettings(Settings):
     target_box: tuple[float, float, float, float, float, float] | None = Field(None, description=(
         "Box that the target must reach: lower corner, upper corner, in the branch's frame [m]."))
     in_view: bool = Field(False, description=(
-        "The target must be visible to the cell's camera: in its picture, within its range, and "
+        "The target must be visible to the cell's camera: inside its image, within its range, and "
         "not hidden by the branch."))
     second_arm: bool = Field(False, description=(
         "The target must be within reach of the cell's second arm."))
     goal_seed: int | None = Field(None, ge=0, description=(
-        "Seed of a random goal in the paper's hemisphere: above the base, no farther than the "
-        "branch is long, among sampled poses that are allowed and far from rest."))
+        "Seed of a random goal in the paper's hemisphere: above the base, within the branch's "
+        "length, among sampled poses that are allowed and far from rest."))
     goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Start position of the grasp [m]. Default: the rest pose."))
@@ -83,15 +83,15 @@ class PlanSettings(Settings):
     max_force: float | None = Field(None, gt=0, description=(
         "Largest force of the gripper at any pose [N]."))
     max_axial_force: float | None = Field(None, gt=0, description=(
-        "Largest component of that force along the branch, pulling or pushing [N]."))
+        "Largest component of that force along the branch, in tension or compression [N]."))
     max_torque: float | None = Field(None, gt=0, description=(
         "Largest torque of the gripper at any pose [Nm]. A gripper that turns with the branch "
         "needs almost none."))
     max_strain: float | None = Field(None, gt=0, lt=1, description=(
         "Largest principal strain anywhere in the branch at any pose (0.01 is 1 %)."))
     wood: Literal["ash", "cherry", "maple", "oak", "walnut"] | None = Field(None, description=(
-        "Limit the strain to half of that at which green wood of this species breaks (0.3 %; "
-        "Wood Handbook FPL-GTR-190). Young shoots bear more; give --max-strain for them."))
+        "Limit the strain to half of the breaking strain of green wood of this species (0.3 %; "
+        "Wood Handbook FPL-GTR-190). Young shoots withstand more; give --max-strain for them."))
     max_stress: float | None = Field(None, gt=0, description=(
         "Largest principal stress anywhere in the branch at any pose [Pa], for the stiff end of "
         "the estimate's intervals."))
@@ -101,14 +101,14 @@ class PlanSettings(Settings):
         "Upper corner of that box [m]."))
     confidence: float | None = Field(None, ge=0.5, lt=1, description=(
         "Probability that the limits hold, given the uncertainty of the estimated Young's "
-        "modulus. Default: they hold for the estimate itself."))
+        "modulus. Default: the limits are checked for the estimate only."))
     speed: float = Field(0.02, gt=0, le=0.25, description="Largest speed of the gripper [m/s].")
     acceleration: float = Field(0.1, gt=0, le=2.0, description=(
         "Largest acceleration of the gripper [m/s^2]. The motion is at rest at both ends of the "
         "path."))
     inertia: bool = Field(True, description=(
-        "Check the limits also in motion, with the branch's inertia, and slow the motion down "
-        "until they hold. Otherwise they hold at every pose at rest."))
+        "Also check the limits in motion, with the branch's inertia, and slow the motion down "
+        "until they hold. Otherwise they are checked at every pose at rest."))
     slowings: int = Field(4, ge=0, le=10, description=(
         "Largest number of times that the motion is slowed down."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
@@ -123,6 +123,7 @@ class PlanSettings(Settings):
         "(root mean square). If it is larger, the states found are added to the field and "
         "planning is repeated."))
     replans: int = Field(3, ge=0, le=10, description=(
-        "Largest number of repeated plans: if the full model breaks a limit, if the field's "
-        "error is too large, or if that error leaves open whether a path exists."))
+        "Largest number of repeated plans. Planning is repeated if the full model breaks a limit, "
+        "if the field's error is too large, or if that error makes it uncertain whether a path "
+        "exists."))
     seed: int = Field(0, ge=0, description="Seed of both planners.")

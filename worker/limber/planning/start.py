@@ -18,7 +18,7 @@ def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarr
     """
     if settings.start is not None and settings.start_seed is not None:
         raise InputError("Both --start and --start-seed are given.",
-                         "A path starts in one place.", "Give one of them.")
+                         "A path has only one start.", "Give only one of them.")
     if settings.start is not None:
         return np.array(settings.start, float)
     if settings.start_seed is not None:
@@ -43,8 +43,9 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
     fit &= goal.distance(field, points) >= half
     fit &= allowed_points(points, Limits.of(settings).on(field))
     if not fit.any():
-        raise NoPathError("No deformed start lies far from rest, far from the goal and allowed.",
-                          f"Far is {half:.3f} m.", "Give a --start, or relax the limits.")
+        raise NoPathError("No allowed deformed start is far from rest and far from the goal.",
+                          f"The distance must be at least {half:.3f} m.",
+                          "Give a --start, or relax the limits.")
     return points[np.flatnonzero(fit)[0]]
 
 
@@ -60,5 +61,5 @@ def check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> N
                          "The branch's energy is not known there.",
                          "Choose a start nearer to rest, or sample farther (`limber energy "
                          "--deflection`).")
-    raise InputError(f"At the start {over_limits(field, start[None], limits)}.",
+    raise InputError(f"The start breaks a limit: {over_limits(field, start[None], limits)}.",
                      "A start must keep the limits.", "Raise the limit, or choose another start.")

@@ -93,8 +93,9 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                               beyond=surely, before=before, progress=progress.part(0.0, 0.5))
             return replace(found, margins=parts[0])
         except NoPathError:
-            progress.warn("No path keeps the limits with margins for the error of the energy "
-                          f"field ({_told(parts[0])}): planned without; the full model decides.")
+            progress.warn("No path keeps the limits with margins for the energy field's error "
+                          f"({_told(parts[0])}). The path is planned without margins. The full "
+                          "model decides whether it is allowed.")
     try:
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
                           before=before, progress=progress.part(0.5, 1.0))
@@ -116,8 +117,9 @@ def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goa
     if UNPROVEN not in none.seen or not any(doubts.values()):
         raise none
     options["progress"].warn(
-        "No path keeps the limits on the energy field, and none is proven away: planned with as "
-        f"much more as its error allows ({_told(doubts)}); the full model decides.")
+        "No path keeps the limits on the energy field, but one may exist. The path is planned "
+        f"with limits extended by the field's error ({_told(doubts)}). The full model decides "
+        "whether it is allowed.")
     try:
         return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
                          **options)
@@ -194,9 +196,9 @@ def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPa
             for number, level in enumerate(certificate.levels)], engine="eikonal"), certificate
     if "D-RRT*" not in trees:
         raise NoPathError(
-            f"D-RRT* found no path in {settings.iterations} iterations, but there is one.",
+            f"D-RRT* found no path in {settings.iterations} iterations, but a path exists.",
             "The eikonal planner found it.",
-            "Allow more --iterations, or leave --planner away.")
+            "Allow more --iterations, or omit --planner.")
     plan = trees["D-RRT*"]
     return plan, replace(certificate, upper=problem.cost(plan.points))
 
@@ -227,12 +229,12 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSetti
     """Return the gentlest path within the length that the settings allow."""
     if settings.planner != "eikonal":
         raise InputError("--max-detour is given with --planner d-rrt-star.",
-                         "A tree keeps no limit on the length of its path.",
-                         "Leave --planner away.")
+                         "D-RRT* cannot limit the length of its path.",
+                         "Omit --planner.")
     if settings.deformation_weight == 0.0:
         raise InputError("--max-detour is given with a --deformation-weight of 0.",
-                         "Without a weight on energy the shortest path is asked for.",
-                         "Leave one of them away.")
+                         "Without a weight on energy the planner seeks the shortest path.",
+                         "Omit one of them.")
     rough = known or [plan_gentle(problem, progress=progress.part(0.0, 0.3)).points]
     paths = [_shortest(problem, path) for path in rough]
     shortest = min((path for path in paths if np.isfinite(path.cost)),

@@ -50,21 +50,21 @@ def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarra
 
 def _told(solved: ResolvedPath, limits: Limits) -> str:
     if not solved.is_whole:
-        return "the branch cannot follow the easiest way on the full model"
+        return "the branch cannot follow the easiest path on the full model"
     values = sizes(solved.solved)
     shares = {name: float(values[name].max()) / limit for name, limit in limits.asked().items()
               if name in values}
     if not shares:
-        return "the easiest way was solved on the full model"
+        return "the easiest path was solved on the full model"
     name = max(shares, key=shares.__getitem__)
     peak = int(values[name].argmax())
     place = ", ".join(f"{x:.3f}" for x in solved.solved.poses[peak, :3])
-    return (f"on the full model the easiest way takes a {name.replace('_', ' ')} of "
+    return (f"on the full model the easiest path needs a {name.replace('_', ' ')} of "
             f"{values[name][peak]:.3g} {UNITS[name]}".rstrip() + f", at ({place}) m")
 
 
 def said_after(none: NoWayError, asked: int, told: str) -> NoWayError:
     """Return the error with what was asked of the full model before it was said."""
     times = "once" if asked == 1 else f"{asked} times"
-    return NoWayError(none.seen, f"{none.why} Poses were added {times} where the field's error "
-                      f"left that in doubt: {told}.", none.fix)
+    return NoWayError(none.seen, f"{none.why} The field's error made this uncertain, so poses "
+                      f"were added {times}: {told}.", none.fix)

@@ -119,8 +119,8 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     coordinates = GraspCoordinates(grasp)
     count = coordinates.count
     if size <= count:
-        raise InputError(f"A reduced model of {size} coordinates.",
-                         f"The grasp alone takes {count}.", "Use 30 to 90.")
+        raise InputError(f"The reduced model has {size} coordinates.",
+                         f"The grasp alone needs {count}.", "Use 30 to 90.")
     metric = gradient_metric(model)
     held = np.array([coordinates.at(pose) for pose in snapshots.poses])
     lifts = elastic_lifts(model, coordinates)
@@ -137,10 +137,10 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     available = int(np.count_nonzero(values > 1e-12 * values[0]))
     wanted = min(size - count - vibration_count, available)
     if wanted <= 0:
-        raise InputError(f"A reduced model of {size} coordinates.",
-                         f"The grasp takes {count} of them, vibrations {vibration_count}; "
-                         f"{len(snapshots)} snapshots hold {available}.",
-                         "Take more training grasps, or a larger model.")
+        raise InputError(f"The reduced model has {size} coordinates.",
+                         f"The grasp needs {count} of them and vibrations need {vibration_count}; "
+                         f"{len(snapshots)} snapshots provide {available}.",
+                         "Use more training grasps, or a larger model.")
     modes = np.tensordot(vectors[:, :wanted] / np.sqrt(values[:wanted]), columns, (0, 0))
     own = heavy[:len(rest)].reshape(len(rest), -1) @ modes.reshape(wanted, -1).T
     vibrations = _let_go(grasp, lifts, snapshots.vibrations.astype(float))

@@ -96,8 +96,8 @@ class ReducedCache:
                     if name.startswith(SNAPSHOT_PREFIX)}
             found = read_model(path), Snapshots.from_arrays(held)
         except (InputError, OSError, ValueError, KeyError, TypeError) as error:
-            self._progress.warn(f"{path.name} in the cache of reduced models was damaged"
-                      f" ({type(error).__name__}); it is removed, and the model learnt again")
+            self._progress.warn(f"{path.name} in the cache of reduced models was damaged "
+                      f"({type(error).__name__}); it is deleted, and the model is trained again")
             with contextlib.suppress(OSError):
                 path.unlink()
             return None
@@ -182,4 +182,4 @@ def learnt_model(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                 cache.store(key, *made)
                 return LearntModel(*made, was_known=False)
         except Timeout:
-            progress(0.0, "another process learns this model; waiting for it")
+            progress(0.0, "another process is training this model; waiting for it")

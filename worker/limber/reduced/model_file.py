@@ -47,7 +47,7 @@ def read_model(path: Path) -> ReducedModel:
     arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
               if not name.startswith("snapshot_")}
     if int(arrays.get("format", -1)) != FORMAT:
-        raise InputError(f"{path} has another format.", "", "Build it again.")
+        raise InputError(f"{path} has a different format.", "", "Build it again.")
     grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
                   "pinned" if str(arrays["grasp_mode"]) == "pinned" else "clamped")
     basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],

@@ -122,8 +122,8 @@ class ReducedModel:
         """
         young = np.asarray(young, float)
         if young.shape != self.control_young.shape or not (young > 0).all():
-            raise InputError(f"Young's moduli {young}.",
-                             f"{len(self.control_young)} positive values are needed.", "")
+            raise InputError(f"The given Young's moduli are {young}.",
+                             f"The model needs {len(self.control_young)} positive values.", "")
         other = copy.copy(self)
         other.young = young
         other.poisson = self.poisson if poisson is None else poisson
@@ -295,9 +295,9 @@ class ReducedModel:
             return f"the pose is {distance:.3g} m from the nearest training grasp"
         factor = np.exp(np.abs(np.log(self.young / self.control_young)).max())
         if factor > 1.05 * self.young_spread:
-            return f"Young's modulus is {factor:.3g} times off what was sampled"
+            return f"Young's modulus differs from the sampled range by a factor of {factor:.3g}"
         if novelty > limit:
-            return f"a coordinate is {novelty:.3g} times its largest in training"
+            return f"a coordinate is {novelty:.3g} times its largest value in training"
         return ""
 
     def _starts(self, pose: np.ndarray, start: ReducedState | None,

@@ -102,10 +102,10 @@ def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance:
     elif estimate.min_det_f <= 0:
         doubt = "an element of the full mesh is inside out there"
     elif estimate.position > position_tolerance:
-        doubt = (f"the full model moves a node by another {100 * estimate.position:.2g} % of the"
-                 " branch's extent")
+        doubt = (f"on the full model a node is {100 * estimate.position:.2g} % of the branch's "
+                 "extent away")
     elif abs(estimate.energy) > energy_tolerance:
-        doubt = f"its energy is {100 * estimate.energy:+.2g} % off the full model's"
+        doubt = f"its energy differs from the full model's by {100 * estimate.energy:+.2g} %"
     else:
         doubt = ""
     return replace(state, trusted=not doubt, doubt=doubt)
@@ -190,7 +190,7 @@ class RefreshingModel:
                  refresh_every: int = 6, reduced: ReducedModel | None = None,
                  snapshots: Snapshots | None = None, progress: Progress = SILENT):
         if (reduced is None) != (snapshots is None):
-            raise InputError("A reduced model without its snapshots.",
+            raise InputError("Only one of the reduced model and its snapshots is given.",
                              "A refresh needs both.", "Give both, or neither.")
         self.model, self.grasp, self.weights = model, grasp, weights
         self.settings = settings or ReducedSettings()

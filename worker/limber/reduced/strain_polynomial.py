@@ -191,8 +191,8 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
         InputError: the material is not St. Venant-Kirchhoff.
     """
     if not model.material.has_cubic_force:
-        raise InputError(f"A reduced model of material {model.material.name}.",
-                         "Only St. Venant-Kirchhoff's force is a cubic polynomial.",
+        raise InputError(f"A reduced model of the material {model.material.name} is requested.",
+                         "Only the force of St. Venant-Kirchhoff is a cubic polynomial.",
                          "Use the full model, or st_venant_kirchhoff.")
     points = _Points(model, weights, control_young)
     if field_count is None:

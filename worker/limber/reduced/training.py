@@ -57,8 +57,9 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         if self.grasp_count < 2 or not 0 < self.reach < 1 or self.young_spread < 1:
             raise InputError(
-                f"{self.grasp_count} grasps, reach {self.reach}, Young spread {self.young_spread}.",
-                "At least 2 grasps, a reach between 0 and 1 and a spread of 1 or more are needed.",
+                f"The training has {self.grasp_count} grasps, reach {self.reach} and Young spread "
+                f"{self.young_spread}.",
+                "It needs at least 2 grasps, a reach between 0 and 1 and a spread of 1 or more.",
                 "Keep the defaults.")
 
 
@@ -259,7 +260,7 @@ class Trainer:
         if not rows:
             raise ConvergenceError(
                 f"None of {len(poses)} training grasps has an equilibrium.",
-                "They may lie out of reach.", "Use a smaller reach, or another grasp point.")
+                "They may be out of reach.", "Use a smaller reach, or another grasp point.")
         return self._snapshots(rows, (vibrations, owners), (swings, swung), len(poses) - len(rows))
 
     def differentiate(self, poses: np.ndarray, young: np.ndarray,

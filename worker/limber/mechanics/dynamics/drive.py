@@ -39,7 +39,7 @@ class Drive:
         self.path: PosePath | None = None
         if poses is not None:
             if not self.grasps or grasp_forces is not None:
-                raise InputError("Poses without a grasp, or together with grasp forces.",
+                raise InputError("Poses are given without a grasp, or together with grasp forces.",
                                  "A grasp follows poses or exerts a force, not both.",
                                  "Omit one of them.")
             self.path = PosePath(self.grasps, model.mesh.nodes, self.times, poses)
@@ -137,9 +137,9 @@ class Drive:
         wanted = (len(self.times), len(self.grasps), 3)
         values = np.asarray(forces, float)
         if not self.grasps or values.size != np.prod(wanted) or not np.isfinite(values).all():
-            raise InputError(f"Grasp forces of shape {values.shape}.",
-                             f"{len(self.times)} times and {len(self.grasps)} grasps need"
-                             f" {wanted}.", "Give three numbers [N] for each.")
+            raise InputError(f"The grasp forces have shape {values.shape}.",
+                             f"{len(self.times)} times and {len(self.grasps)} grasps need shape "
+                             f"{wanted}.", "Give three numbers [N] for each.")
         return values.reshape(wanted)
 
 
@@ -147,6 +147,6 @@ def _checked_times(times: np.ndarray) -> np.ndarray:
     times = np.asarray(times, float)
     if times.ndim != 1 or len(times) < 1 or not np.isfinite(times).all() or (
             np.diff(times) <= 0).any():
-        raise InputError("Times are not ascending.", "Each frame must be later than the last.",
-                         "Sort them and remove what is double.")
+        raise InputError("The times are not ascending.", "Each frame must be later than the last.",
+                         "Sort them and remove duplicates.")
     return times

@@ -76,8 +76,8 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
     tangents = None
     if sensitivities is not None:
         if not isinstance(settings, NewmarkSettings):
-            raise InputError("Derivatives along a motion by the energy-momentum scheme.",
-                             "They are made of Newmark's steps.", "Give NewmarkSettings.")
+            raise InputError("The energy-momentum scheme gives no derivatives along a motion.",
+                             "Only Newmark's scheme has them.", "Give NewmarkSettings.")
         tangents = MotionTangents(drive, settings, sensitivities, sensitivity_nodes)
     run = _Run(drive, settings, tangents)
     run.begin(start)
@@ -112,7 +112,7 @@ class _Run:
                 displacement = np.zeros(shape)
             else:
                 values = start.displacement if isinstance(start, StaticResult) else start
-                displacement = checked_forces(values, shape, "Start displacements").copy()
+                displacement = checked_forces(values, shape, "start displacements").copy()
             self.state = MotionState(first, displacement, np.zeros(shape), np.zeros(shape),
                                      *self._strains(displacement), self.settings.max_step)
             if self.drive.path:
@@ -233,7 +233,8 @@ class _Run:
 
         complete = len(frames) == len(self.drive.times)
         stretch = principal_stretch(self.model, self.state.displacement)
-        message = "" if complete else f"{self.stepper.trouble}; stretched most {stretch.at}"
+        message = "" if complete else (f"{self.stepper.trouble}; the largest stretch is "
+                                       f"{stretch.at}")
         derivatives = None
         if self.tangents:
             change = stacked("reaction_change")

@@ -50,8 +50,9 @@ def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None
         if np.abs(squares[:count] - before).max() <= _TOLERANCE * squares[:count].max():
             return Modes(np.sqrt(squares[:count]) / (2 * np.pi), vectors[:count])
         before = squares[:count]
-    raise ConvergenceError(f"The {count} lowest modes have not settled in {_ITERATIONS} rounds.",
-                           "They may lie very close together.", "Ask for fewer.")
+    raise ConvergenceError(f"The {count} lowest modes did not converge in {_ITERATIONS} "
+                           "iterations.",
+                           "They may lie very close together.", "Request fewer modes.")
 
 
 def subspace_round(model: BranchModel, tangent: Tangent, vectors: np.ndarray,

@@ -29,8 +29,8 @@ class MotionSettings:
 
     def __post_init__(self) -> None:
         if not self.max_step > 0:
-            raise InputError(f"A time step of {self.max_step} s.", "It must be positive.",
-                             "Take a hundredth of the slowest vibration's period, or less.")
+            raise InputError(f"The time step is {self.max_step} s.", "It must be positive.",
+                             "Use a hundredth of the slowest vibration's period, or less.")
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class NewmarkSettings(MotionSettings):
         super().__post_init__()
         if not (0 < self.beta <= 0.5 and 0.5 <= self.gamma <= 1):
             raise InputError(
-                f"Newmark beta {self.beta}, gamma {self.gamma}.",
+                f"Newmark's beta is {self.beta} and gamma is {self.gamma}.",
                 "beta must be in (0, 1/2], gamma in [1/2, 1].",
-                "Keep 1/4 and 1/2 unless high frequencies are to be damped.")
+                "Keep 1/4 and 1/2 unless you want to damp high frequencies.")
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,6 @@ class DynamicResult:
         if not self.converged:
             raise ConvergenceError(
                 f"The motion stopped at {self.last.time:.4g} s: {self.message}",
-                f"{len(self.times)} frames before it are good.",
-                "Move more slowly or less far, or check units and Young's modulus.", result=self)
+                f"The {len(self.times)} frames before it are valid.",
+                "Use a slower or smaller motion, or check units and Young's modulus.", result=self)
         return self

@@ -37,8 +37,8 @@ class PosePath:
         wanted = (len(times), len(grasps), 6)
         poses = np.asarray(poses, float)
         if poses.size != np.prod(wanted) or not np.isfinite(poses).all():
-            raise InputError(f"Poses of shape {poses.shape}, or not finite.",
-                             f"{len(times)} times and {len(grasps)} grasps need {wanted}.",
+            raise InputError(f"The poses have shape {poses.shape} or are not finite.",
+                             f"{len(times)} times and {len(grasps)} grasps need shape {wanted}.",
                              "Give x, y, z [m] and a rotation vector [rad] for each.")
         self.grasps, self._rest = list(grasps), rest
         self.poses = unwrapped(poses.reshape(wanted))

@@ -27,8 +27,9 @@ class PoseTable:
         if self.poses.shape != (len(self.times), 6) or len(self.times) < 2 or not (
                 np.isfinite(self.poses).all() and np.isfinite(self.times).all()
                 and np.all(np.diff(self.times) > 0)):
-            raise InputError(f"A table of {len(self.times)} poses, of shape {self.poses.shape}.",
-                             "A way needs two poses or more, finite, at ascending times.",
+            raise InputError(f"The table has {len(self.times)} times and poses of shape "
+                             f"{self.poses.shape}.",
+                             "A path needs at least two finite poses at ascending times.",
                              "Give t_s, x_m, y_m, z_m, rx_rad, ry_rad, rz_rad in each row.")
 
     @property

@@ -148,6 +148,6 @@ def _check_orientation(mesh: TetMesh, determinant: np.ndarray) -> None:
     if len(bad):
         place = ", ".join(f"{x:.4g}" for x in mesh.centroids[bad[0]])
         raise InputError(
-            f"{len(bad)} tetrahedra are inverted or have no volume, first number {bad[0]} at"
-            f" ({place}) m.", "Their stiffness is not defined.",
+            f"{len(bad)} tetrahedra are inverted or have no volume; the first is number {bad[0]} "
+            f"at ({place}) m.", "Their stiffness is not defined.",
             "Orient the mesh (TetMesh.oriented) or mesh the surface again.")

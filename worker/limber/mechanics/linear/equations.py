@@ -90,7 +90,7 @@ class Tangent:
         # Not before they are asked for: many a tangent only says whether a state is stable.
         factor = self._factor
         if not isinstance(factor, SupernodalFactor):
-            raise TypeError(f"{type(factor).__name__} has no first half of a solve.")
+            raise TypeError(f"{type(factor).__name__} cannot solve in two halves.")
         return factor.down(self.equations.pin_rows)
 
     @cached_property

@@ -39,7 +39,7 @@ class WindRecord:
         Raises:
             InputError: it cannot be read, is too short, or does not blow forward on average.
         """
-        columns = read_columns(path, ("time_s", "speed_m_s"), "a record of the wind")
+        columns = read_columns(path, ("time_s", "speed_m_s"), "a wind record")
         return cls.checked(columns["time_s"], columns["speed_m_s"], str(path))
 
     @classmethod
@@ -53,12 +53,13 @@ class WindRecord:
                 np.diff(times) > 0).all() or not speeds.mean() > 0 or (
                 not np.abs(speeds).max() < FASTEST):
             raise InputError(
-                f"{what} is no record of a wind.", f"It has at least {LEAST_RECORD} rows, "
-                f"ascending times, and a wind under {FASTEST:g} m/s that blows along --wind on "
-                "average.", "Give another one.")
+                f"{what} is not a wind record.", f"A wind record has at least {LEAST_RECORD} "
+                f"rows, ascending times, and a wind below {FASTEST:g} m/s that blows along --wind "
+                "on average.", "Give another record.")
         if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
-            raise InputError(f"{what} has gaps that are far longer than its steps.",
-                             "It is taken in even steps.", "Give a part of it without gaps.")
+            raise InputError(f"{what} has gaps that are much longer than its time steps.",
+                             "The record must have even time steps.",
+                             "Give a part of the record without gaps.")
         return cls(times, speeds)
 
     def even_wind(self, direction: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -72,8 +73,8 @@ class WindRecord:
         """
         push = float((self.speeds * np.abs(self.speeds)).mean())
         if not push > 0:
-            raise InputError("The recorded wind pushes against --wind on average.", "",
-                             "Turn --wind round.")
+            raise InputError("On average the recorded wind blows against --wind.", "",
+                             "Reverse --wind.")
         x, y, z = map(float, np.sqrt(push) * np.array(direction) / np.linalg.norm(direction))
         return x, y, z
 
@@ -104,7 +105,8 @@ def blown(direction: tuple[float, float, float], gusts: Gusts | None,
         InputError: gusts without a wind, or a record against it.
     """
     if gusts is not None and not np.any(direction):
-        raise InputError("Gusts without wind.", "They are of a wind that has a direction.",
+        raise InputError("Gusts are given without a wind.",
+                         "Gusts need a wind with a direction.",
                          "Give --wind X Y Z.")
     return gusts.even_wind(direction) if isinstance(gusts, WindRecord) else direction
 

@@ -36,9 +36,10 @@ def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
     """
     found = outdoors.rest()
     if not found.converged:
-        raise WorkError(f"The branch finds no rest under these loads ({found.message}).",
-                        f"It followed {100 * found.reached:.0f} % of them.",
-                        "They may be more than it can carry: see --limit-load with smaller ones.")
+        raise WorkError(f"The branch has no equilibrium under these loads ({found.message}).",
+                        f"It could carry {100 * found.reached:.0f} % of them.",
+                        "The loads may exceed what it can carry. Use --limit-load with smaller "
+                        "loads.")
     return found
 
 
@@ -75,7 +76,7 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
         return {"sag_m": float(bent.displacement[tip] @ down),
                 "greatest_strain": float(bent.strains.max()),
                 "first_frequency_hz": float(bent.frequencies[0])}
-    progress(0.0, "rest under the loads")
+    progress(0.0, "equilibrium under the loads")
     bent = outdoors.bent(required_rest(outdoors))
     own = told(bent)
     result: dict[str, Any] = _NOT_KNOWN | {

@@ -123,8 +123,8 @@ def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
     if is_stable(loaded):
         return LoadedBranch(loaded, targets)
     progress.warn(
-        "The branch is too soft to carry its own weight in the scanned shape: its weight is left "
-        "out. Check Young's modulus, density and gravity.")
+        "The branch is too soft to carry its own weight in the scanned shape. Its weight is "
+        "neglected. Check Young's modulus, density and gravity.")
     return LoadedBranch(model.with_parameters(gravity=(0.0, 0.0, 0.0)), targets)
 
 

@@ -19,7 +19,7 @@ class StVenantKirchhoff(MaterialLaw):
 
     name = "st_venant_kirchhoff"
     is_compiled = is_hookean = has_cubic_force = True
-    softening = ("where St. Venant-Kirchhoff goes soft: stable_neo_hookean bears more")
+    softening = "where St. Venant-Kirchhoff softens: stable_neo_hookean withstands more"
 
     def energy(self, strain: np.ndarray, lame_lambda: np.ndarray,
                lame_mu: np.ndarray) -> np.ndarray:

@@ -178,29 +178,31 @@ def check_law(law: MaterialLaw) -> None:
     other = lam[::-1]
     energy = law.energy(strain, lam, mu)
     if np.shape(energy) != (8,) or not np.isfinite(energy).all():
-        raise _wrong(law, f"gives an energy of shape {np.shape(energy)}, or not finite, for"
-                     " strains of shape (8, 6)", "Return one finite number a strain.")
+        raise _wrong(law, f"gives an energy of shape {np.shape(energy)}, or one that is not "
+                     "finite, for strains of shape (8, 6)",
+                     "Return one finite number for each strain.")
     rest = np.zeros((8, 6))
     if np.abs(law.stress(rest, lam, mu)).max() > 1e-9 or np.abs(
             law.energy(rest, lam, mu)).max() > 1e-9:
-        raise _wrong(law, "has energy or stress without strain",
-                     "Add the terms that make both 0 there.")
+        raise _wrong(law, "has energy or stress at zero strain",
+                     "Add terms that make both 0 there.")
     if not np.allclose(law.stress(strain, lam, mu), _slopes(law, strain, lam, mu), atol=1e-7):
         raise _wrong(law, "gives a stress that is not the derivative of its energy",
-                     "Use no abs, conjugate or comparison of the strain in the energy, or give the"
-                     " stress; the derivative to a shear strain counts half.")
+                     "Do not use abs, conjugate or comparisons of the strain in the energy, or "
+                     "give the stress. The derivative with respect to a shear strain counts half.")
     change = MaterialLaw.stress_change(law, strain, strain, lam, mu)
     by_moduli = np.einsum("nkl,nl->nk", law.moduli(strain, lam, mu), strain * MULTIPLICITY)
     if not (np.allclose(by_moduli, change, rtol=1e-5, atol=1e-8) and np.allclose(
             law.stress_change(strain, strain, lam, mu), change, rtol=1e-5, atol=1e-8)):
         raise _wrong(law, "gives moduli that are not the derivative of its stress",
-                     "Their columns are derivatives to the shear angles, twice the shear strains.")
+                     "Their columns are derivatives with respect to the shear angles, which are "
+                     "twice the shear strains.")
     if not np.allclose(law.energy(strain, lam + 2 * other, mu + 2 * mu),
                        energy + 2 * law.energy(strain, other, mu), rtol=1e-9, atol=1e-15):
         raise _wrong(law, "is not linear in both Lamé coefficients",
-                     "Give its own constants as ratios to them.")
+                     "Express its own constants as ratios to them.")
     if np.linalg.eigvalsh(law.moduli(rest, lam, mu)).min() <= 0:
-        raise _wrong(law, "is not stable without strain", "Its moduli must be positive there.")
+        raise _wrong(law, "is not stable at zero strain", "Its moduli must be positive there.")
 
 
 def _tried() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -218,4 +220,4 @@ def _slopes(law: MaterialLaw, strain: np.ndarray, lam: np.ndarray, mu: np.ndarra
 
 def _wrong(law: MaterialLaw, what: str, remedy: str) -> InputError:
     return InputError(f"The material {law.name!r} {what}.",
-                      "Solvers would find other states than those of least energy.", remedy)
+                      "Solvers would not find the states of least energy.", remedy)

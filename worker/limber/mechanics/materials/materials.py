@@ -24,8 +24,8 @@ class RayleighDamping:
 
     def __post_init__(self) -> None:
         if not (self.mass >= 0 and self.stiffness >= 0):
-            raise InputError(f"Damping {self.mass}, {self.stiffness} is negative.",
-                             "It would feed energy into the motion.", "Use 0 or more.")
+            raise InputError(f"The damping {self.mass}, {self.stiffness} is negative.",
+                             "Negative damping would add energy to the motion.", "Use 0 or more.")
 
 
 @overload
@@ -55,7 +55,7 @@ def per_tet(name: str, value: float | np.ndarray, tet_count: int) -> np.ndarray:
     array = np.asarray(value, float)
     if array.ndim > 1 or (array.ndim == 1 and len(array) != tet_count):
         raise InputError(f"{name} has shape {array.shape}; the mesh has {tet_count} tetrahedra.",
-                         "One number, or one for each tetrahedron, is needed.",
+                         "Limber needs one number, or one for each tetrahedron.",
                          "Map control points to tetrahedra with young_weights.")
     if not np.isfinite(array).all():
         raise InputError(f"{name} is not finite everywhere.", "A value is missing.", "Give it.")
@@ -74,6 +74,6 @@ def check_poisson(poisson: np.ndarray) -> None:
     worst = poisson[np.argmax(np.abs(poisson))]
     if poisson.min() <= -1 or poisson.max() > MAX_POISSON:
         raise InputError(f"Poisson's ratio is {worst:g}.",
-                         f"It must lie above -1 and not above {MAX_POISSON}: at 0.5 the material"
-                         " is incompressible and these elements lock.",
+                         f"It must be above -1 and at most {MAX_POISSON}: at 0.5 the material is "
+                         "incompressible and these elements lock.",
                          "Wood has 0.3 to 0.45.")

@@ -32,12 +32,13 @@ def register_material(law: "MaterialLaw") -> "MaterialLaw":
 
     name = getattr(law, "name", "")
     if not re.fullmatch(r"[a-z]\w*", name) or name in BUILT_IN:
-        raise InputError(f"A material cannot be called {name!r}.",
-                         "A name is of small letters, digits and _, and not a built-in one's.",
+        raise InputError(f"{name!r} is not a valid material name.",
+                         "A name has only lower-case letters, digits and _, and differs from the "
+                         "built-in names.",
                          "Choose another.")
     if law.is_compiled or law.is_linear or law.is_hookean or law.has_cubic_force or law.kernel:
-        raise InputError(f"The material {name!r} takes itself for a built-in one.",
-                         "The kernels do not know it.", "Leave those attributes as they are.")
+        raise InputError(f"The material {name!r} declares itself built-in.",
+                         "The kernels do not implement it.", "Do not change those attributes.")
     check_law(law)
     _registered[name] = law
     return law
@@ -66,9 +67,9 @@ def material_named(name: "str | MaterialLaw") -> "MaterialLaw":
         found = entry.load()
         law = found() if isinstance(found, type) else found
         if law.name != name:
-            raise InputError(f"{entry.value} is called {law.name!r}, not {name!r}.",
-                             "Its entry point has another name.", "Give both the same name.")
+            raise InputError(f"{entry.value} has the name {law.name!r}, not {name!r}.",
+                             "Its entry point has a different name.", "Give both the same name.")
         return register_material(law)
-    raise InputError(f"There is no material {name!r}.", "It must be one of those known: "
+    raise InputError(f"There is no material {name!r}.", "The known materials are: "
                      + ", ".join(material_names()) + ".",
                      "Choose one, or register it (limber.mechanics.register_material).")

@@ -24,7 +24,7 @@ def young_weights(mesh: TetMesh, control_points: np.ndarray, power: float = 2) -
     """
     points = np.asarray(control_points, float)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
-        raise InputError(f"Control points of shape {points.shape}.",
+        raise InputError(f"The control points have shape {points.shape}.",
                          "At least one finite position is needed.", "Give an array [K, 3].")
     distance = np.linalg.norm(mesh.centroids[:, None] - points[None], axis=2)
     # Relative to the nearest, so that no power overflows; a centroid on a point takes it alone.

@@ -89,7 +89,7 @@ class Path:
         while self.reached < 1.0:
             progress(self.reached, "seeking equilibrium", iteration=self.iterations)
             if self.iterations > self.settings.total_iterations:
-                self.trouble = f"no end after {self.iterations} iterations"
+                self.trouble = f"not finished after {self.iterations} iterations"
                 return self._result()
             part = min(1.0, self.reached + step)
             before = self.iterations
@@ -286,7 +286,7 @@ class Path:
             self.status, self.trouble = Status.unstable, "the equilibrium found is not stable"
             return None
         if not steady and self._lost(trial, state, part) > _LOST:
-            self.trouble = "it would jump to another equilibrium"
+            self.trouble = "the branch would jump to another equilibrium"
             return None
         if (stretch := principal_stretch(self.model, trial)).value > self.settings.stretch_limit:
             self.status = Status.torn
@@ -318,8 +318,8 @@ class Path:
     def _result(self) -> StaticResult:
         stretch = principal_stretch(self.model, self.displacement)
         message = "" if self.status is Status.converged else (
-            f"{self.trouble}; stopped at {100 * self.reached:.1f} % of the way, where the branch"
-            f" is stretched most {stretch.at} ({100 * (stretch.value - 1):.1f} %)"
+            f"{self.trouble}; stopped at {100 * self.reached:.1f} % of the path, where the "
+            f"largest stretch of the branch is {stretch.at} ({100 * (stretch.value - 1):.1f} %)"
             + self._softening())
         warnings = strain_warnings(stretch) + buckling_warnings(self.snaps)
         load = self.load_at(self.reached)
@@ -342,5 +342,5 @@ def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:
     where = [f"{100 * part:.0f} %" for part, buckled in snaps if buckled]
     if not where:
         return []
-    return [f"A straight part buckled at {where[0]} of the way: to which side is chance, another"
-            " equilibrium of about the same energy exists."]
+    return [f"A straight part buckled at {where[0]} of the path. The side is arbitrary: another "
+            "equilibrium with about the same energy exists."]

@@ -40,8 +40,8 @@ class StaticProblem:
                        else list(grasp))
         self.single = isinstance(grasp, Grasp)
         if is_held and not self.grasps:
-            raise InputError("A pose was given without a grasp.", "Nothing would follow it.",
-                             "Give the grasp too.")
+            raise InputError("A pose is given without a grasp.", "No node would follow it.",
+                             "Also give the grasp.")
         self.is_held = is_held
         self.equations: Equations = model.equations(self.grasps if is_held else ())
         self.mixed = settings.mixed and model.material.has_cubic_force
@@ -49,8 +49,8 @@ class StaticProblem:
     def poses(self, pose: np.ndarray) -> list[np.ndarray]:
         poses = np.asarray(pose, float).reshape(-1, 6) if np.size(pose) % 6 == 0 else [pose]
         if len(poses) != len(self.grasps):
-            raise InputError(f"{len(poses)} poses for {len(self.grasps)} grasps.",
-                             "Each grasp needs one.", "Give an array [grasps, 6].")
+            raise InputError(f"{len(poses)} poses are given for {len(self.grasps)} grasps.",
+                             "Each grasp needs one pose.", "Give an array [grasps, 6].")
         return [check_pose(item) for item in poses]
 
     def target(self, pose: np.ndarray | None, grasp_force: np.ndarray | None,
@@ -80,9 +80,10 @@ class StaticProblem:
         """Return nodal forces of forces [N] at the grasps, spread over the patches."""
         forces = np.asarray(grasp_force, float).reshape(-1, 3)
         if self.is_held or len(forces) != len(self.grasps) or not np.isfinite(forces).all():
-            raise InputError(f"{len(forces)} grasp forces for {len(self.grasps)} grasps.",
-                             "A grasp has a pose or a force, and a force for each.",
-                             "Give an array [grasps, 3] [N] and no pose.")
+            raise InputError(f"{len(forces)} grasp forces are given for "
+                             f"{len(self.grasps)} grasps.",
+                             "Each grasp needs a force, and a grasp with a force has no pose.",
+                             "Give an array [grasps, 3] [N] and omit the poses.")
         load = np.zeros((self.model.mesh.node_count, 3))
         for grasp, force in zip(self.grasps, forces, strict=True):
             load[grasp.nodes] += grasp.weights[:, None] * force
@@ -92,15 +93,15 @@ class StaticProblem:
         if start is None:
             return np.zeros((self.model.mesh.node_count, 3))
         values = start.displacement if isinstance(start, StaticResult) else start
-        return checked_forces(values, (self.model.mesh.node_count, 3), "Start displacements")
+        return checked_forces(values, (self.model.mesh.node_count, 3), "start displacements")
 
 
 def strain_warnings(stretch: Place) -> list[str]:
     """Return a warning if the largest stretch is beyond what wood does, else nothing."""
     if stretch.value <= 1.5:
         return []
-    return [f"Strain reaches {100 * (stretch.value - 1):.0f} % {stretch.at}: far beyond wood."
-            " Check the units of loads and of Young's modulus."]
+    return [f"The strain reaches {100 * (stretch.value - 1):.0f} % {stretch.at}, far more than "
+            "wood withstands. Check the units of the loads and of Young's modulus."]
 
 
 class HowFound(TypedDict, total=False):
@@ -167,7 +168,7 @@ def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, ou
 
 
 def checked_forces(values: np.ndarray, shape: tuple[int, ...],
-                   name: str = "Nodal forces") -> np.ndarray:
+                   name: str = "nodal forces") -> np.ndarray:
     """Return a nodal field as floats.
 
     Raises:
@@ -175,6 +176,6 @@ def checked_forces(values: np.ndarray, shape: tuple[int, ...],
     """
     values = np.asarray(values, float)
     if values.shape != shape or not np.isfinite(values).all():
-        raise InputError(f"{name} have shape {values.shape} or are not finite.",
+        raise InputError(f"The {name} have shape {values.shape} or are not finite.",
                          f"The mesh needs {shape}.", "Give three numbers for each node.")
     return values

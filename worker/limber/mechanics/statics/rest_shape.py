@@ -67,14 +67,15 @@ class _Search:
     def unloaded(self, rest: np.ndarray) -> np.ndarray:
         """Return rest positions in balance with the scan, taking the load on bit by bit."""
         for number in range(_MAX_UNLOADING):
-            self.progress(min(0.7, number / 40), "seeking the rest shape", step=number)
+            self.progress(min(0.7, number / 40), "finding the rest shape", step=number)
             step = self._step(rest, self.scan)
             turn = float(np.abs(_gradients(self.model, step)).max())
             rest = rest + min(1.0, _LARGEST_TURN / max(turn, 1e-30)) * step
             if turn <= _BALANCED:
                 return rest
         raise ConvergenceError(
-            f"No rest shape: after {_MAX_UNLOADING} steps the scan is not in balance.",
+            f"No rest shape was found: the scan is not in equilibrium after {_MAX_UNLOADING} "
+            "steps.",
             "The branch is too soft to carry itself in the scanned shape.",
             "Check Young's modulus, density and gravity.")
 
@@ -87,10 +88,10 @@ class _Search:
             reached = rest + found.displacement
             miss = reached - self.scan
             misses.append(float(np.linalg.norm(miss[self.corners], axis=1).max()))
-            self.progress(min(0.99, 0.7 + 0.03 * number), "seeking the rest shape",
+            self.progress(min(0.99, 0.7 + 0.03 * number), "finding the rest shape",
                           miss=misses[-1])
             if misses[-1] <= tolerance:
-                self.progress(1.0, "seeking the rest shape", miss=misses[-1])
+                self.progress(1.0, "finding the rest shape", miss=misses[-1])
                 return rest
             if len(misses) > 5 and misses[-1] > 0.95 * misses[-4]:
                 break
@@ -98,8 +99,8 @@ class _Search:
             target = reached - _straight(self.model.mesh, miss)
             rest = rest + self._step(rest, target)
         raise ConvergenceError(
-            "No rest shape: the loaded candidate still misses the scan by"
-            f" {1000 * misses[-1]:.2f} mm.",
+            f"No rest shape was found: the loaded candidate is still {1000 * misses[-1]:.2f} mm "
+            "away from the scan.",
             "The branch may be too soft to carry itself in this shape.",
             "Check Young's modulus, density and gravity.")
 
@@ -133,8 +134,8 @@ class _Search:
     def _check_stable(self, candidate: BranchModel, displacement: np.ndarray) -> None:
         if not candidate.equations().tangent(candidate, displacement).is_positive_definite:
             raise ConvergenceError(
-                "No rest shape: a shape is in balance with the scan under its load, but not stably"
-                " so: it would fall or roll over.",
+                "No rest shape was found: the equilibrium in the scanned shape is not stable. The "
+                "branch would fall or roll over.",
                 "The branch is too soft to stay in the scanned shape.",
                 "Check Young's modulus, density and gravity.")
 
@@ -142,11 +143,12 @@ class _Search:
         try:
             return self.model.with_rest_nodes(rest)
         except InputError as error:
-            raise _too_soft(f"On the way to it elements turn inside out. {error.seen}") from error
+            raise _too_soft("Elements turn inside out on the path to the rest shape. "
+                            f"{error.seen}") from error
 
 
 def _too_soft(why: str) -> ConvergenceError:
-    return ConvergenceError(f"No rest shape. {why}",
+    return ConvergenceError(f"No rest shape was found. {why}",
                             "The branch is too soft to carry itself in the scanned shape.",
                             "Check Young's modulus, density and gravity.")
 

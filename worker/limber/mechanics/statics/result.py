@@ -105,7 +105,7 @@ class StaticResult:
         if not self.converged:
             raise ConvergenceError(
                 f"No equilibrium: {self.message}",
-                f"The last good state is at {100 * self.reached:.0f} % of the way.",
-                "Ask for a smaller motion or load, or check units and Young's modulus.",
+                f"The last valid state is at {100 * self.reached:.0f} % of the path.",
+                "Use a smaller motion or load, or check units and Young's modulus.",
                 result=self)
         return self

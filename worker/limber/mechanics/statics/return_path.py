@@ -23,7 +23,7 @@ def doubt_of(path: Path, result: StaticResult) -> str:
     """
     if not path.snaps:
         return ""
-    where = f"the branch snapped at {100 * path.snaps[0][0]:.0f} % of the way"
+    where = f"the branch snapped through at {100 * path.snaps[0][0]:.0f} % of the path"
     begin, grasps = path.begin, path.problem.grasps
     pose = None if path.pose is None else np.array(
         [grasp.pose_of(path.model.mesh.nodes, begin) for grasp in grasps])
@@ -31,9 +31,9 @@ def doubt_of(path: Path, result: StaticResult) -> str:
                   path.goal.load - path.imbalance)
     back = Path(path.problem, result.displacement, goal, pose).run(SILENT)
     if not back.converged:
-        return f"{where}, and no way back was found ({back.message})"
+        return f"{where}, and no return path was found ({back.message})"
     away = float(np.linalg.norm(back.displacement - begin, axis=1).max())
     if away <= _SAME * path.model.extent:
         return ""
-    return (f"{where}, and led back it ends {1e3 * away:.0f} mm from where it began: another stable"
-            " state of the same hold exists")
+    return (f"{where}, and on the return path it ends {1e3 * away:.0f} mm from its start: another "
+            "stable state exists for the same grasp")

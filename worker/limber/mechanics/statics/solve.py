@@ -105,6 +105,6 @@ def _verified(problem: StaticProblem, result: StaticResult, goal: Target, pose: 
     if again.converged and lower > 1e-3 * abs(again.energy):
         return replace(
             result, status=Status.false_equilibrium,
-            message=f"energy {result.energy:.6g} J, but {again.energy:.6g} J on the"
-                    " way from rest: a false equilibrium")
+            message=f"the energy is {result.energy:.6g} J, but {again.energy:.6g} J on the path "
+                    "from rest: a false equilibrium")
     return result

@@ -209,8 +209,8 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     goal = about_goal(problem, grid, ground)
     if not goal.meets:
         if problem.goal.doubt(problem.energy_field) > 0.0:
-            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm it is out of reach "
-                            "by less than the energy field may be wrong by.")
+            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
+                            "of reach, but by less than the error of the energy field.")
         raise _separated(problem, grid, open_cells)
     to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
@@ -265,6 +265,6 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: 
 
 def _separated(problem: GentleProblem, grid: Grid, open_cells: np.ndarray) -> NoWayError:
     share = 100.0 * open_cells.mean()
-    return no_way(problem, f"Proven on a grid of {1e3 * grid.spacing:.1f} mm: cells where motion "
-                  f"is surely not allowed separate the two ({share:.0f} % of the region's box is "
+    return no_way(problem, f"This is proven on a grid of {1e3 * grid.spacing:.1f} mm: forbidden "
+                  f"cells separate the start from the goal ({share:.0f} % of the region's box is "
                   "open).")

@@ -58,8 +58,9 @@ class Risk:
 
     def told(self) -> list[str]:
         """Return in words which limits are not kept with the confidence."""
-        return [f"with the confidence asked for, {name.replace('_', ' ')} may be {100 * share:.0f} "
-                "% of what is allowed" for name, share in self.excess.items() if share > 1.0]
+        return [f"at the requested confidence, {name.replace('_', ' ')} may reach "
+                f"{100 * share:.0f} % of its limit"
+                for name, share in self.excess.items() if share > 1.0]
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ class YoungDoubt:
             try:
                 found = [chosen]
                 for place in places[1:]:
-                    progress(len(found) / len(places), "limits under other moduli")
+                    progress(len(found) / len(places), "limits with other moduli")
                     found.append(self.solved(grasp_model, axes @ place, chosen))
                 break
             except ConvergenceError:
@@ -225,8 +226,8 @@ class YoungDoubt:
                 raise ConvergenceError(
                     f"With another Young's modulus the branch has no acceptable solution "
                     f"({reason}) at ({place}) m.",
-                    "Then it cannot be told whether the limits are kept.",
-                    "Choose a gentler goal, or leave --confidence away.")
+                    "It is therefore unknown whether the limits hold.",
+                    "Choose a gentler goal, or omit --confidence.")
             results.append(result)
         return SolvedPoses.of(other, results)
 

@@ -29,7 +29,7 @@ class Broken:
 
     def __str__(self) -> str:
         place = ", ".join(f"{x:.3f}" for x in self.position)
-        return f"{self.name} {self.value:.4g} where {self.limit:.4g} is allowed, at ({place}) m"
+        return f"{self.name} {self.value:.4g} exceeds the limit {self.limit:.4g} at ({place}) m"
 
 
 class Constraint(Protocol):

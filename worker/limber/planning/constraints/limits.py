@@ -66,8 +66,8 @@ class Limits:
                        low=self.low if low is None else np.maximum(self.low, low),
                        high=self.high if high is None else np.minimum(self.high, high))
         if not (both.low < both.high).all():
-            raise InputError("The workspace and that of the cell have nothing in common.",
-                             f"Together they go from {both.low} to {both.high} m.",
+            raise InputError("The given workspace and the cell's workspace do not overlap.",
+                             f"Their intersection from {both.low} to {both.high} m is empty.",
                              "Correct --workspace-low and --workspace-high, or the cell file.")
         return both
 
@@ -93,8 +93,9 @@ class Limits:
         strain = settings.max_strain or np.inf
         if settings.wood is not None:
             if settings.max_strain is not None:
-                raise InputError("--max-strain and --wood are given.", "Both limit the strain.",
-                                 "Give one of them.")
+                raise InputError("Both --max-strain and --wood are given.",
+                                 "Both limit the strain.",
+                                 "Give only one of them.")
             strain = strain_limit(settings.wood)
         low = np.array(settings.workspace_low or [-np.inf] * 3, float)
         high = np.array(settings.workspace_high or [np.inf] * 3, float)
@@ -134,8 +135,8 @@ class Limits:
         found = dict.fromkeys(UNITS, 0.0)
         for name, limit in self.asked().items():
             if values.get(name) is None:
-                raise InputError(f"The energy field knows no {name.replace('_', ' ')}.",
-                                 "It was sampled by an older program.",
+                raise InputError(f"The energy field contains no {name.replace('_', ' ')}.",
+                                 "An older version of Limber sampled it.",
                                  "Run `limber energy` again with --force.")
             size = np.abs(values[name])
             near = inner & (size > _NEAR[0] * limit) & (size < _NEAR[1] * limit)

@@ -121,7 +121,8 @@ def _moved(grasp_model: GraspModel, poses: np.ndarray, start: np.ndarray, pace: 
         places[:len(found.displacement)], grasp_model.mesh.nodes + found.displacement)]
     if not found.converged:
         where = ", ".join(f"{x:.3f}" for x in places[len(found.times) - 1])
-        broken.append(f"in motion the branch does not come along ({found.message}) at ({where}) m")
+        broken.append(f"in motion the branch cannot follow the gripper ({found.message}) at "
+                      f"({where}) m")
     return _Moved({name: float(size.max()) for name, size in values.items()}, broken,
                   found.converged, found.step_count)
 

@@ -53,7 +53,7 @@ LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
 """What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
 gripper's force along the branch [N], outward positive, and its torque [Nm]; how close the branch is
 to an obstacle, 1 where it touches one. A plan's constraints may add more."""
-_WHAT = "an energy field (`limber energy --force` makes one)"
+_WHAT = "an energy field (`limber energy --force` creates one)"
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
 _OPTIONAL_SHAPES = {
@@ -320,7 +320,7 @@ class EnergyField:
             for name, values in arrays.items():
                 if "_fit_" in name and values.dtype.kind == "f" and (
                         np.abs(values) > _LARGEST).any():
-                    raise ValueError(f"{name} has a number beyond {_LARGEST:g}")
+                    raise ValueError(f"{name} contains a number above {_LARGEST:g}")
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
@@ -364,7 +364,7 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     if len(samples.poses) < needed:
         raise WorkError(f"Only {len(samples.poses)} grasp poses were accepted.",
                         f"A field in three coordinates needs at least {needed}.",
-                        "Sample more poses, or a smaller deflection.")
+                        "Sample more poses, or use a smaller deflection.")
     charts = CHARTS_TRIED if base is not None else CHARTS_TRIED[:1]
     if radius is None:
         radius = 0.0 if base is None else float(np.linalg.norm(samples.positions[0] - base))
@@ -415,7 +415,7 @@ def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
         whole = np.full((len(samples.poses), columns), np.nan)
         known = arrays.get(name, np.empty((len(whole), 0)))
         if known.ndim != 2 or len(known) != len(whole) or known.shape[1] > columns:
-            raise ValueError(f"{name} does not fit the poses")
+            raise ValueError(f"{name} does not match the poses")
         whole[:, :known.shape[1]] = known
         found.append(whole)
     return found[0], found[1]
@@ -496,8 +496,8 @@ def left_out_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face
         [N], shape [m, 4].
     """
     if not (~face).any():
-        raise WorkError(f"{len(samples.poses)} grasp poses are too few to leave any out.",
-                        "Then the error of the energy field cannot be told.",
+        raise WorkError(f"{len(samples.poses)} grasp poses are too few for cross-validation.",
+                        "The error of the energy field cannot be measured.",
                         "Sample more poses.")
     places = chart.map(samples.positions)
     missed = RadialInterpolant.leave_one_out(

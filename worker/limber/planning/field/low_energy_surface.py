@@ -59,7 +59,7 @@ def walk_valley(crew: Crew, count: int, *, deflection: float, seed: int = 0,
     # In turn: the farther from rest, the longer it takes.
     shares = max(2, -(-len(across) // _SHARE_DIRECTIONS))
     found = crew.run(_walk, [(across[k::shares], force) for k in range(shares)],
-                     progress=progress, message="how the grasp moves by itself")
+                     progress=progress, message="finding the low-energy surface")
     pairs = [found[k % shares][k // shares] for k in range(len(across))]
     slack = [pair[0] for pair in pairs[1:] if pair[0] is not None]
     places = np.array([grasp_model.rest_position, *(state.pose[:3] for state in slack)])
@@ -72,7 +72,7 @@ def _walk(grasp_model: GraspModel, across: np.ndarray, outward: float,
     """Return the states under each force [n, 3], and drawn ``outward`` [N] besides."""
     pairs = []
     for number, force in enumerate(across):
-        progress(number / len(across), "how the grasp moves by itself")
+        progress(number / len(across), "finding the low-energy surface")
         slack = _under(grasp_model, force, grasp_model.rest) if force.any() else grasp_model.rest
         if slack is None:
             pairs.append((None, None))

@@ -163,11 +163,11 @@ class RadialInterpolant:
         found = cls(**plain, powers=powers, **{
             name: np.ascontiguousarray(value, float) for name, value in part.items()})
         if found.kernel not in KERNELS or not (found.scale > 0 and found.shape > 0):
-            raise ValueError(f"no kernel {found.kernel} of shape {found.shape}")
+            raise ValueError(f"unknown kernel {found.kernel} of shape {found.shape}")
         if len(found.gradient_weights) not in (0, len(found.centres)) or not (
                 (powers >= 0) & (powers <= 8)).all() or len(found.value_weights) != len(
                 found.centres):
-            raise ValueError("weights that do not fit their samples")
+            raise ValueError("weights that do not match their samples")
         return found
 
 
@@ -208,7 +208,7 @@ def _solve(centres: np.ndarray, right: np.ndarray, powers: np.ndarray, kernel: s
         raise WorkError(
             f"The {kernel} interpolation of {len(centres)} samples has no unique solution.",
             f"It needs at least {terms} samples that do not coincide or lie in one plane.",
-            "Sample more grasp poses, or a larger deflection.")
+            "Sample more grasp poses, or use a larger deflection.")
     return weights
 
 

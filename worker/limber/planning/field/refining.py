@@ -30,7 +30,8 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
     begun = len(field.samples.poses)
     while field.errors["energy_error"] > asked and len(field.samples.poses) < most:
         count = len(field.samples.poses)
-        progress((count - begun) / max(most - begun, 1), "more poses where the field is off",
+        progress((count - begun) / max(most - begun, 1),
+                 "adding poses where the field's error is large",
                  error=field.errors["energy_error"], samples=count)
         places, sources = _where_off(field, min(max(_FEWEST, round(_ROUND * count)), most - count))
         if not len(places):
@@ -74,7 +75,7 @@ def _solved(grasp_model: GraspModel, places: np.ndarray, starts: list[np.ndarray
     shares = np.array_split(np.arange(len(places)), max(2, -(-len(places) // _SHARE_PLACES)))
     found = run_tasks(_solve, [(grasp_model, places[k], [starts[n] for n in k])
                               for k in shares if len(k)],
-                      workers=workers, message="more poses where the field is off")
+                      workers=workers, message="adding poses where the field's error is large")
     return [one for share in found for one in share]
 
 

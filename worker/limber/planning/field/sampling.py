@@ -130,10 +130,10 @@ def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley,
             break
     if sum(map(len, found)) >= (count if fewest is None else fewest):
         return np.concatenate(found)[:count]
-    raise WorkError("The grasp has nearly no room to move.",
-                    f"Within {radius:.3f} m of rest the branch, held {reach.arc_length:.3f} m from "
-                    "its base, reaches little above that.",
-                    "Grasp the branch farther out, or allow more --deflection.")
+    raise WorkError("The grasp can hardly move.",
+                    f"The branch is held {reach.arc_length:.3f} m from its base and reaches "
+                    f"little more than the {radius:.3f} m around its rest position.",
+                    "Grasp the branch farther from its base, or raise --deflection.")
 
 
 def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -231,7 +231,7 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
         place = ", ".join(f"{x:.3f}" for x in positions[bad[0].target])
         raise ConvergenceError(
             f"No acceptable solution ({bad[0].trouble}) with the grasp at ({place}) m.",
-            "It is a sample of the energy field, which could be solved once.",
+            "This pose is a sample of the energy field and had a solution before.",
             "Run `limber energy` again with --force.")
     return np.array([one.displacement for one in good[1:]])
 

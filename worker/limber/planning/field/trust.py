@@ -57,7 +57,7 @@ class TrustRegion:
             raise WorkError(
                 f"{len(accepted)} accepted grasp poses span no volume.",
                 "The energy is known only between them.",
-                "Sample more poses, or a larger deflection.") from error
+                "Sample more poses, or use a larger deflection.") from error
         outline = _outline(flat, planes, chart) if chart.radius > 0.0 else accepted
         return cls(np.ascontiguousarray(planes), accepted, rejected, chart,
                    outline.min(axis=0), outline.max(axis=0), outline)

@@ -32,7 +32,7 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
     if len(allowed) == 0:
         raise GoalOverLimitsError(
             f"No pose in the goal region keeps the limits: {over_limits(field, trusted, limits)}.",
-            f"{len(trusted)} poses in it were drawn.",
+            f"{len(trusted)} poses in the region were checked.",
             "Raise the limit (--max-energy, --max-force and others, the workspace), or choose a "
             "goal nearer to the rest pose.")
     return np.ascontiguousarray(allowed)
@@ -41,13 +41,13 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
 def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
     """Return in words which limits none of ``points`` [n, 3] keeps, and by how much."""
     outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
-    told = [f"the {one.words} is at least {one.with_unit(least)} where "
-            f"{one.with_unit(one.limit)} is allowed" for one in limited(field, limits)
+    told = [f"the {one.words} is at least {one.with_unit(least)}, its limit is "
+            f"{one.with_unit(one.limit)}" for one in limited(field, limits)
             if (least := float(one.size(points).min())) > one.limit]
     if outside.min() > 0.0:
         told.append(f"the workspace is {outside.min():.3f} m away"
                     + unit_doubt(outside.min(), field))
-    return " and ".join(told) or "each pose breaks one or the other"
+    return " and ".join(told) or "every pose breaks at least one of them"
 
 
 @compiled
@@ -70,7 +70,7 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
         f"{unit_doubt(float(distance.min()), field)}.",
         f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
         f"{_place(field.region.low)} to {_place(field.region.high)}.",
-        "Choose a goal nearer to that, widen --goal-tolerance, or sample farther (`limber "
+        "Choose a goal nearer to this region, raise --goal-tolerance, or sample farther (`limber "
         "energy --deflection`).")
 
 

@@ -69,6 +69,7 @@ class View(Convex):
         """Raise NoPathError where the branch's surface hides ``what`` at a place."""
         if self.hidden_by(triangles, place, _OWN):
             raise NoPathError(
-                f"At the path's end the branch hides {what} from the camera.",
-                "Limber checks the line of sight at a path's end, but cannot plan for it yet.",
+                f"At the end of the path the branch hides {what} from the camera.",
+                "Limber checks the line of sight at the end of a path, but cannot plan for it "
+                "yet.",
                 "Choose a --target-box on the camera's side, or move the camera.")

@@ -24,12 +24,14 @@ class CellGoal(TargetGoal):
 def _kind(name: str, entry: str) -> GoalKind:
     def made(asked: GoalRequest, _value: bool) -> CellGoal:
         if name not in asked.cell:
-            raise InputError(f"--{name.replace('_', '-')} is given, but no cell with a {entry}.",
-                             "The cell file says where it stands.", "Give --cell with one.")
+            raise InputError(f"--{name.replace('_', '-')} is given without a cell that has a "
+                             f"{entry}.",
+                             "The cell file states its position.",
+                             "Give --cell with such a file.")
         place = asked.cell[name]
         return CellGoal(place.region, *target_of(asked), cell_place=place)
     return GoalKind(name, made, is_of_target=True)
 
 
-IN_VIEW = _kind("in_view", "[camera] that stands still")
+IN_VIEW = _kind("in_view", "[camera] at a fixed position")
 SECOND_ARM = _kind("second_arm", "[second_arm]")

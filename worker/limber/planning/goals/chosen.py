@@ -33,9 +33,9 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
             if (field.region.contains(chart.curved(centre + around)).mean() > 0.5
                     and field.region.contains(position)[0]):
                 return near(position, tolerance)
-    raise NoPathError("No far pose lies well inside the sampled region.",
-                      f"Too few of {len(away)} accepted samples are far from the rest pose.",
-                      "Sample more poses with `limber energy --samples`, or name a --goal.")
+    raise NoPathError("No distant pose lies well inside the sampled region.",
+                      f"Too few of the {len(away)} accepted samples are far from the rest pose.",
+                      "Sample more poses with `limber energy --samples`, or give a --goal.")
 
 
 def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,
@@ -53,8 +53,9 @@ def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits:
     fit &= np.linalg.norm(points - field.rest, axis=1) >= half
     fit &= allowed_points(points, limits)
     if not fit.any():
-        raise NoPathError("No pose of the hemisphere lies far from rest and keeps the limits.",
-                          f"Far is {half:.3f} m; the hemisphere's radius is {length:.3f} m.",
+        raise NoPathError("No pose in the hemisphere is far from rest and keeps the limits.",
+                          f"A distant pose is at least {half:.3f} m from rest; the hemisphere's "
+                          f"radius is {length:.3f} m.",
                           "Give a --goal, or relax the limits.")
     return near(points[np.flatnonzero(fit)[0]], tolerance)
 

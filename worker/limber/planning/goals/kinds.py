@@ -28,12 +28,12 @@ def goal_of(request: GoalRequest) -> Goal:
     asked = asked_kinds(settings)
     if len(asked) > 1:
         raise InputError(f"{' and '.join(kind.option for kind in asked)} are given.",
-                         "A path ends in one goal.", "Give one of them.")
+                         "A path has only one goal.", "Give only one of them.")
     if settings.target is not None and not any(kind.is_of_target for kind in asked):
         *others, last = [kind.option for kind in KINDS if kind.is_of_target]
-        raise InputError(f"--target {settings.target} is given without a place for it.",
-                         "A target alone says not where it shall be.",
-                         f"Give {', '.join(others)} or {last} as well.")
+        raise InputError(f"--target {settings.target} is given without a goal for it.",
+                         "A target alone does not state where it must move.",
+                         f"Also give {', '.join(others)} or {last}.")
     if not asked:
         return default_goal(request.field, settings.goal_tolerance)
     return asked[0].make(request, getattr(settings, asked[0].name))

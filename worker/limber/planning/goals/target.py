@@ -115,9 +115,9 @@ def target_of(asked: GoalRequest) -> tuple[int | None, str]:
     if name is None:
         return None, "tip"
     if name not in names:
-        raise InputError(f"The branch has no target {name}.",
-                         f"It has: {', '.join(names) or 'none'}.",
-                         "Name one with `limber target`.")
+        raise InputError(f"The branch has no target named {name}.",
+                         f"Its targets are: {', '.join(names) or 'none'}.",
+                         "Define one with `limber target`.")
     return names.index(name), name
 
 

@@ -87,7 +87,7 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
     longest = float((1.0 + max_detour) * least)
     search = _Search(problem, longest, [shortest, *others])
     for step in range(_STEPS):
-        progress(0.5 * step / _STEPS, "how much a metre may cost", length=search.last_length)
+        progress(0.5 * step / _STEPS, "weighing length against energy", length=search.last_length)
         if not search.step():
             break
     bounds = _Bounds(problem, search)
@@ -99,7 +99,7 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
         if weight is None:
             break
     if not bounds.stopped:
-        progress(0.95, "just short enough")
+        progress(0.95, "refining the path of the allowed length")
     return search.result(bounds.best, bounds.best_weight, float(least), bounds.stopped)
 
 
@@ -158,8 +158,8 @@ class _Search:
         tried = [refine(path, weighed) for path in self.starts]
         path, cost = min(tried, key=lambda item: item[1])
         if not np.isfinite(cost):
-            raise NoPathError("No allowed path was found to start from.",
-                              "Refining the known ones ended outside the limits.",
+            raise NoPathError("No allowed path was found as a starting point.",
+                              "Refinement of the known paths ended outside the limits.",
                               "Sample more poses with `limber energy --samples`.")
         self.add(weight, path, None)
         # From here on the neighbouring weight's path is start enough.

@@ -56,14 +56,14 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
             return best[1]
         if rough is not None:
             # Coarser cells than those that left it open will not settle it.
-            raise not_found(problem, f"It is open on {_grid(verdicts[0])}.")
+            raise not_found(problem, f"The question is undecided on {_grid(verdicts[0])}.")
         verdicts.append(judge(problem))
         # A path that keeps the limits is a better proof than cells that separate.
         way = verdicts[0].way
         known = (way is not None and found_from([way])) or found_from(_easiest(problem))
         if not known and verdicts[0].proven:
-            raise no_way(problem, f"Proven on {_grid(verdicts[0])}: cells where motion is "
-                         "surely not allowed separate the two.")
+            raise no_way(problem, f"This is proven on {_grid(verdicts[0])}: forbidden cells "
+                         "separate the start from the goal.")
         return best[1]
 
     certificate = certify(problem, improve, enough=enough, progress=progress)
@@ -77,7 +77,7 @@ def _easiest(problem: GentleProblem) -> list[np.ndarray]:
 
 def _grid(verdict: Verdict) -> str:
     along, off = 1e3 * verdict.edges[0], 1e3 * verdict.edges[2]
-    return f"a grid of {along:.1f} mm along and {off:.2g} mm off the shell that the grasp moves on"
+    return f"a grid of {along:.1f} mm along the low-energy surface and {off:.2g} mm across it"
 
 
 def _straight(problem: GentleProblem) -> np.ndarray:

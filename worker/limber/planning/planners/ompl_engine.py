@@ -34,8 +34,8 @@ class OmplRrtStar:
     def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
         if reason := self.missing():
             raise MissingDependencyError(
-                "OMPL is not installed.", f"Importing it says: {reason}.",
-                "Use --engine own, which needs nothing, or install the extra `planning`.")
+                "OMPL is not installed.", f"The import failed with: {reason}.",
+                "Use --engine own, which needs no other package, or install the extra `planning`.")
         from ompl import base, geometric
         from ompl import util as ompl_util
 

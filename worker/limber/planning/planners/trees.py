@@ -65,8 +65,8 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     if raw is None:
         raise NoPathError(
             f"{search.iterations} iterations found no allowed path to the goal region.",
-            f"{reached} poses were reached from the start; the limits, or poses that the "
-            "branch model refused, may separate it from the goal.",
+            f"{reached} poses were reached from the start. The limits or rejected poses may "
+            "separate the start from the goal.",
             "Allow more --iterations, or raise --max-energy or --max-force.")
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
     points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,
