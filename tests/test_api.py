@@ -178,7 +178,7 @@ def test_a_branch_tells_what_it_holds(example):
     assert example.skeleton.radius.max() < 0.05
     assert example.plot().axes
     assert repr(example.pulls) == "<pull-1>" and len(example.results) == 6
-    with pytest.raises(KeyError, match="there are pull-1"):
+    with pytest.raises(KeyError, match="known: pull-1"):
         example.pulls["pull-2"]
 
 

@@ -94,10 +94,10 @@ def test_a_task_is_the_same_after_its_command_line():
 @pytest.mark.parametrize(("words", "told"), [
     (["--scheduler", "tcp://10.0.0.1:8786"], "not encrypted"),
     (["--scheduler", "tcp://example.org:8786"], "not encrypted"),
-    (["--scheduler", "10.0.0.1"], "no address"),
+    (["--scheduler", "10.0.0.1"], "not the address"),
     (["--scheduler", "tls://127.0.0.1:1", "--cluster", "local"], "Omit one of them"),
-    (["--cluster", "slurm"], "How many jobs"),
-    (["--cluster", "slurm", "--workers", "2"], "no sbatch"),
+    (["--cluster", "slurm"], "number of jobs to request"),
+    (["--cluster", "slurm", "--workers", "2"], "sbatch is not on this computer"),
 ])
 def test_what_cannot_or_shall_not_run_is_refused(words, told, tmp_path, branch_template, capsys,
                                                  monkeypatch):

@@ -92,10 +92,10 @@ def test_a_sweep_is_every_combination(write):
     ("workers = 0", 1, "at least 1"),
     ('workers = "two"', 1, "a whole number"),
     ('time_limit = "3 MB"', 1, "Known units: s, ms, min, h"),
-    ("memory_limit = -5", 1, "no positive number"),
+    ("memory_limit = -5", 1, "not a positive number"),
     ("[[job]]\nscan = 1", 2, "Did you mean scans?"),
     ("[[job]]\n[[job.stage]]\nrun = 'reconstruct'", 1, "either scans or folders"),
-    ("[[job]]\nscans = ['none*.ply']\n[[job.stage]]\nrun = 'reconstruct'", 2, "No file is"),
+    ("[[job]]\nscans = ['none*.ply']\n[[job.stage]]\nrun = 'reconstruct'", 2, "No file matches"),
     ("[[job]]\nscans = ['scans/*.ply']", 1, "no [[job.stage]]"),
     (SCANS + "\n# a comment\nprun = 2", 8, "Did you mean prune?"),
     (SCANS + "prune = -1", 6, "greater than or equal to 0"),
@@ -103,20 +103,20 @@ def test_a_sweep_is_every_combination(write):
     (SCANS + 'density = "8 mm"', 6, "It must be in kg/m^3"),
     (SCANS + 'prune = "8 mm"', 6, "This value has no unit"),
     (SCANS + 'unit = "yd"', 6, "should be 'm', 'cm', 'mm' or 'in'"),
-    (SCANS + 'output = "x"', 6, "given by the batch"),
+    (SCANS + 'output = "x"', 6, "The batch sets"),
     (SCANS + '[[job.stage]]\nrun = "reconstuct"', 7, "Did you mean reconstruct?"),
-    (SCANS + '[[job.stage]]\nrun = ["mesh"]', 7, "there is no such stage"),
+    (SCANS + '[[job.stage]]\nrun = ["mesh"]', 7, "this stage does not exist"),
     (SCANS + '[[job.stage]]\nrun = "record"', 7, "It moves a robot"),
     (SCANS + '[[job.stage]]\nrun = "generate"', 7, "It makes a scan"),
     (SCANS + '[[job.stage]]\nrun = "import-pull"\nsource = "pulls/{scan}/*.c3d"\nname = "a"', 8,
-     "no file is"),
+     "no file matches"),
     (SCANS + '[[job.stage]]\nrun = "import-pull"\nsource = "a.csv"', 6, "Field required"),
-    (SCANS + '[[job.stage]]\nrun = "target"\nname = "{branch}"', 8, "{scan} and {file} are"),
-    (SCANS + '[job.sweep]\n"reconstruct.mesh_spacing" = 3', 7, "takes a list"),
-    (SCANS + '[job.sweep]\n"mesh_spacing" = [3]', 7, "names no stage"),
+    (SCANS + '[[job.stage]]\nrun = "target"\nname = "{branch}"', 8, "Use {scan} or {file}"),
+    (SCANS + '[job.sweep]\n"reconstruct.mesh_spacing" = 3', 7, "needs a list"),
+    (SCANS + '[job.sweep]\n"mesh_spacing" = [3]', 7, "does not name a stage"),
     (SCANS + '[job.sweep]\n"reconstruct.mesh_spacing" = [3, "5 mm"]', 7, "This value has no unit"),
-    (SCANS + '[[job.stage]]\nrun = "scene"\noutput = "../../evil.blend"', 8, "leads out of"),
-    (SCANS + '[[job.stage]]\nrun = "scene"\noutput = "/tmp/evil.blend"', 8, "leads out of"),
+    (SCANS + '[[job.stage]]\nrun = "scene"\noutput = "../../evil.blend"', 8, "is outside"),
+    (SCANS + '[[job.stage]]\nrun = "scene"\noutput = "/tmp/evil.blend"', 8, "is outside"),
     ("[job]\nscans = []", 1, "[[job]]"),
 ])
 def test_what_is_wrong_is_told_with_its_line(write, text, line, said):
@@ -160,7 +160,7 @@ def test_two_branches_never_share_a_folder(write, tmp_path):
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "apple.ply").write_text("")
     told = refusal(write(SCANS.replace('"scans/*.ply"', '"scans/*.ply", "more/*.ply"')))
-    assert "Two branches would be apple.branch" in told
+    assert "Two branches would be named apple.branch" in told
 
 
 def test_every_stage_may_stand_in_a_job_file(write, tmp_path):

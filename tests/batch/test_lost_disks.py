@@ -111,7 +111,7 @@ def test_lost_results_stop_the_batch(orchard, batch, here, monkeypatch, trouble)
         code, told, _ = batch()
     assert code == 3, told
     if trouble == "gone":
-        assert "results is not there any more" in told["error"]
+        assert "results no longer exists" in told["error"]
         assert not out.exists()
         (orchard / "away").rename(out)
     else:

@@ -67,7 +67,7 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
     assert len(captions) == 6
     parts = stored["young_deviation"]
     assert parts["geometry"] is None and max(parts["mesh"]) < 0.2
-    assert "came without a deviation" in captions[0]
+    assert "have no stated deviation" in captions[0]
 
 
 @pytest.mark.slow

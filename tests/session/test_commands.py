@@ -122,11 +122,11 @@ def test_without_weight_the_branch_rises(session, branch_folder):
 
 
 @pytest.mark.parametrize(("command", "fields", "words"), [
-    ("move", {"pose": [0, 0, 0.1, 0, 0, 0]}, "Nothing is held"),
+    ("move", {"pose": [0, 0, 0.1, 0, 0, 0]}, "No grasp is held"),
     ("grasp", {"vertex": 10**9}, "no vertex"),
     ("grasp", {"point": [5.0, 0, 0]}, "No node lies"),
     ("grasp", {"point": [0.0, 0, 0], "radius_m": 0.01}, "fixed base"),
-    ("release", {"grasp": 99}, "Nothing is held|no grasp"),
+    ("release", {"grasp": 99}, "No grasp is held|no grasp"),
     ("young", {"young_pa": [1e7] * 999}, "999 moduli"),
     ("dynamics", {"on": True}, "reduced model"),
     ("hello", {"protocol": PROTOCOL + 1}, "different versions"),

@@ -124,7 +124,7 @@ def test_what_loads_do_is_told(with_axes):
     said = Said()
     teller = EffectsTeller(with_axes, SessionSettings(), said)
     question = protocol.parse_command(b'{"command": "effects", "id": 7, "limit_load": true}')
-    with pytest.raises(InputError, match="neither wind"):
+    with pytest.raises(InputError, match="no wind, snow"):
         teller.ask(question, held)
     loads = Outdoors(wind=(3.0, 0.0, 0.0), snow=0.5)
     held.set_outdoors(loads)

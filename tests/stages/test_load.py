@@ -113,7 +113,7 @@ def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     assert branch.manifest.stages["load:gale"].result["sag_m"] == result["sag_m"]
     section = next(one for one in draw_page(branch)[1] if one.title == "Load: gale")
     told = dict(row[:2] for row in section.tables[0][1])
-    assert told["peak of the gusts over the mean load"] == f"{result['gusts']['factor']:.2f}"
+    assert told["peak load of the gusts over the mean load"] == f"{result['gusts']['factor']:.2f}"
     assert len(section.pictures) == 1 and not section.text
     data = scene_data(branch, motion="load-gale")
     assert data.info["frames"]["name"] == "load-gale" and "frame_scalar:strain" in data.arrays

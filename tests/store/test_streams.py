@@ -93,7 +93,7 @@ def test_two_writers_of_one_stream_are_refused(tmp_path: Path):
 
 
 def test_a_line_end_in_a_line_is_refused(tmp_path: Path):
-    with Stream(tmp_path / "a.csv") as stream, pytest.raises(InputError, match="line end"):
+    with Stream(tmp_path / "a.csv") as stream, pytest.raises(InputError, match="line break"):
         stream.append("1\n2")
 
 

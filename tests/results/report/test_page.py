@@ -84,8 +84,8 @@ def test_an_execution_shows_felt_beside_predicted(meshed: Branch):
     executed("led", rows)
     executed("lost", rows[:100])
     html, page = draw_page(meshed)
-    led, lost = (section for section in page if section.title.startswith("By the robot"))
-    assert len(led.pictures) == 1 and ["peak force, felt [N]", "5.20"] in led.tables[0][1]
+    led, lost = (section for section in page if section.title.startswith("Executed by the robot"))
+    assert len(led.pictures) == 1 and ["measured peak force [N]", "5.20"] in led.tables[0][1]
     assert not lost.pictures and "no predicted force" in lost.text[0]
     assert "a stop: slipped" in html
 
@@ -132,7 +132,7 @@ def test_an_assumed_modulus_is_never_called_true():
     estimate = {"young_pa": [2e6], "young_interval_pa": [[1e6, 4e6]]}
     pull = {"young_true_pa": [3e6], "young_assumed": True}
     told = " ".join(modulus_rows(estimate, pull)[0]) + held_sentence(estimate, pull)
-    assert "assumed E [MPa]" in told and "this branch was not pulled" in told
+    assert "assumed E [MPa]" in told and "This branch was not pulled" in told
     assert "true" not in told and "error" not in told
     curve = {"fractions": [0.2, 0.8], "young_pa": [2e6, 1e6],
              "young_interval_pa": [[1e6, 3e6], [5e5, 2e6]]}
@@ -182,7 +182,7 @@ def test_what_holds_an_estimate_back_is_read_first(meshed: Branch):
     with meshed.stage("estimate") as stage:
         stage.path("estimate.json").write_text(json.dumps(full), encoding="utf-8")
     result = write_report(meshed.folder)
-    assert result["sections"][:2] == ["What holds the estimate back", "Summary"]
+    assert result["sections"][:2] == ["What limits the estimate", "Summary"]
     html = (meshed.folder / "report.html").read_text(encoding="utf-8")
     assert html.index("calibrate it") < html.index("Summary</h2>") and "14.0 %" in html
 
@@ -228,7 +228,7 @@ def test_cylinder_model_stands_beside_calipers(tmp_path):
     assert row["sigmas"] == pytest.approx(-0.001 / 4e-4)
     html = (branch.folder / "report.html").read_text(encoding="utf-8")
     for text in ("74.0 %", "26.0 %", "probability 0.40", "sigma 25% of it", "-4.8 %", "-2.5",
-                 "By branching order", "taper [mm of radius a m]"):
+                 "By branching order", "taper [mm of radius per m]"):
         assert text in html, text
     for content, told in (("along_m,diameter_mm\n0.5,21\n", "0.5 m; the main path is 0.4 m"),
                           ("along_m,diameter_mm\n0.1,-3\n", "line 2: -3 mm"), ("", "no values")):

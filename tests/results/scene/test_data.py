@@ -151,8 +151,8 @@ def test_frames_of_another_mesh_are_refused(tmp_path, mesh):
     surface = mesh.nodes[np.unique(mesh.surface_faces())]
     plan = _plan({}, [[0.0, 0.0, 0.3]])
     for name, content, words in (("fewer", _pc2(surface[None, 1:]), "another mesh"),
-                                 ("cut", _pc2(surface[None])[:-4], "not a whole PC2"),
-                                 ("none", b"", "not a whole PC2")):
+                                 ("cut", _pc2(surface[None])[:-4], "not a complete PC2"),
+                                 ("none", b"", "not a complete PC2")):
         branch = _branch(tmp_path / name, mesh, plan__p=plan | {"frames/p.pc2": content})
         with pytest.raises(InputError, match=words):
             scene_data(branch)
@@ -173,7 +173,7 @@ def test_frames_of_an_earlier_mesh_are_left_out(tmp_path, mesh):
             stage.path("mesh.vtu"))
     data = scene_data(branch)
     assert "frames" not in data.info and "path:plan" in data.arrays
-    assert any("p is of an earlier mesh" in note for note in data.info["notes"])
+    assert any("p belongs to an earlier mesh" in note for note in data.info["notes"])
     with pytest.raises(InputError, match="another mesh"):
         scene_data(branch, motion="p")
 
@@ -352,7 +352,7 @@ def test_motions_are_named(tmp_path, mesh):
     named = scene_data(branch, motion="s")
     assert named.info["frames"]["count"] == 3
     assert not named.info["frames"]["is_timed"]
-    with pytest.raises(BranchFolderError, match="There are: p, s"):
+    with pytest.raises(BranchFolderError, match="Its frames are: p, s"):
         scene_data(branch, motion="q")
 
 

@@ -50,7 +50,7 @@ class Result:
         return tuple(self.values.get("warnings", ()))
 
     def _shown(self) -> dict[str, str]:
-        """What is printed, by its label."""
+        """The printed values, by label."""
         return {name: f"{value:.4g}" if isinstance(value, float) else str(value)
                 for name, value in self.values.items() if isinstance(value, bool | int | float)}
 
@@ -246,8 +246,8 @@ class Simulation(Result):
 
     def _shown(self) -> dict[str, str]:
         return {"name": self.name, "frames": str(len(self.times)),
-                "energy at the end": f"{self.energies[-1]:.4g} J",
-                "force at the end": f"{np.linalg.norm(self.forces[-1]):.4g} N",
+                "final energy": f"{self.energies[-1]:.4g} J",
+                "final force": f"{np.linalg.norm(self.forces[-1]):.4g} N",
                 "largest strain": f"{self.strains.max():.4g}", "converged": _yes(self.converged)}
 
 
@@ -257,14 +257,14 @@ class Load(Result):
 
     Attributes:
         sag: How far the tip comes down [m].
-        sag_interval: Its 95 % interval [m], shape [2]; NaN where nothing tells how sure E is.
+        sag_interval: Its 95 % interval [m], shape [2]; NaN if the uncertainty of E is unknown.
         greatest_strain: Largest principal strain.
         strain_over_limit: That strain over the one at which the wood is taken to fail.
         frequencies: Lowest natural frequencies under the loads [Hz].
         frequencies_before: Those without the loads [Hz].
         tip_displacement: [m], shape [3].
         wind_force: On all of the branch [N], shape [3].
-        bears_times: How many times the loads the branch bears; None if it was not asked.
+        bears_times: Factor on the loads that the branch bears; None if it was not requested.
     """
 
     sag: float
@@ -305,8 +305,8 @@ class Load(Result):
         low, high = 1e3 * self.sag_interval
         between = "" if np.isnan(low) else f" ({low:.4g} to {high:.4g})"
         shown = {"sag": f"{1e3 * self.sag:.4g}{between} mm",
-                 "greatest strain": f"{self.greatest_strain:.4g}",
-                 "share of the limit": f"{100 * self.strain_over_limit:.3g} %",
+                 "largest strain": f"{self.greatest_strain:.4g}",
+                 "fraction of the limit": f"{100 * self.strain_over_limit:.3g} %",
                  "first frequency": f"{self.frequencies[0]:.4g} Hz"}
         return shown if self.bears_times is None else shown | {
             "bears": f"{self.bears_times:.3g} times the loads"}
@@ -320,7 +320,7 @@ class EnergyField(Result):
         positions: Sampled positions of the grasp [m], shape [m, 3]; the first is at rest.
         energies: Potential of strain and weight above the rest shape there [J], shape [m].
         forces: Of the gripper on the branch there [N], shape [m, 3].
-        energy_error: Of samples left out of the fit, root mean square over theirs.
+        energy_error: Of samples outside the fit: root mean square error over that of the energy.
         force_error: Likewise of the force.
     """
 
@@ -366,7 +366,7 @@ class EnergyField(Result):
         return {"samples": str(len(self.positions)),
                 "rejected": str(self.values["rejected_count"]),
                 "largest energy": f"{self.energies.max():.4g} J",
-                "off by": f"{100 * self.energy_error:.2g} % of the energy, "
+                "error": f"{100 * self.energy_error:.2g} % of the energy, "
                           f"{100 * self.force_error:.2g} % of the force"}
 
 
@@ -386,7 +386,7 @@ class Plan(Result):
         energy_saved: Against the shortest path [%].
         cost: Of the gentle path on the energy field, as the planner weighs energy and length.
         bound: No path costs less than that: the certificate.
-        gap: How far the gentle path is from the best one at most [%]; None if it is not known.
+        gap: Largest cost of the gentle path above that of the best one [%]; None if unknown.
     """
 
     name: str
@@ -443,7 +443,7 @@ class Plan(Result):
                 "energy": f"{self.energy:.3g} J m",
                 "saved": "not known" if saved is None else f"{saved:.1f} %",
                 "peak force": f"{self.values['plan']['peak_force_n']:.3g} N",
-                "above the best at most": "not known" if gap is None else f"{gap:.2g} %"}
+                "cost above the best path, at most": "not known" if gap is None else f"{gap:.2g} %"}
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -455,7 +455,7 @@ class Execution(Result):
         armed: Whether the robot moved; otherwise it was a dry run.
         reached: Whether it came to the path's end and back.
         stop_reason: Why it was stopped; None where it was not.
-        peak_force: Largest that was felt [N]; None in a dry run.
+        peak_force: Largest measured force [N]; None in a dry run.
         path_error: Largest distance from the path [m]; None in a dry run.
     """
 
@@ -475,7 +475,7 @@ class Execution(Result):
                    branch.path(f"executions/{name}/samples.csv"))
 
     def plot(self) -> "Figure":
-        """Draw the felt force beside the predicted one.
+        """Draw the measured force and the predicted one.
 
         Raises:
             InputError: the robot did not move.

@@ -192,7 +192,7 @@ class ByName(Mapping[str, Value], Generic[Value]):
 
     def __getitem__(self, name: str) -> Value:
         if name not in self._names:
-            raise KeyError(f"{name!r}: there are {', '.join(self._names) or 'none'}")
+            raise KeyError(f"{name!r} does not exist; known: {', '.join(self._names) or 'none'}")
         return self._read(name)
 
     def __iter__(self) -> Iterator[str]:
@@ -211,7 +211,7 @@ class Branch:
     Nothing is kept in memory: each verb reads the folder and writes to it, as commands do.
 
     Args:
-        folder: Of the branch; :func:`limber.open` says the same.
+        folder: Of the branch; :func:`limber.open` takes the same.
 
     Raises:
         BranchFolderError: there is no such folder, or it is damaged or of a newer format.
@@ -324,8 +324,9 @@ class Branch:
             WorkError: the fit ends at no result.
         """
         if settings.get("follow"):
-            raise InputError("follow was given.", "It estimates while a pull is recorded, and has "
-                             "another result.", "Use branch.run(\"estimate\", follow=True).")
+            raise InputError("follow was given.", "It estimates while a pull is recorded, and "
+                             "returns another result.",
+                             "Use branch.run(\"estimate\", follow=True).")
         return cast(Estimate, self._run("estimate", quiet, settings))
 
     def simulate(self, *, quiet: bool = False, **settings: Any) -> Simulation:
@@ -384,7 +385,7 @@ class Branch:
 
         Raises:
             BranchFolderError: there is no energy field, or one of another branch.
-            NoPathError: no path leads to the goal; the message says why.
+            NoPathError: no path reaches the goal; the message states why.
         """
         return cast(Plan, self._run("plan", quiet, settings))
 
@@ -400,7 +401,7 @@ class Branch:
         Raises:
             InputError: plan, cell and branch do not belong together, or nobody confirmed.
             NoPathError: the arm cannot follow the path.
-            SafetyStop: it was stopped; its ``result`` says where.
+            SafetyStop: it was stopped; its ``result`` states where.
         """
         return cast(Execution, self._run("execute", quiet, settings, cell=cell))
 
@@ -456,7 +457,7 @@ class Branch:
             InputError: there is no such stage, or a setting is refused.
         """
         if _known_stage(stage) in ("generate", "reconstruct", "mesh"):
-            raise InputError(f"{stage} makes a branch.", "", f"Call limber.{stage}.")
+            raise InputError(f"{stage} makes a new branch.", "", f"Call limber.{stage}.")
         _, values = self._values(stage, quiet, settings)
         return Result(MappingProxyType(values))
 
@@ -546,7 +547,8 @@ def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
     if names is None:
         points = np.asarray(cloud)
         if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-            raise InputError(f"The cloud is an array of shape {points.shape}, {points.dtype}.",
+            raise InputError(f"The cloud is an array of shape {points.shape} and type "
+                             f"{points.dtype}.",
                              "Points have shape [n, 3].",
                              "Give other columns by name: {\"x\": ..., \"red\": ...}.")
         columns = dict(zip("xyz", points.T, strict=True))

@@ -1,1 +1,1 @@
-"""Many branches at once: a job file says what is run on which, and running it again goes on."""
+"""Many branches at once: a job file states what to run on which; a second run continues."""

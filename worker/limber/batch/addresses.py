@@ -1,4 +1,4 @@
-"""Addresses of files that are elsewhere (``s3://``, ``sftp://``, ``gs://`` ...), by fsspec.
+"""Addresses of remote files (``s3://``, ``sftp://``, ``gs://`` ...), by fsspec.
 
 Neither locks nor renames can be relied on there: files are brought here, and results are put
 there. Who may read and write is fsspec's business (its configuration and environment), never the
@@ -28,12 +28,12 @@ _PLAIN_NAME = re.compile(r"^[^./\\:*?\"<>|\x00-\x1f][^/\\:*?\"<>|\x00-\x1f]*$")
 _TELLING = frozenset(
     "etag checksum md5hash content_md5 sha generation versionid mtime modify modified lastmodified "
     "last_modified updated created time".split())
-"""In what file systems say of a file, in small letters: what changes with its content."""
+"""The entries of a file system's information that change with a file's content, in lower case."""
 _MOST_BYTES_READ = 64 << 20
 
 
 def is_address(text: str) -> bool:
-    """Whether a text is an address and no path."""
+    """Whether a text is an address, not a path."""
     return _ADDRESS.match(text) is not None
 
 
@@ -41,22 +41,22 @@ def checked_address(address: str) -> str:
     """Return an address without a slash at its end.
 
     Raises:
-        InputError: it is chained, holds a password, or leads upwards.
+        InputError: it is chained, contains a password, or contains ``..``.
     """
     # First of all: the other messages show the address.
     for part in address.split("::"):
         host = part.partition("://")[2].partition("/")[0]
         if ":" in host.rpartition("@")[0]:
-            raise InputError(f"The address at {host.rpartition('@')[2]} has a password in it.",
+            raise InputError(f"The address at {host.rpartition('@')[2]} contains a password.",
                              "Job files, tables and logs would show it.",
-                             "Put it into fsspec's configuration (~/.config/fsspec) or "
-                             "environment.")
+                             "Store the password in fsspec's configuration (~/.config/fsspec) or "
+                             "in the environment.")
     if "::" in address:
         raise InputError(f"{address!r} is a chain of addresses.",
-                         "Each file is fetched from one place.", "Name that place alone.")
+                         "Each file is fetched from a single address.", "Give only that address.")
     _, _, rest = address.partition("://")
     if ".." in PurePosixPath(rest).parts:
-        raise InputError(f"{address!r} leads upwards.", "", "Write where it leads to.")
+        raise InputError(f"{address!r} contains `..`.", "", "Write the resulting address instead.")
     return address.rstrip("/")
 
 
@@ -64,21 +64,23 @@ def plain_name(address: str) -> str:
     """Return the last part of an address, as the name that the file gets here.
 
     Raises:
-        InputError: it is no name that every system takes.
+        InputError: it is not a name that every system accepts.
     """
     name = address.rstrip("/").rpartition("/")[2]
     if not _PLAIN_NAME.match(name):
-        raise InputError(f"{address!r} ends with {name!r}, which is no name of a file here.",
-                         "It begins with a dot or has one of \\ / : * ? \" < > | in it.",
-                         "Rename it.")
+        raise InputError(f"{address!r} ends with {name!r}, which is not a valid file name "
+                         "on this computer.",
+                         "The name is empty, begins with a dot or contains one of "
+                         "\\ / : * ? \" < > |.",
+                         "Rename the file.")
     return name
 
 
 def matching(pattern: str) -> list[str]:
-    """Return the addresses that a pattern, or an address, stands for, sorted.
+    """Return the addresses that match a pattern or an address, sorted.
 
     Raises:
-        InputError: it is refused. WorkError: its place cannot be read.
+        InputError: it is invalid. WorkError: the server cannot be read.
     """
     address = checked_address(pattern)
     system, path = _system(address)
@@ -89,15 +91,15 @@ def matching(pattern: str) -> list[str]:
 
 
 def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
-    """Bring a file, or a folder, to ``target``, unless it is there as it is at its address.
+    """Copy a file or folder to ``target``, unless an unchanged copy is there.
 
-    It is there whole or not at all.
+    The copy is complete or does not exist.
 
     Args:
-        stop: Called now and then; raises to end it.
+        stop: Called repeatedly; ends the copy by raising.
 
     Raises:
-        WorkError: it is not there, was cut short, or finds no room here.
+        WorkError: it does not exist, was interrupted, or exceeds the free space.
     """
     system, path = _system(address)
     with _explained(address, "read"):
@@ -157,17 +159,17 @@ def put(source: Path, address: str) -> None:
 
 
 def read_bytes(address: str) -> bytes | None:
-    """Return what a small file at an address holds; None where there is none.
+    """Return the content of a small file at an address; None if it does not exist.
 
     Raises:
-        WorkError: its place cannot be read, or it is large.
+        WorkError: the server cannot be read, or the file is large.
     """
     system, path = _system(address)
     with _explained(address, "read"):
         system.invalidate_cache()
         try:
             if (system.info(path).get("size") or 0) > _MOST_BYTES_READ:
-                raise WorkError(f"{address} is over {_MOST_BYTES_READ >> 20} MiB.",
+                raise WorkError(f"{address} exceeds {_MOST_BYTES_READ >> 20} MiB.",
                                 "A manifest was expected.", "Check the address.")
             return bytes(system.cat_file(path))
         except FileNotFoundError:
@@ -202,15 +204,16 @@ def _system(address: str) -> tuple[Any, str]:
     except ImportError as error:
         raise MissingDependencyError(
             f"{address} needs a package that is not installed.", f"{error}.",
-            "Install it beside Limber; fsspec names one for each kind of address.") from error
+            "Install that package as well. The documentation of fsspec names the package for each "
+            "kind of address.") from error
     except Exception as error:  # each file system raises its own
-        raise InputError(f"{address} is no address that can be used "
-                         f"({type(error).__name__}: {error}).", "",
-                         "fsspec's documentation lists the kinds there are.") from error
+        raise InputError(f"{address} is not a usable address ({type(error).__name__}: "
+                         f"{error}).", "",
+                         "The documentation of fsspec lists the supported kinds.") from error
 
 
 def _before(system: Any, address: str, path: str) -> str:
-    """What stands in an address before its path: SFTP and its like leave the host out of paths."""
+    """The part of an address before its path: SFTP and others omit the host in paths."""
     if address.endswith(path):
         return address.removesuffix(path)
     return system.unstrip_protocol(path).removesuffix(path)
@@ -224,16 +227,16 @@ def _explained(address: str, what: str) -> Iterator[None]:
     except LimberError:
         raise
     except FileNotFoundError as error:
-        raise WorkError(f"There is no {address}.", "", "Check the address.") from error
+        raise WorkError(f"{address} does not exist.", "", "Check the address.") from error
     except Exception as error:  # each file system's client raises its own
         raise WorkError(f"{address} could not be {what} ({type(error).__name__}: {error}).",
-                        "Its place does not answer, or you may not.",
-                        "Check network and credentials, and run this with --retry-failed.",
+                        "The server does not respond, or access is denied.",
+                        "Check the network and the credentials, and run this with --retry-failed.",
                         ) from error
 
 
 def _told(found: dict[str, dict[str, Any]]) -> str:
-    """What tells whether files have changed; nothing where their system does not say."""
+    """A digest that changes with the files; empty if their system does not report changes."""
     if not all(any(value and str(key).lower() in _TELLING for key, value in one.items())
                for one in found.values()):
         return ""
@@ -242,10 +245,10 @@ def _told(found: dict[str, dict[str, Any]]) -> str:
 
 
 def _inside(folder: str, place: str) -> PurePosixPath:
-    """The place of a file in its folder.
+    """The relative path of a file in its folder.
 
     Raises:
-        InputError: a part of it is no plain name.
+        InputError: a part of it is not a plain name.
     """
     inner = PurePosixPath(place).relative_to(PurePosixPath(folder))
     for part in inner.parts:
@@ -256,8 +259,9 @@ def _inside(folder: str, place: str) -> PurePosixPath:
 def _require_room(folder: Path, address: str, size: float) -> None:
     free = shutil.disk_usage(folder).free
     if free < size + LEAST_FREE_BYTES:
-        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left, and {address} has "
-                        f"{size / 1e6:.0f}.", "It is brought here before it is used.",
+        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left, and {address} needs "
+                        f"{size / 1e6:.0f} MB.",
+                        "The file is copied to this disk before it is used.",
                         "Make room, or name another disk (`work` in the job file).")
 
 
@@ -272,5 +276,6 @@ def _copy(system: Any, place: str, target: Path, size: int | None,
             if size is not None and count > size:
                 break
     if size is not None and count != size:
-        raise WorkError(f"{place} was to have {size} bytes, and {count} came.",
-                        "It was cut short, or written meanwhile.", "Run this again.")
+        raise WorkError(f"{place} should have {size} bytes, but {count} were received.",
+                        "The transfer was interrupted, or the file was written to at the same "
+                        "time.", "Run this again.")

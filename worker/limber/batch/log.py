@@ -1,4 +1,4 @@
-"""What a batch did, line by line, for whoever looks in the morning: a text file of bounded size."""
+"""The log of a batch, for reading afterwards: a text file of bounded size."""
 
 import logging
 from logging.handlers import RotatingFileHandler
@@ -19,7 +19,7 @@ def path_of_log(jobs: JobFile) -> Path:
 class BatchLog:
     """Appends lines with their time to a batch's log; use it in a ``with``.
 
-    A line that cannot be written, on a full disk, is told on standard error and costs no work.
+    A line that cannot be written, on a full disk, is printed on standard error instead.
     """
 
     def __init__(self, jobs: JobFile):

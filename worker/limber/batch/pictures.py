@@ -1,4 +1,4 @@
-"""A picture of each branch for the summary: its axes from two sides, coloured by what is known."""
+"""A picture of each branch for the summary: its axes from two sides, coloured by modulus."""
 
 import html
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a batch has done so far: lines that are appended as it happens, whatever ends it."""
+"""The progress of a batch: lines appended as it happens, so that they survive any end."""
 
 import json
 import os
@@ -14,13 +14,13 @@ from limber.core.present import present
 from limber.store.growing_files import Stream, stream_lines
 
 _LEAST_LINES, _MOST_TIMES = 2000, 4
-"""The file is shortened when it has so many lines, and so many times those that still count."""
+"""The file is shortened when it has this many lines, and this many times the valid ones."""
 WAITING, RUNNING, DONE, KEPT, FAILED = "waiting", "running", "done", "up to date", "failed"
 
 
 @dataclass(frozen=True)
 class Record:
-    """How a task stands: ``numbers`` are those of its result, ``memory_mb`` its largest.
+    """The state of a task: ``numbers`` are those of its result, ``memory_mb`` its largest.
 
     ``content`` is the digest of the branch that a stage has shown which stores nothing in it.
     """
@@ -49,7 +49,7 @@ class Records:
             self._take(line)
 
     def of(self, branch: BranchJob, task: StageTask) -> Record:
-        """Return how a task stands; one that was running when its batch was killed waits."""
+        """Return the state of a task; one that ran when its batch was killed is waiting."""
         return self._found.get((branch.name, task.fingerprint), Record())
 
     @contextmanager

@@ -37,7 +37,7 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
         jobs: The checked job file.
         records: Take in how each task ends, as it happens.
         retry_failed: Try again what has failed.
-        workers: At most so many branches side by side; by default the file's, or the core budget.
+        workers: Largest number of parallel branches; by default the file's, or the core budget.
             On a queue's cluster: how many jobs to ask for.
         cluster: Where, as one of :data:`limber.batch.jobs.job_file.CLUSTERS`; by default the
             file's, or this process's own pool.
@@ -59,7 +59,7 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
 
 
 class Machines(Protocol):
-    """Where tasks are run: so many at a time, stopped all at once."""
+    """Runs tasks: a number at a time; all can be stopped together."""
 
     @property
     def count(self) -> int: ...
@@ -92,7 +92,7 @@ class _ThisProcess:
 
 
 class _Course:
-    """The way of all branches through their tasks; each may be fetched before and put after."""
+    """Takes all branches through their tasks; each may be fetched before and uploaded after."""
 
     def __init__(self, jobs: JobFile, records: Records, machines: Machines, staging: Staging,
                  log: BatchLog, progress: Progress, *, retry_failed: bool):
@@ -171,13 +171,13 @@ class _Course:
         except OSError:
             is_there = False
         if not is_there:
-            raise WorkError(f"{self.jobs.out} is not there any more.",
-                            "Results and records go there; it was moved, or its disk or network "
-                            "folder was lost.",
-                            "Bring it back and run this again: what was stored is kept.")
+            raise WorkError(f"{self.jobs.out} no longer exists.",
+                            "Results and records are written there. It was moved, or its disk or "
+                            "network folder was lost.",
+                            "Restore it and run this again. Stored results are kept.")
 
     def end(self, branch: BranchJob) -> None:
-        """Have what came of a branch put where it belongs, or count it as ended."""
+        """Have the results of a branch uploaded, or count it as ended."""
         if branch.home or self.jobs.home:
             self.running[self.staging.put(branch)] = (
                 branch, len(branch.tasks), time.monotonic())
@@ -261,7 +261,7 @@ def _step(branch: BranchJob, number: int) -> str:
 
 def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,
             ) -> list[tuple[BranchJob, StageTask, str]]:
-    """Return what a run would do: each branch's tasks, in order, and what comes of them."""
+    """Return what a run would do: each branch's tasks, in order, and their status."""
     found = []
     for branch in jobs.branches:
         stopped = ""
@@ -270,12 +270,12 @@ def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,
             if stopped:
                 told = stopped
             elif record.status == FAILED and not retry_failed:
-                told, stopped = "not again: it failed (--retry-failed)", "not reached"
+                told, stopped = "not repeated: it failed (--retry-failed)", "not reached"
             elif record.status == RUNNING:
                 told = "running"
             elif record.has_succeeded:
-                told = "done before; runs again if its input has changed"
+                told = "done earlier; runs again if its input has changed"
             else:
-                told = "to run" if record.status != FAILED else "to try again"
+                told = "to be run" if record.status != FAILED else "to be repeated"
             found.append((branch, task, told))
     return found

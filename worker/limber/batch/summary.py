@@ -1,4 +1,4 @@
-"""What came of a batch: a table with one row a branch, and a page to look at."""
+"""The summary of a batch: a table with one row per branch, and an HTML page."""
 
 import csv
 import html
@@ -128,13 +128,13 @@ def _branch(branch: BranchJob, records: Records, page: Path) -> Iterator[str]:
 
 
 def _title(branch: BranchJob, page: Path) -> str:
-    """The branch's name, leading to its own report where it has one."""
+    """The branch's name, with a link to its report if it has one."""
     name, way = html.escape(branch.name), _way(branch.folder / "report.html", page)
     return f"<a href='{way}'>{name}</a>" if way else name
 
 
 def _rendered(branch: BranchJob, page: Path) -> str:
-    """What `limber scene` has rendered of the branch."""
+    """The branch's pictures that `limber scene` has rendered."""
     shown = (getattr(task.inputs, kind, None) for task in branch.tasks
              for kind in ("render", "turntable"))
     ways = [way for path in shown if path and (way := _way(path, page))]
@@ -143,7 +143,7 @@ def _rendered(branch: BranchJob, page: Path) -> str:
 
 
 def _way(path: Path, page: Path) -> str:
-    """The way from the page to a file beside it, as a link has it; none leads to no file."""
+    """The relative link from the page to a file beside it; empty if the file does not exist."""
     if not path.is_file():
         return ""
     try:

@@ -1,1 +1,1 @@
-"""What people and other programs look at: report, Blender scene, exports, motion files."""
+"""Results for people and other programs: report, Blender scene, exports, motion files."""

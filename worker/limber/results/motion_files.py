@@ -34,8 +34,9 @@ def write_pc2(path: Path, positions: np.ndarray, start: float = 0.0, rate: float
     positions = np.asarray(positions, np.float32)
     shaped = positions.ndim == 3 and positions.shape[2] == 3 and len(positions) > 0
     if not shaped or not np.isfinite(positions).all():
-        raise InputError(f"Frames of shape {positions.shape}, or not finite.",
-                         "A cache needs [frames, vertices, 3].", "Check the motion.")
+        raise InputError(f"The frames have shape {positions.shape}, or are not finite.",
+                         "A cache needs finite positions of shape [frames, vertices, 3].",
+                         "Check the motion.")
     header = _PC2_HEADER.pack(b"POINTCACHE2\0", 1, positions.shape[1], start, rate,
                               positions.shape[0])
     write_atomically(Path(path), header + positions.astype("<f4").tobytes())
@@ -52,13 +53,14 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
     header = data[:_PC2_HEADER.size] if whole else bytes(_PC2_HEADER.size)
     name, _, count, start, rate, frames = _PC2_HEADER.unpack(header)
     if name != b"POINTCACHE2\0" or len(data) - _PC2_HEADER.size != frames * count * 12:
-        raise InputError(f"{path} is not a whole PC2 file.", "It is damaged or of another kind.",
+        raise InputError(f"{path} is not a complete PC2 file.",
+                         "It is damaged or has another format.",
                          "Write it again.")
     body = np.frombuffer(data, "<f4", offset=_PC2_HEADER.size)
     if not (frames > 0 and count > 0 and np.isfinite(body).all()
             and np.isfinite([start, rate]).all()):
-        raise InputError(f"{path} has no frames, or places that are not finite.",
-                         "Nothing can move so.", "Write it again.")
+        raise InputError(f"{path} has no frames, or has positions that are not finite.",
+                         "It does not describe a motion.", "Write it again.")
     return body.reshape(frames, count, 3), start, rate
 
 
@@ -89,12 +91,12 @@ class FramesFile(FileContent):
 
 
 def read_frames_file(path: Path) -> FramesFile:
-    """Read what is said of the frames of a motion.
+    """Read the description of a motion's frames.
 
     Raises:
         InputError: it cannot be read, or its lists do not fit each other.
     """
-    return read_json_as(path, FramesFile, "what is said of a motion's frames")
+    return read_json_as(path, FramesFile, "a description of a motion's frames")
 
 
 def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np.ndarray]:

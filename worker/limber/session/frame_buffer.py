@@ -1,4 +1,4 @@
-"""The file through which a session hands over frames: memory-mapped, one writer, any readers.
+"""The file that passes a session's frames: memory-mapped, one writer, any number of readers.
 
 Little-endian; a reader needs nothing but numpy and mmap.
 
@@ -263,7 +263,8 @@ class FrameReader:
         if not layout.fits(size):
             self._map.close()
             raise InputError(f"{os.fspath(path)} of {size} bytes is cut short or damaged.",
-                             "Its header announces more than it contains.", "Start a new session.")
+                             "Its header states more data than the file contains.",
+                             "Start a new session.")
         self.vertex_count, face_count = counts[:2]
         self.faces = np.frombuffer(self._map, "<i4", 3 * face_count, layout.faces_at
                                    ).reshape(-1, 3).copy()

@@ -1,4 +1,4 @@
-"""What a session still has to do, between the thread that reads its client and the one that solves.
+"""The commands that wait, between the thread that reads the client and the one that solves.
 
 Commands keep their order, but a ``move`` replaces the one before it of the same grasp: of poses
 that come while one is being solved, the newest wins. What waits is bounded.
@@ -106,4 +106,4 @@ def _take(line: bytes | None, inbox: Inbox, refuse: Callable[[int, str], None]) 
         inbox.close()
     elif not inbox.put(command):
         refuse(command.id, f"{_WAITING_LIMIT} commands are waiting, which is the limit. Send "
-                           "fewer, or wait for replies.")
+                           "fewer commands, or wait for replies.")

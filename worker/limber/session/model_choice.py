@@ -1,4 +1,4 @@
-"""Which model answers for the branch that is held, and what is being learnt for it."""
+"""The choice of the model that answers for the held branch, and the models being learnt."""
 
 import time
 from collections.abc import Callable
@@ -135,7 +135,7 @@ class Answering:
     def set_dynamics(self, on: bool) -> None:
         """Let the branch move in time, or answer with equilibria."""
         if on and not self._settings.reduced:
-            raise InputError("Motion needs the reduced model.",
+            raise InputError("Motion needs a reduced model.",
                              "This session was started without one.",
                              "Start it without --no-reduced.")
         self._wants_motion = on

@@ -1,4 +1,4 @@
-"""The branch a session starts from, and what its reduced model is made of."""
+"""The initial branch of a session, and the inputs of its reduced model."""
 
 from pathlib import Path
 

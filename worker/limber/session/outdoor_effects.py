@@ -1,4 +1,4 @@
-"""What loads outdoors do to the held branch, worked out beside the frames in a process of its own.
+"""The effects of outdoor loads on the held branch, computed in a separate process.
 
 It takes seconds: meanwhile the branch is moved on. The answer is of the branch as its folder has
 it, with the moduli and the loads that the session had when it was asked.

@@ -1,4 +1,4 @@
-"""What a client may say to a session, checked before anything acts on it.
+"""The messages that a client may send to a session, checked before they take effect.
 
 One JSON object a line, UTF-8, at most ``LINE_LIMIT`` bytes. Every command may carry an ``id``, that
 its reply carries again. Whatever is wrong with a line is said in an ``error`` reply; nothing that a
@@ -14,9 +14,9 @@ from limber.core.errors import InputError
 from limber.core.json_lines import json_object
 
 PROTOCOL = 2
-"""Of commands, events and the frames' file; a client of another one is told so."""
+"""Version of commands, events and the frames' file; clients with another one are refused."""
 LINE_LIMIT = 1 << 20
-"""Longest line [bytes]; what is longer is dropped up to its end, and said."""
+"""Longest line [bytes]; a longer line is discarded and reported."""
 GRASP_LIMIT = 8
 """Most grasps at once."""
 _FAR = 1e3
@@ -37,7 +37,7 @@ class _Command(BaseModel):
 
 
 class _OnBranch(BaseModel):
-    """A place on the branch: a vertex of the surface, or a point of the branch as scanned [m]."""
+    """A position on the branch: a vertex of the surface, or a point of the scanned branch [m]."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -47,7 +47,7 @@ class _OnBranch(BaseModel):
     @model_validator(mode="after")
     def _one_place(self) -> "_OnBranch":
         if (self.vertex is None) == (self.point is None):
-            raise ValueError("a place is either `vertex` or `point`")
+            raise ValueError("give a position as either `vertex` or `point`")
         return self
 
 
@@ -59,7 +59,7 @@ class Hello(_Command):
 
 
 class Grab(_Command, _OnBranch):
-    """Hold the branch at a place, where that is now."""
+    """Hold the branch at a position, where that is now."""
 
     command: Literal["grasp"]
     mode: Literal["clamped", "pinned"] = "pinned"
@@ -103,7 +103,7 @@ class Young(_Command):
 
 
 class Load(_OnBranch):
-    """A dead load [N] at a place."""
+    """A dead load [N] at a position."""
 
     force_n: tuple[_Component, _Component, _Component]
 

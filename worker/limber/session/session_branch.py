@@ -1,4 +1,4 @@
-"""The branch of a session with all that holds and loads it, and its equilibria in full.
+"""The branch of a session with its grasps and loads, and its equilibria on the full model.
 
 Nothing here knows of clients, threads or files: :mod:`limber.session.worker` brings the wishes and
 publishes the answers.
@@ -106,7 +106,7 @@ class HeldBranch:
         """
         if len(self.grasps) >= GRASP_LIMIT:
             raise InputError(f"There are already {GRASP_LIMIT} grasps.",
-                             "A frame has no room for more.", "Release one.")
+                             "A frame cannot hold more.", "Release one.")
         return self.hold(Grasp.at(self.model.mesh, self._place(vertex, point), radius, mode))
 
     def hold(self, grasp: Grasp) -> int:
@@ -137,7 +137,7 @@ class HeldBranch:
             InputError: there is none, or not that one.
         """
         if not self.grasps:
-            raise InputError("Nothing is held.", "A move needs a grasp.", "Send a grasp first.")
+            raise InputError("No grasp is held.", "A move needs a grasp.", "Send a grasp first.")
         number = min(self.grasps) if number is None else number
         if number not in self.grasps:
             raise InputError(f"There is no grasp {number}.",
@@ -213,7 +213,7 @@ class HeldBranch:
             InputError: there are none, or the branch's weight is switched off.
         """
         if self._outdoors is None:
-            raise InputError("There is neither wind nor snow, fruit or a cut.", "",
+            raise InputError("There is no wind, snow, fruit or cut.", "",
                              "Send `outdoors` first.")
         if not self.gravity_on and self.model.hanging is not None:
             raise InputError("The branch's weight is switched off.",

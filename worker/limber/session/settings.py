@@ -1,4 +1,4 @@
-"""What a session is started with."""
+"""The settings of a session."""
 
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ class SessionSettings(BaseModel):
     mode: Literal["clamped", "pinned"] = Field(
         "clamped", description="What the marked grasp holds: position and rotation, or the "
             "position only.")
-    grasp: bool = Field(True, description="Start with the marked grasp held. Otherwise nothing "
+    grasp: bool = Field(True, description="Start with the marked grasp held. Otherwise no grasp "
         "is held.")
     gravity: bool = Field(True, description="The branch carries its own weight, as when it was "
         "scanned.")

@@ -115,8 +115,8 @@ class Learning:
             pass  # closed while it was read
         if not self._closed:
             self.has_failed = True
-            self._say(event="warning", message="the trainer has ended; the reduced model is no"
-                      " longer checked, or there is none")
+            self._say(event="warning", message="the trainer has ended; the reduced model is no "
+                      "longer checked, or does not exist")
 
     def _hear(self, content: dict[str, Any]) -> None:
         if self._closed:

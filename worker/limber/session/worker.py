@@ -214,7 +214,7 @@ class Session:
             case protocol.Hello(protocol=number) if number != protocol.PROTOCOL:
                 raise InputError(
                     f"The client speaks protocol {number}, this session {protocol.PROTOCOL}.",
-                    "They are of different versions of Limber.", "Install one version for both.")
+                    "They belong to different versions of Limber.", "Install one version for both.")
         return {}
 
     def _answer(self) -> None:

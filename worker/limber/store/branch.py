@@ -1,4 +1,4 @@
-"""The branch folder ``NAME.branch/``: ordinary files and a manifest that vouches for them.
+"""The branch folder ``NAME.branch/``: ordinary files and a manifest with their checksums.
 
 Every stage of the pipeline writes through :meth:`Branch.stage`::
 
@@ -140,7 +140,7 @@ class Branch:
         if folder.is_dir() and any(not is_litter(p.name) for p in folder.iterdir()):
             raise BranchFolderError(
                 f"{folder} exists and is not a branch folder.",
-                f"It has files but no {MANIFEST}; writing there could overwrite them.",
+                f"It contains files but no {MANIFEST}. Writing there could overwrite them.",
                 "Name a new folder with -o, for example NAME.branch.")
         name = folder.name.removesuffix(".branch") or folder.resolve().name.removesuffix(".branch")
         begin(folder, Manifest(name=name))
@@ -211,7 +211,7 @@ class Branch:
         """
         if not self.has(name):
             raise BranchFolderError(
-                f"{self.folder} has no {name}.", "The stage that makes it has not been run.",
+                f"{self.folder} has no {name}.", "The stage that writes it has not been run.",
                 f"Run `limber {made_by}` first.")
         return self.path(name)
 
@@ -368,7 +368,7 @@ class Branch:
         if missing:
             raise BranchFolderError(
                 f"{self.folder} has no {', '.join(missing)}.",
-                "The stage that makes it has not been run.", "Run the earlier stages first.")
+                "The stage that writes it has not been run.", "Run the earlier stages first.")
         self._check(reads)
         return {name: self.digest(name) for name in reads} | dict(digests or {})
 

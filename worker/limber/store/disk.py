@@ -1,4 +1,4 @@
-"""What a full disk or a lost folder does to a stage, as its user can read it."""
+"""Messages for stages that meet a full disk or a lost folder."""
 
 import gc
 import shutil

@@ -1,4 +1,4 @@
-"""The folder of a branch before anything of it is read: made, there, whole, without links."""
+"""Checks of a branch folder before it is read: it exists, is complete and has no links."""
 
 import os
 import shutil
@@ -41,7 +41,8 @@ def begin(folder: Path, manifest: Manifest) -> None:
             return
         raise BranchFolderError(
             f"{folder} cannot be written to ({error.strerror}).",
-            "Results go there.", "Choose another place with -o, or change its permissions.",
+            "Results are written there.",
+            "Choose another folder with -o, or change its permissions.",
         ) from error
 
 

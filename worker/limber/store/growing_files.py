@@ -74,9 +74,9 @@ class Stream:
             WorkError: an earlier line could not be written, as on a full disk.
         """
         if "\n" in line or "\r" in line:
-            raise InputError("A line of a stream has a line end in it.", "It would become two "
+            raise InputError("A line of a stream contains a line break.", "It would become two "
                                                                          "lines.",
-                             "Append them one by one.")
+                             "Append the lines one by one.")
         self._raise_error()
         with self._guard:
             self._waiting.append(line.encode("utf-8") + b"\n")

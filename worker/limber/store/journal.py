@@ -1,4 +1,4 @@
-"""How a stage's files enter a branch folder: all of them or none, also when the program is killed.
+"""How a stage's files enter a branch folder: all or none, even if the program is killed.
 
 The work folder, with the new manifest in it, is renamed to ``.commit``: that is the moment from
 which the stage counts. Then its files are moved into place, the manifest last. Whoever finds a
@@ -44,8 +44,8 @@ def unfinished_error(folder: Path) -> BranchFolderError:
     return BranchFolderError(
         f"{folder} has results of an interrupted command that are not in place yet "
         f"({_COMMIT}).", "This command only reads, and changes nothing in the folder.",
-        f"Run `limber verify {shlex.quote(str(folder))} --finish`, or any stage that writes to the "
-        "folder: it puts them in place. Then run this again.")
+        f"Run `limber verify {shlex.quote(str(folder))} --finish`, or any stage that writes to "
+        "the folder. It puts the results in place. Then run this again.")
 
 
 def commit(folder: Path, work: Path, manifest: Manifest) -> None:

@@ -1,4 +1,4 @@
-"""What stages read from a branch folder, as the values that the packages below take.
+"""The data that stages read from a branch folder, as values for the packages below.
 
 The packages know no folder: whatever of a branch's mesh, masses, axes and pulls goes into a
 computation comes through here.
@@ -128,7 +128,7 @@ def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
     known = read_json_as(branch.path("targets.json"), _Targets, "a list of targets")
     if known.format_version != TARGETS_FORMAT:
         raise InputError(f"{branch.folder}/targets.json has format {known.format_version}.",
-                         f"This program knows format {TARGETS_FORMAT}.", "Update Limber.")
+                         f"This program supports format {TARGETS_FORMAT}.", "Update Limber.")
     return tuple(NamedTarget(t.name, t.position_m, t.mass_kg) for t in known.targets)
 
 

@@ -1,4 +1,4 @@
-"""Who may write to a branch folder: one program at a time, and its results enter one by one.
+"""The right to write to a branch folder: one program at a time, one result after another.
 
 Both locks are the operating system's, so that a program's end, however it came, sets them free.
 """
@@ -130,7 +130,8 @@ def _acquire(lock: BaseFileLock, folder: Path, wait_seconds: float) -> None:
         if isinstance(error, Timeout):
             raise
         raise BranchFolderError(
-            f"{folder} cannot be written to ({error.strerror or error}).", "Results go there.",
+            f"{folder} cannot be written to ({error.strerror or error}).",
+            "Results are written there.",
             "Change its permissions, or work on a copy.") from error
 
 

@@ -1,4 +1,4 @@
-"""The manifest ``branch.json``: what a branch folder holds, and what it was made from."""
+"""The manifest ``branch.json``: the content of a branch folder, and its sources."""
 
 import functools
 import hashlib

@@ -1,4 +1,4 @@
-"""What is wrong with a branch folder's files, compared with what its manifest vouches for."""
+"""The damage of a branch folder's files, compared with the checksums in its manifest."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

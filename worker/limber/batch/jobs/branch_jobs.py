@@ -1,4 +1,4 @@
-"""What a job file comes to: branches, and the stages that are run on each."""
+"""The content of a job file: branches, and the stages to run on each."""
 
 import hashlib
 import json

@@ -34,14 +34,14 @@ def read_jobs(path: Path) -> JobFile:
     """Read and check a job file.
 
     Raises:
-        InputError: it is no TOML, or says what cannot be run; every problem with its line.
+        InputError: it is not TOML, or cannot be run; lists every problem with its line.
     """
     path = Path(path)
     require_file(path, "A job file")
     try:
         content, text = read_toml(path, "a job file"), read_text(path, "a job file")
     except InputError as error:
-        raise InputError(error.seen, "A job file is TOML, and its numbers are finite.",
+        raise InputError(error.seen, "A job file is TOML with finite numbers.",
                          "`limber batch --help` shows what a job file looks like.") from error
     return _Reader(path, content, Problems(path, toml_lines(text))).read()
 
@@ -60,14 +60,14 @@ class _Reader:
                             problems.typed(content, "work", str, (), ""), self.path.stem)
         workers = problems.typed(content, "workers", int, (), None)
         if workers is not None and workers < 1:
-            problems.add(("workers",), "workers is at least 1.")
+            problems.add(("workers",), "workers must be at least 1.")
         cluster = problems.typed(content, "cluster", str, (), None)
         if cluster is not None and cluster not in CLUSTERS:
             problems.add(("cluster",), f"cluster = {cluster!r}: {nearest(cluster, CLUSTERS)}")
         limits = Limits(self.limit("time_limit", "s"), self.limit("memory_limit", "MB"))
         jobs = problems.tables(content, "job", ())
         if not jobs:
-            problems.add((), "It has no [[job]].")
+            problems.add((), "The file has no [[job]].")
         branches = [branch for number, job in enumerate(jobs)
                     for branch in self.job(job, ("job", number))]
         self.check_folders(branches)
@@ -81,7 +81,7 @@ class _Reader:
         try:
             value = in_unit(self.content[key], unit)
             if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-                raise ValueError(f"{self.content[key]!r} is no positive number of {unit}.")
+                raise ValueError(f"{self.content[key]!r} is not a positive number of {unit}.")
             return float(value)
         except ValueError as error:
             self.problems.add((key,), f"{key}: {error}")
@@ -97,7 +97,7 @@ class _Reader:
         for source, sweep in itertools.islice(branches, _MOST_BRANCHES):
             found.append(self.branch(source, sweep, stages, place))
         if next(branches, None) is not None:
-            self.problems.add(place, f"The job has over {_MOST_BRANCHES} branches.")
+            self.problems.add(place, f"The job has more than {_MOST_BRANCHES} branches.")
         return found
 
     def branch(self, source: Source, sweep: dict[str, Any], stages: list[dict[str, Any]],
@@ -117,19 +117,19 @@ class _Reader:
     def sources(self, job: dict[str, Any], place: Place) -> list[Source]:
         given = [key for key in ("scans", "folders") if key in job]
         if len(given) != 1:
-            self.problems.add(place, "A job has either scans or folders.")
+            self.problems.add(place, "A job needs either scans or folders.")
             return []
         key, at = given[0], (*place, given[0])
         look = self.paths.files if key == "scans" else self.paths.folders
         found: list[Source] = []
         for pattern in self.problems.typed(job, key, list, place, []):
             if not isinstance(pattern, str):
-                self.problems.add(at, f"{pattern!r} is no path.")
+                self.problems.add(at, f"{pattern!r} is not a path.")
                 continue
             matches = look(pattern, at)
             if matches == []:
                 what = "file" if key == "scans" else "branch folder"
-                self.problems.add(at, f"No {what} is {pattern!r}.")
+                self.problems.add(at, f"No {what} matches {pattern!r}.")
             found += [Source(path, key == "scans") for path in matches or ()]
         return found
 
@@ -142,28 +142,29 @@ class _Reader:
             return [{}]
         if table and "folders" in job:
             self.problems.add(at, "A sweep over branch folders would overwrite its own results. "
-                              "Sweep over scans, or give the stages names of their own.")
+                              "Sweep over scans, or give the results of the stages different "
+                              "names.")
             return [{}]
         choices = []
         for key, values in table.items():
             stage, _, name = key.partition(".")
             if not name or stage not in [about.get("run") for about in stages]:
-                self.problems.add((*at, key), f"{key!r} names no stage of this job and setting of "
-                                  "it, as \"reconstruct.mesh_spacing\" does.")
+                self.problems.add((*at, key), f"{key!r} does not name a stage of this job and one "
+                                  "of its settings. An example is \"reconstruct.mesh_spacing\".")
             elif not isinstance(values, list) or not values:
-                self.problems.add((*at, key), f"{key} takes a list of values.")
+                self.problems.add((*at, key), f"{key} needs a list of values.")
             else:
                 choices.append([(key, value) for value in values])
         return [dict(choice) for choice in itertools.product(*choices)]
 
     def check_folders(self, branches: list[BranchJob]) -> None:
-        """Two branches cannot share a folder; none leaves the folder that they go to."""
+        """Report branches that share a folder."""
         seen: set[Path] = set()
         for branch in branches:
             folder = branch.folder.resolve()
             if folder in seen:
-                self.problems.add((), f"Two branches would be {branch.name}.branch. Give the scans "
-                                  "different names, or run them as two job files.")
+                self.problems.add((), f"Two branches would be named {branch.name}.branch. Give "
+                                  "the scans different names, or use two job files.")
             seen.add(folder)
 
 

@@ -1,4 +1,4 @@
-"""The paths that a job file names; what is at an address gets one here."""
+"""The paths that a job file names; a remote file gets a local path."""
 
 import glob
 import hashlib
@@ -14,11 +14,11 @@ from limber.store.manifest import MANIFEST
 
 
 class JobPaths:
-    """Finds what a job file names, and keeps in mind what is at an address.
+    """Finds the files that a job file names, and remembers their addresses.
 
     Args:
         folder: Of the job file: paths in it begin there.
-        problems: Told what is wrong with a path, and its place in the job file.
+        problems: Collects what is wrong with a path, and its position in the job file.
 
     Attributes:
         out: Where results go, and what is fetched.
@@ -36,7 +36,8 @@ class JobPaths:
         self.out = self._folder / otherwise
         if work and (is_address(work) or not is_address(out)):
             self._problems.add(
-                ("work",), "work is a folder here, for results that go to an address.")
+                ("work",), "work must be a folder on this computer, and needs an address in "
+                           "`out`.")
         elif is_address(out):
             self.home = self._tried(checked_address, out, ("out",)) or ""
             self.out = self._folder / (work or otherwise)
@@ -73,9 +74,9 @@ class JobPaths:
         if is_address(name):
             if self._tried(checked_address, name, place):
                 self._problems.add(
-                    place, f"{name!r} is an address; what stages write goes to `out`.")
+                    place, f"{name!r} is an address. Stages write their files to `out` only.")
         elif not path.is_relative_to(self.out.resolve()):
-            self._problems.add(place, f"{name!r} leads out of {self.out}.")
+            self._problems.add(place, f"{name!r} is outside {self.out}.")
         return path
 
     def address_of(self, path: Path) -> str:
@@ -83,7 +84,7 @@ class JobPaths:
         return self._known.get(path, "")
 
     def fetched(self, paths: list[Path]) -> tuple[tuple[str, Path], ...]:
-        """Return address and path of those that have to be fetched."""
+        """Return address and path of the files that must be fetched."""
         return tuple((self._known[path], path) for path in dict.fromkeys(paths)
                      if path in self._known)
 

@@ -1,4 +1,4 @@
-"""What is wrong with a job file: gathered, and told at once, each with its line."""
+"""The problems of a job file: collected, and reported together, each with its line."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ _KINDS = {str: "a text", int: "a whole number", list: "a list"}
 
 
 class Problems:
-    """The problems of one file, of which ``lines`` says where what stands."""
+    """The problems of one file; ``lines`` gives the line of each key."""
 
     def __init__(self, path: Path, lines: dict[Place, int]):
         self._path, self._lines = path, lines
@@ -22,7 +22,7 @@ class Problems:
         self._told.append((line_of(self._lines, place), text))
 
     def stop(self) -> None:
-        """Raise an InputError that tells them, if there are any."""
+        """Raise an InputError that lists them, if there are any."""
         if not self._told:
             return
         told = [f"{self._path}, line {line}: {text}"
@@ -34,22 +34,22 @@ class Problems:
     def check_keys(self, table: dict[str, Any], known: tuple[str, ...], place: Place) -> None:
         for key in table:
             if key not in known:
-                self.add((*place, key), f"{key!r} is not known here. {nearest(key, known)}")
+                self.add((*place, key), f"{key!r} is unknown here. {nearest(key, known)}")
 
     def typed(self, table: dict[str, Any], key: str, kind: type, place: Place,
               otherwise: Any) -> Any:
-        """Return a value of this kind; ``otherwise`` where there is none."""
+        """Return a value of this kind; ``otherwise`` if it is missing or has another type."""
         value = table.get(key, otherwise)
         if value is not otherwise and (not isinstance(value, kind) or isinstance(value, bool)):
-            self.add((*place, key), f"{key} is {value!r}; it takes {_KINDS[kind]}.")
+            self.add((*place, key), f"{key} is {value!r}, but must be {_KINDS[kind]}.")
             return otherwise
         return value
 
     def tables(self, table: dict[str, Any], key: str, place: Place) -> list[dict[str, Any]]:
-        """Return the tables of a name, as ``[[job]]`` are; none where it is something else."""
+        """Return the tables of a name, as ``[[job]]`` are; an empty list if it has another type."""
         found = table.get(key, [])
         if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
             names = ".".join(str(part) for part in (*place, key) if isinstance(part, str))
-            self.add((*place, key), f"Write {key} as tables: [[{names}]].")
+            self.add((*place, key), f"Write {key} as an array of tables: [[{names}]].")
             return []
         return found

@@ -1,4 +1,4 @@
-"""A job file as a script for those who schedule otherwise: a Slurm array, or a Snakefile.
+"""A job file as a script for other schedulers: a Slurm array, or a Snakefile.
 
 Each branch is one task: its stages one after the other, as command lines. What is up to date is
 kept, as ever, so a task that was cut off is simply run again.
@@ -31,8 +31,8 @@ def write_script(jobs: JobFile, kind: str) -> Path:
         InputError: inputs or results are at addresses.
     """
     if jobs.home or any(branch.is_moved for branch in jobs.branches):
-        raise InputError(f"{jobs.path} has addresses.", "A script runs stages on files here; what "
-                         "is elsewhere is fetched and put by the batch itself.",
+        raise InputError(f"{jobs.path} contains addresses.", "A script runs stages on local "
+                         "files. Only the batch itself fetches and uploads remote files.",
                          "Run it without --emit, or fetch the files first.")
     jobs.out.mkdir(parents=True, exist_ok=True)
     path = jobs.out / f"{jobs.path.stem}.{'slurm' if kind == 'slurm' else 'smk'}"
@@ -57,8 +57,8 @@ def _minutes(jobs: JobFile, branch_tasks: int) -> int:
 def _slurm(jobs: JobFile) -> Iterator[str]:
     longest = max(len(branch.tasks) for branch in jobs.branches)
     yield "#!/usr/bin/env bash"
-    yield f"# Made of {jobs.path.name} by `limber batch --emit slurm`. Submit with sbatch, where"
-    yield "# `limber` is on the PATH; submit again to go on after a stop."
+    yield f"# Made from {jobs.path.name} by `limber batch --emit slurm`. Submit with sbatch, where"
+    yield "# `limber` is on the PATH; submit again to continue after a stop."
     yield f"#SBATCH --job-name=limber-{shlex.quote(jobs.path.stem)}"
     yield f"#SBATCH --array=0-{len(jobs.branches) - 1}"
     yield "#SBATCH --cpus-per-task=1"
@@ -79,7 +79,7 @@ def _slurm(jobs: JobFile) -> Iterator[str]:
 
 
 def _snakemake(jobs: JobFile) -> Iterator[str]:
-    yield f"# Made of {jobs.path.name} by `limber batch --emit snakemake`:"
+    yield f"# Made from {jobs.path.name} by `limber batch --emit snakemake`:"
     yield "# snakemake --cores N -s FILE"
     yield f"workdir: {str(Path.cwd())!r}"
     names = [f"branch_{number}" for number in range(len(jobs.branches))]

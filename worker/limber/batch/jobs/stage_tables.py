@@ -23,12 +23,12 @@ from limber.stages.registry import (
 )
 
 _PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
-_ROBOTS = {"always": "It moves a robot: somebody has to stand beside it.",
-           "when armed": "It may move a robot: run it at a terminal."}
+_ROBOTS = {"always": "It moves a robot, which a person must supervise.",
+           "when armed": "It may move a robot. Run it at a terminal."}
 
 
 def why_not_in_batches(name: str) -> str:
-    """Return why a stage cannot stand in a job file; nothing where it can.
+    """Return why a stage is not allowed in a job file; an empty text if it is allowed.
 
     Raises:
         KeyError: there is no such stage.
@@ -37,7 +37,7 @@ def why_not_in_batches(name: str) -> str:
     if stage.moves_robot:
         return _ROBOTS[stage.moves_robot]
     if not stage.inputs.model_fields.keys() & {"branch_folder", "output"}:
-        return "It makes a scan, not a branch: run it before, and name its cloud under scans."
+        return "It makes a scan, not a branch. Run it first, and list its cloud under scans."
     return ""
 
 
@@ -82,7 +82,7 @@ class StageTables:
 
 
 class _StageValues:
-    """The values of one stage on one branch, each with its place in the file."""
+    """The values of one stage on one branch, each with its position in the file."""
 
     def __init__(self, of: StageTables, stage: StageDescription,
                  given: dict[str, tuple[Any, Place]], place: Place):
@@ -100,7 +100,7 @@ class _StageValues:
         values: dict[str, Any] = {}
         for key, value in self._given.items():
             if key in own:
-                self._problems.add(self._places[key], f"{key!r} is given by the batch.")
+                self._problems.add(self._places[key], f"The batch sets {key!r} itself. Remove it.")
             elif key not in self._fields:
                 self._problems.add(self._places[key], f"{self._stage.name} has no {key!r}. "
                                    f"{nearest(key, list(self._fields))}")
@@ -115,8 +115,8 @@ class _StageValues:
             return {"branch_folder": self._of.folder}
         source = next(key for key, about in self._fields.items() if about.get("argument"))
         if not self._of.source.is_scan:
-            self._problems.add((), f"{self._stage.name} makes a branch of a scan; this job has "
-                               "branch folders.")
+            self._problems.add((), f"{self._stage.name} makes a branch from a scan, but this job "
+                               "has branch folders.")
         return {source: self._of.source.path, "output": self._of.folder}
 
     def _value(self, key: str, value: Any) -> Any:
@@ -137,7 +137,7 @@ class _StageValues:
                 return self._of.source.name
             if match.group(1) == "file":
                 return match.group(0)
-            self._problems.add(place, f"{match.group(0)} is not known; {{scan}} and {{file}} are.")
+            self._problems.add(place, f"{match.group(0)} is unknown. Use {{scan}} or {{file}}.")
             return ""
         return _PLACEHOLDER.sub(fill, text)
 
@@ -162,7 +162,7 @@ class _StageValues:
             return [(key, self._of.paths.file(name, place), False)]
         matches = self._of.paths.files(name, place)
         if matches == []:
-            self._problems.add(place, f"{key}: no file is {name!r}.")
+            self._problems.add(place, f"{key}: no file matches {name!r}.")
         return [(key, path, True) for path in matches or ()]
 
     def _checked(self, values: dict[str, Any]) -> StageTask | None:
@@ -193,7 +193,7 @@ def _trouble(name: str) -> str:
     known = stage_summaries()
     if name in known:
         return why_not_in_batches(name)
-    return "there is no such stage. " + nearest(
+    return "this stage does not exist. " + nearest(
         name, [each for each in known if not why_not_in_batches(each)])
 
 

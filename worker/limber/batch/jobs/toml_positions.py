@@ -1,4 +1,4 @@
-"""Where in a TOML file a key stands: the parser says what is there, not where."""
+"""The line of each key in a TOML file, which the parser does not report."""
 
 import re
 
@@ -39,7 +39,7 @@ def toml_lines(text: str) -> dict[Place, int]:
 
 
 def line_of(lines: dict[Place, int], place: Place) -> int:
-    """Return the line of ``place``, or of the nearest thing around it."""
+    """Return the line of ``place``, or of the nearest table around it."""
     while place not in lines:
         place = place[:-1]
     return lines[place]

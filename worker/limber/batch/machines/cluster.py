@@ -1,4 +1,4 @@
-"""Machines beyond this process, by Dask: a cluster started here, asked of a queue, or found.
+"""Machines beyond this process, by Dask: a cluster started here, by a queue, or already running.
 
 Command lines go out, outcomes come back; branch folders stand where all machines see them. What
 is sent is encrypted and both ends are known to each other (TLS); only a scheduler that somebody
@@ -38,11 +38,11 @@ _UNWATCHED = {"distributed.worker.profile.enabled": False, "distributed.admin.ti
 """Nor how Dask's own processes spend their time, which takes some of the stages'."""
 _WAIT_SECONDS = 0.5
 _MEMORY_MB = 4000.0
-"""What a job asks of a queue where neither the job file nor Dask's settings say."""
+"""The memory requested for a job if neither the job file nor Dask's settings state it."""
 
 
 class ClusterLostError(WorkError):
-    """The scheduler does not answer any more; what was done is kept."""
+    """The scheduler no longer responds; completed results are kept."""
 
 
 class Cluster:
@@ -52,11 +52,11 @@ class Cluster:
         jobs: The job file; its limits hold for each stage.
         kind: One of :data:`~limber.batch.jobs.job_file.CLUSTERS`, or None with an ``address``.
         address: Of a scheduler that runs already: ``tls://HOST:PORT``, or ``tcp://`` on loopback.
-        workers: How many workers to start, or jobs to ask of a queue.
-        progress: Told while no worker has come yet; cancelling it ends the wait.
+        workers: Number of workers to start, or of jobs to request from a queue.
+        progress: Reports the wait for the first worker; cancelling it ends the wait.
 
     Raises:
-        InputError: the address would not be safe, or a queue was not told how many jobs.
+        InputError: the address is not safe, or the number of jobs for a queue is missing.
         MissingDependencyError: Dask is not installed.
         WorkError: the cluster could not be started, or a worker of it cannot run the tasks.
         Cancelled: it was, before a worker came.
@@ -76,7 +76,7 @@ class Cluster:
 
     @property
     def count(self) -> int:
-        """How many tasks to have under way."""
+        """Number of tasks to run at a time."""
         return self._wanted or max(sum(self._client.nthreads().values()), 1)
 
     def submit(self, task: StageTask, folder: Path) -> Future:
@@ -117,9 +117,10 @@ class Cluster:
         error = remote.exception()
         if isinstance(error, KilledWorker):
             error = WorkError(
-                "Every worker that ran it was lost.", "The stage, or what else ran on those "
-                "machines, took more memory or time than they had, or they went down.",
-                "See the queue's logs; ask for more memory or time in Dask's settings.")
+                "Every worker that ran this stage was lost.",
+                "The stage or another program on those machines exceeded their memory "
+                "or time, or the machines failed.",
+                "See the queue's logs, and request more memory or time in Dask's settings.")
         if error is not None:
             future.set_exception(error)
         else:
@@ -136,9 +137,9 @@ class Cluster:
             try:
                 return Client(address, timeout="20s", set_as_default=False)
             except (OSError, ValueError, TypeError) as error:
-                raise WorkError(f"No Dask scheduler answers at {address} ({error}).", "",
+                raise WorkError(f"No Dask scheduler responds at {address} ({error}).", "",
                                 "Start `dask scheduler` and `dask worker --no-nanny`, with the "
-                                "same certificates in Dask's settings here and there.") from error
+                                "same certificates in Dask's settings on all machines.") from error
         # As long as the cluster is there: it may start a lost worker anew.
         stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _UNWATCHED))
         cluster = stack.enter_context(
@@ -164,14 +165,14 @@ class Cluster:
 
         self._wanted = self._wanted or jobs.workers
         if self._wanted is None:
-            raise InputError(f"How many jobs to ask of {kind} is not said.",
-                             "Each waits in the queue and costs what its allocation costs.",
+            raise InputError(f"The number of jobs to request from {kind} is not given.",
+                             "Each job waits in the queue and uses its allocation.",
                              "Give --workers N, or `workers = N` in the job file.")
         made = getattr(dask_jobqueue, _QUEUES[kind])
         submitter = made.job_cls.submit_command
         if shutil.which(submitter) is None:
-            raise InputError(f"There is no {submitter} on this computer.",
-                             f"Jobs are asked of {kind} with it.",
+            raise InputError(f"The program {submitter} is not on this computer.",
+                             f"It is needed to submit jobs to {kind}.",
                              "Run the batch on a login node of the cluster, or with --emit.")
         own = dask.config.get(f"jobqueue.{kind}", {})
         cores = int(own.get("cores") or 1)
@@ -213,9 +214,10 @@ def _unfit_here(version: str) -> str:
 
 def _lost(error: Exception | None) -> ClusterLostError:
     told = f" ({error})" if error is not None else ""
-    return ClusterLostError(f"The Dask scheduler does not answer any more{told}.",
-                            "What was done is kept; what ran is before its stage or after it.",
-                            "Run the batch again: it goes on from there.")
+    return ClusterLostError(f"The Dask scheduler no longer responds{told}.",
+                            "Completed results are kept. A branch that was in work has its state "
+                            "before or after the running stage.",
+                            "Run the batch again. It continues from there.")
 
 
 def _check_address(address: str) -> None:
@@ -223,8 +225,8 @@ def _check_address(address: str) -> None:
     protocol, _, place = address.partition("://")
     host = place.rpartition(":")[0].strip("[]")
     if protocol not in ("tls", "tcp") or not host:
-        raise InputError(f"{address!r} is no address of a Dask scheduler.", "",
-                         "Write tls://HOST:PORT, as `dask scheduler` says it.")
+        raise InputError(f"{address!r} is not the address of a Dask scheduler.", "",
+                         "Write tls://HOST:PORT, as `dask scheduler` prints it.")
     if protocol == "tls" or host == "localhost":
         return
     try:

@@ -1,4 +1,4 @@
-"""What a Dask worker does for a batch: it runs command lines, in processes of its own pool.
+"""The work of a Dask worker for a batch: it runs command lines in processes of its own pool.
 
 A stage's crash, its memory and its time are then the stage's alone, and what was imported stays
 for the next one. A worker that is lost takes its processes with it.
@@ -29,10 +29,11 @@ _pool: Pool | None = None
 def unfit(version: str) -> str:
     """Return why this process cannot be a worker of a batch of this version; empty if it can."""
     if version != VERSION:
-        return f"it has Limber {VERSION}, the batch has {version}; install the same on all machines"
+        return (f"it has Limber {VERSION}, but the batch has {version}; install the same version "
+                "on all machines")
     if current_process().daemon:
-        return ("it may not start processes; start Dask workers with --no-nanny, or with "
-                "DASK_DISTRIBUTED__WORKER__DAEMON=False in their environment")
+        return ("it is not allowed to start processes; start Dask workers with --no-nanny, or "
+                "with DASK_DISTRIBUTED__WORKER__DAEMON=False in their environment")
     return ""
 
 
@@ -42,9 +43,9 @@ def run_line(line: list[str], place: str, folder: str, limits: Limits, version: 
 
     Args:
         line: The stage and its arguments, as they are typed after ``limber``.
-        place: The folder from which the paths in it count.
+        place: The folder to which the paths in it are relative.
         folder: The branch folder.
-        limits: What it may take.
+        limits: Its limits on time and memory.
         version: The batch's.
 
     Returns:
@@ -55,7 +56,7 @@ def run_line(line: list[str], place: str, folder: str, limits: Limits, version: 
     """
     reason = unfit(version)
     if reason:
-        return _failed(f"The worker {os.getpid()} cannot run it: {reason}.", 0.0)
+        return _failed(f"The worker {os.getpid()} cannot run this stage: {reason}.", 0.0)
     started = time.perf_counter()
     try:
         return _workers_pool().submit(_run, line, place, folder, limits=limits).result()

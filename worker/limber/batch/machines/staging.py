@@ -1,4 +1,4 @@
-"""Branches whose inputs, or themselves, are elsewhere: brought here before, put there after.
+"""Remote branches and inputs: fetched before the stages run, uploaded afterwards.
 
 The branch folder here is worked on as any other. At its address its files stand beside each other
 as here, the manifest last: whoever reads it there finds the branch before a batch or after it, or
@@ -42,7 +42,7 @@ class Staging:
         self._threads = ThreadPoolExecutor(AT_ONCE, "staging")
 
     def fetch(self, branch: BranchJob) -> Future:
-        """Bring in a branch's inputs, and the branch itself as it stands at its address."""
+        """Fetch a branch's inputs, and the branch itself from its address."""
         return self._threads.submit(bring_in, branch, self._stop)
 
     def put(self, branch: BranchJob) -> Future:
@@ -62,10 +62,10 @@ class Staging:
 
 
 def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
-    """Fetch what a branch reads, and the branch where it is not here or was changed elsewhere.
+    """Fetch the inputs of a branch, and the branch if it is missing here or changed remotely.
 
     Raises:
-        WorkError: a file cannot be had. BranchFolderError: the branch was changed here and there.
+        WorkError: a file cannot be fetched. BranchFolderError: both copies were changed.
     """
     for address, path in branch.fetched:
         fetch(address, path, stop)
@@ -83,10 +83,10 @@ def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
 
 
 def put_out(jobs: JobFile, branch: BranchJob) -> None:
-    """Put what is new of a branch to its address, and what its stages wrote beside it.
+    """Upload the new files of a branch to its address, and those that its stages wrote beside it.
 
     Raises:
-        WorkError: it cannot be written there. BranchFolderError: it was changed there meanwhile.
+        WorkError: it cannot be written there. BranchFolderError: the remote branch changed.
     """
     if (branch.folder / MANIFEST).is_file():
         _put_branch(branch)
@@ -120,9 +120,11 @@ def _is_ours(branch: BranchJob, theirs: bytes) -> bool:
         return True
     if here != known != there:
         raise BranchFolderError(
-            f"{branch.home} is another branch than {branch.folder}.",
-            "Both were changed since the one was copied to the other, or they never were one.",
-            f"Move {branch.folder} away to go on with the other, or the other to go on with it.")
+            f"{branch.home} and {branch.folder} are different branches.",
+            "Both have changed since one was copied from the other, or they were never the same "
+            "branch.",
+            f"Move {branch.folder} away to continue with the remote branch, or move the remote "
+            "branch away to continue with the local one.")
     return there == known
 
 
@@ -136,9 +138,10 @@ def _download(branch: BranchJob, manifest: bytes, stop: Callable[[], None]) -> N
             target = made / checked_name(name)
             copy_here(f"{branch.home}/{name}", target, stop)
             if file_digest(target) != entry.sha256:
-                raise WorkError(f"{branch.home}/{name} is not what its manifest says.",
-                                "It is damaged, or was being written.",
-                                "Let the program that writes it end, or restore it.")
+                raise WorkError(f"{branch.home}/{name} differs from its manifest.",
+                                "It is damaged, or another program was writing it.",
+                                "Wait until the program that writes it has ended, or restore the "
+                                "file.")
         made.rename(branch.folder)
     finally:
         remove(made)
@@ -148,9 +151,9 @@ def _download(branch: BranchJob, manifest: bytes, stop: Callable[[], None]) -> N
 def _put_branch(branch: BranchJob) -> None:
     theirs = read_bytes(f"{branch.home}/{MANIFEST}")
     if theirs is not None and not _is_ours(branch, theirs):
-        raise BranchFolderError(f"{branch.home} was changed by another program meanwhile.",
-                                f"The results are in {branch.folder}.",
-                                "Run one batch at a time on it.")
+        raise BranchFolderError(f"Another program changed {branch.home} at the same time.",
+                                f"The results of this run are in {branch.folder}.",
+                                "Run only one batch at a time on this branch.")
     mine = settled_manifest(branch.folder)
     there = _files(theirs)
     for name, entry in mine.files.items():
@@ -165,7 +168,7 @@ def _put_branch(branch: BranchJob) -> None:
 
 
 def _files(manifest: bytes | None) -> dict[str, str]:
-    """Names and checksums of a manifest elsewhere; none of one that is damaged."""
+    """Names and checksums of a remote manifest; empty if it is damaged."""
     if manifest is None:
         return {}
     try:
@@ -196,7 +199,7 @@ def _mark(branch: BranchJob) -> Path:
 def _known(branch: BranchJob) -> str:
     """The manifest's checksum when the branch here and that at its address were last the same."""
     try:
-        told = read_json(_mark(branch), "a note of what was fetched")
+        told = read_json(_mark(branch), "a record of the fetched files")
     except InputError:
         # There is none, or it is damaged: then nothing is known.
         return ""

@@ -6,7 +6,7 @@ from limber.mechanics.model import BranchModel
 from limber.results.exports.elastic import require_elastic
 
 _STEP = 0.005
-"""Moduli within such a share of each other have one material."""
+"""Moduli whose relative difference is below this have one material."""
 _A_LINE = 12
 
 
@@ -30,8 +30,8 @@ def inp_text(model: BranchModel, name: str, tip: int, load: np.ndarray | None = 
     require_elastic(model.material, "Abaqus' *ELASTIC", at_any_strain=True)
     mesh = model.mesh
     kind = "C3D10" if mesh.is_quadratic else "C3D4"
-    lines = ["*HEADING", f"{name}: branch of Limber, units m, kg, s, Pa. The shape hangs under its "
-             "weight already: apply none.", "*NODE, NSET=ALL"]
+    lines = ["*HEADING", f"{name}: branch by Limber, units m, kg, s, Pa. The shape is prestressed "
+             "by gravity: apply no gravity.", "*NODE, NSET=ALL"]
     lines += [f"{number}, {x:.9g}, {y:.9g}, {z:.9g}"
               for number, (x, y, z) in enumerate(mesh.nodes.tolist(), start=1)]
     lines.append(f"*ELEMENT, TYPE={kind}, ELSET=BRANCH")

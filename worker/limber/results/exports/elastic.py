@@ -1,4 +1,4 @@
-"""Which material laws other programs can be told of."""
+"""The material laws that can be exported to other programs."""
 
 from limber.core.errors import InputError
 from limber.mechanics.materials.law import MaterialLaw, is_hookean_at_rest
@@ -8,7 +8,7 @@ def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = Fal
     """Refuse a law that Young's modulus and Poisson's ratio do not describe.
 
     Args:
-        program: That is told these two numbers.
+        program: The program that gets these two numbers.
         at_any_strain: Whether it computes large strains with them, too.
 
     Raises:
@@ -16,6 +16,7 @@ def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = Fal
     """
     if law.is_hookean or (not at_any_strain and is_hookean_at_rest(law)):
         return
-    raise InputError(f"{program} has no material {law.name!r}.",
-                     "The file gives Young's modulus and Poisson's ratio, which are another law's.",
+    raise InputError(f"{program} does not support the material {law.name!r}.",
+                     "The file can only state Young's modulus and Poisson's ratio, which do not "
+                     "describe this law.",
                      "Export the branch with st_venant_kirchhoff.")

@@ -26,8 +26,8 @@ def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
     """
     root = ElementTree.Element("mujoco", model=name)
     root.append(ElementTree.Comment(
-        f" Limber: m, kg, s. Damping: {damping.stiffness:.6g} s times the stiffness; "
-        f"{damping.mass:.6g} 1/s times the mass is left out, which MJCF cannot express. "))
+        f" Limber: m, kg, s. Damping: {damping.stiffness:.6g} s times the stiffness. The part of "
+        f"{damping.mass:.6g} 1/s times the mass is omitted, because MJCF cannot express it. "))
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
     ElementTree.SubElement(root, "option", timestep=f"{_TIMESTEP:g}", integrator="implicitfast",
                            gravity=_numbers(tree.gravity))

@@ -1,4 +1,4 @@
-"""A branch as rigid links with springs between them: what robot simulators can run.
+"""A branch as rigid links with springs between them, for robot simulators.
 
 The links follow the axes, a spring sits in the middle of each segment (Hrennikoff's and Wittbrodt's
 rigid finite elements): its bending stiffness is E I / l, its torsional one G J / l. Sections are
@@ -135,7 +135,7 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
         spacing: Length of a link [m]; forks cut links, too.
 
     Raises:
-        InputError: a link would hold none of the mesh, or springs cannot be made of its material.
+        InputError: a link would contain no part of the mesh, or its material has no springs.
     """
     require_elastic(model.material, "A rod's spring")
     points, volume, tet = _sampled(model.mesh)
@@ -153,8 +153,9 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
     for number, segment in enumerate(segments):
         own = of == number
         if not own.any():
-            raise InputError(f"A link of {1e3 * segment.length:.2g} mm holds none of the mesh.",
-                             "The mesh is too coarse for links so short.", "Take longer links.")
+            raise InputError(f"A link of {1e3 * segment.length:.2g} mm contains no part of the "
+                             "mesh.",
+                             "The mesh is too coarse for such short links.", "Use longer links.")
         axis, bending, twist = _section(points[own] - samples[nearest[own]], segment,
                                         volume[own], model.young[tet[own]], shear[tet[own]])
         k = segment.link

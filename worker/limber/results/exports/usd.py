@@ -1,4 +1,4 @@
-"""USD: the branch as a volume deformable body, for Isaac Sim and whatever else reads USD physics.
+"""USD: the branch as a volume deformable body, for Isaac Sim and others that read USD physics.
 
 The schema is NVIDIA's ``OmniPhysics`` deformable schema, which stands ready to enter UsdPhysics
 (Omni Physics documentation, *Omni Physics Deformable Schema*); until then its names are unknown
@@ -80,8 +80,8 @@ def write_usd(branch: Deformable, damping: RayleighDamping, name: str, path: Pat
 
     mesh = branch.model.mesh
     stage = Usd.Stage.CreateInMemory()
-    stage.SetMetadata("comment", f"{name}: branch of Limber. Its shape hangs under its weight "
-                      "already: no gravity acts on it.")
+    stage.SetMetadata("comment", f"{name}: branch by Limber. Its shape is prestressed by gravity, "
+                      "so no gravity acts on it.")
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)

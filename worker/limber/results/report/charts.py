@@ -1,4 +1,4 @@
-"""What the report's pictures share: charts with their labels, and two views of a branch."""
+"""Common parts of the report's figures: charts with labels, and two views of a branch."""
 
 from typing import TYPE_CHECKING, Any
 

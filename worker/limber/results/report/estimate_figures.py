@@ -1,4 +1,4 @@
-"""Pictures of an estimate: E along the branch, loss against evaluations, simulated on observed."""
+"""Figures of an estimate: E along the branch, loss over evaluations, simulated over observed."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -20,11 +20,11 @@ def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
     """
     yield (young_along_branch(estimate), _interval_caption(estimate))
     yield (what_the_pulls_tell(estimate),
-           "How well the pulls tell each parameter: standard deviation before the fit (at its "
-           f"start) and after it. Over {UNRESOLVED_DEVIATION:g} (line) a modulus is linked to its "
-           "neighbour.")
+           "How well the pulls determine each parameter: standard deviation before the fit (at "
+           f"its start) and after it. Above {UNRESOLVED_DEVIATION:g} (line) a modulus is linked "
+           "to its neighbour.")
     yield (loss_over_evaluations(estimate),
-           "Loss against forward simulations; the line is the best so far.")
+           "Loss against forward simulations; the line is the lowest so far.")
     for pull in estimate["pulls"]:
         if np.size(pull["observed_m"]):
             yield (simulated_over_observed(pull, estimate),
@@ -32,20 +32,21 @@ def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
                    "frames; bars are residuals, ten times enlarged.")
         if np.size(pull.get("point_residual", ())):
             yield (residuals_over_time(pull),
-                   f"Pull {pull['name']}: residuals of each point and of the force over their "
-                   f"deviation; about 1 is noise, crosses from {OUTLIER} are outliers.")
+                   f"Pull {pull['name']}: residuals of each point and of the force, divided by "
+                   f"their standard deviation. About 1 is noise; crosses (above {OUTLIER}) are "
+                   "outliers.")
         if pull["measured_force_n"] and _numbers(pull["measured_force_n"]).size:
             yield (force_over_time(pull),
                    f"Pull {pull['name']}: force of the gripper on the branch.")
     if estimate.get("held_out"):
         yield (held_out_scores(estimate),
-               "Pulls foretold by a fit that did not see them: error over the pull's own travel "
-               "and peak force.")
+               "Pulls predicted by a fit without them: error relative to the pull's travel and "
+               "peak force.")
 
 
 def young_along_branch(estimate: dict[str, Any]) -> Any:
     """E at the control points with intervals, and the truth where there is one."""
-    figure, axes = chart(5.2, 3.2, "place on the main path (0 base, 1 tip)",
+    figure, axes = chart(5.2, 3.2, "position on the main path (0 base, 1 tip)",
                          "Young's modulus [MPa]")
     place = np.array(estimate["fractions"])
     young = np.array(estimate["young_pa"]) / 1e6
@@ -56,9 +57,9 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
         place, young = np.array([0.0, 1.0]), np.repeat(young, 2)
         interval, sensor = np.repeat(interval, 2, axis=0), np.repeat(sensor, 2, axis=0)
     axes.fill_between(place, *interval.T, color=SIMULATED, alpha=0.18, lw=0,
-                      label="95 %, radii and mesh included")
+                      label="95 %, including radii and mesh")
     axes.errorbar(place, young, np.abs(sensor.T / 1e6 - young), fmt="o-", color=SIMULATED,
-                  capsize=4, label="estimated, 95 % by the sensors alone")
+                  capsize=4, label="estimated, 95 % from the sensors alone")
     truth = estimate.get("truth")
     if truth:
         axes.plot(truth["fractions"], np.array(truth["young_pa"]) / 1e6, "D", ms=7, mfc="none",
@@ -85,7 +86,7 @@ def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
     least = 1e-4
     axes.bar(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color="#bbbbbb",
              label="before the fit")
-    axes.bar(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after it")
+    axes.bar(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after the fit")
     axes.axhline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
     axes.set_yscale("log")
     axes.set_xticks(place, names)
@@ -95,7 +96,7 @@ def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
 
 def residuals_over_time(pull: dict[str, Any]) -> Any:
     """Standardised residual of every point and of the force at every frame."""
-    figure, axes = chart(5.2, 3.0, "time [s]", "residual / its deviation")
+    figure, axes = chart(5.2, 3.0, "time [s]", "residual / standard deviation")
     points = _numbers(pull["point_residual"])
     time = np.array(pull["all_times_s"])
     force = _numbers(pull["force_residual"])
@@ -114,12 +115,13 @@ def residuals_over_time(pull: dict[str, Any]) -> Any:
 
 
 def held_out_scores(estimate: dict[str, Any]) -> Any:
-    """Errors of foretold pulls in percent, points and force."""
+    """Errors of predicted pulls in percent, of points and force."""
     scores = estimate["held_out"]
-    figure, axes = chart(5.2, 1.2 + 0.45 * len(scores), "error of the foretold pull [%]", "")
+    figure, axes = chart(5.2, 1.2 + 0.45 * len(scores), "error of the predicted pull [%]", "")
     place = np.arange(len(scores))
-    for shift, key, colour, label in ((0.2, "relative_distance", SIMULATED, "points, of travel"),
-                                      (-0.2, "relative_force", "#2e8b57", "force, of its peak")):
+    for shift, key, colour, label in (
+            (0.2, "relative_distance", SIMULATED, "points, relative to travel"),
+            (-0.2, "relative_force", "#2e8b57", "force, relative to its peak")):
         values = 100 * np.array([_number(score.get(key)) for score in scores.values()])
         axes.barh(place + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
     axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
@@ -187,12 +189,12 @@ def _interval_caption(estimate: dict[str, Any]) -> str:
             if parts.get(key) is not None]
     missing = ""
     if parts and parts.get("geometry") is None:
-        missing = (" The radii came without a deviation: what they are off by is not in the "
-                   "interval.")
+        missing = (" The radii have no stated deviation, so the interval does not include their "
+                   "error.")
     elif parts.get("axis_is_exact", True) and parts:
-        missing = " Where the scan's axis runs is taken as exact."
+        missing = " The position of the scan's axis is assumed exact."
     return ("Young's modulus along the branch with its 95 % interval"
-            + (f"; largest standard deviation by {', '.join(told)}" if told else "")
+            + (f"; largest standard deviations from: {', '.join(told)}" if told else "")
             + "." + missing)
 
 
@@ -201,5 +203,5 @@ def _number(value: float | None) -> float:
 
 
 def _numbers(values: Any) -> np.ndarray:
-    """JSON's null, which stands for a number that was not measured, as NaN."""
+    """Values as an array; JSON's null (not measured) becomes NaN."""
     return np.array(values, dtype=float)

@@ -1,4 +1,4 @@
-"""What a robot did with a plan: the force that was felt beside the predicted one."""
+"""The execution of a plan by a robot: the measured force against the predicted one."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,18 +20,20 @@ _NAMES = [*(f"{kind}_f{axis}_n" for kind in ("smooth", "expected") for axis in "
 
 
 def execution_rows(result: Mapping[str, Any]) -> list[list[str]]:
-    """Return the rows of an execution's result, as its stage tells it."""
-    ended = ("its end, and came back" if result.get("reached")
+    """Return the rows of an execution's result, as its stage returns it."""
+    ended = ("the end of the path, then returned" if result.get("reached")
              else f"a stop: {result.get('stop_reason')}")
-    rows = [["what", "value"], ["came to", ended]]
+    rows = [["item", "value"], ["ended at", ended]]
     for key, label, scale, form in [
-            ("predicted_peak_force_n", "peak force, predicted [N]", 1, "{:.2f}"),
-            ("peak_force_n", "peak force, felt [N]", 1, "{:.2f}"),
-            ("force_within_share", "force within 5 % of the peak or the interval [% of the way]",
+            ("predicted_peak_force_n", "predicted peak force [N]", 1, "{:.2f}"),
+            ("peak_force_n", "measured peak force [N]", 1, "{:.2f}"),
+            ("force_within_share",
+             "force within 5 % of the peak, or within the interval [% of the path]",
              100, "{:.1f}"),
-            ("force_error_of_peak", "difference, 95 % of the way below [% of the peak]", 100,
+            ("force_error_of_peak",
+             "force difference not exceeded on 95 % of the path [% of the peak]", 100,
              "{:.1f}"),
-            ("path_error_m", "distance from the path, worst [mm]", 1000, "{:.2f}")]:
+            ("path_error_m", "largest distance from the path [mm]", 1000, "{:.2f}")]:
         value = result.get(key)
         if value is not None and np.isfinite(value):
             rows.append([label, form.format(scale * value)])
@@ -39,7 +41,7 @@ def execution_rows(result: Mapping[str, Any]) -> list[list[str]]:
 
 
 def force_along_the_way(path: Path) -> "Figure":
-    """Draw the felt force (smoothed) beside the predicted one and its 95 % interval.
+    """Draw the measured force (smoothed), and the predicted one with its 95 % interval.
 
     Raises:
         InputError: the log is damaged, or holds no moment for which a force was predicted.
@@ -49,12 +51,14 @@ def force_along_the_way(path: Path) -> "Figure":
     log = read_stream(path)
     missing = [name for name in _NAMES if name not in log.columns]
     if missing:
-        raise InputError(f"{path} has no column {missing[0]}.", "It is no log of an execution.",
+        raise InputError(f"{path} has no column {missing[0]}.",
+                         "It is not the log of an execution.",
                          "Execute the plan again.")
     table = log.values[:, [log.columns.index(name) for name in _NAMES]]
     known = np.isfinite(table).all(axis=1)
     if not known.any():
-        raise InputError(f"{path} has no predicted force.", "The branch was not led.",
+        raise InputError(f"{path} has no predicted force.",
+                         "The execution did not predict the force on the branch.",
                          "Execute the plan again.")
     known = np.flatnonzero(known)
     known = known[::max(1, len(known) // _MOST_POINTS)]
@@ -69,12 +73,12 @@ def force_along_the_way(path: Path) -> "Figure":
         half = 1.96 * np.sqrt(np.maximum(variances[:, column], 0.0))
         axes.fill_between(times, expected[:, column] - half, expected[:, column] + half,
                           color=SIMULATED, alpha=0.2, lw=0)
-        axes.plot(times, expected[:, column], color=SIMULATED, label="predicted, 95 % of it")
-        axes.plot(times, felt[:, column], ".", ms=2, color=OBSERVED, label="felt")
+        axes.plot(times, expected[:, column], color=SIMULATED, label="predicted, 95 % interval")
+        axes.plot(times, felt[:, column], ".", ms=2, color=OBSERVED, label="measured")
         axes.set_ylabel(f"force {name} [N]")
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
         if name == "x":
             axes.legend(frameon=False, ncols=2)
-    axes.set_xlabel("time since the robot set out [s]")
+    axes.set_xlabel("time since the robot started [s]")
     return figure

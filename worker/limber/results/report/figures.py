@@ -121,7 +121,7 @@ def pull(recording: Any) -> "Figure":
         upper.plot(time, recording.wrenches[:, column], ".-", color=colour, label=name)
         lower.plot(time, 1e3 * moved[:, column], ".-", color=colour, label=name)
     upper.set(ylabel="force on the branch [N]")
-    lower.set(ylabel="grasp moved by [mm]", xlabel="time [s]")
+    lower.set(ylabel="displacement of the grasp [mm]", xlabel="time [s]")
     for axis in (upper, lower):
         axis.grid(alpha=0.25)
     upper.legend(ncols=3, frameon=False)
@@ -158,10 +158,10 @@ def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
     distance = 1e3 * np.linalg.norm(data["poses"][:, :3] - rest, axis=1)
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8))
     left.scatter(distance, 1e3 * data["energies_j"], s=9, color=ORDER_COLOURS[0])
-    left.set(xlabel="grasp moved by [mm]", ylabel="strain energy [mJ]")
+    left.set(xlabel="displacement of the grasp [mm]", ylabel="strain energy [mJ]")
     force = np.linalg.norm(data["forces_n"], axis=1)
     right.scatter(distance, force, s=9, color=ORDER_COLOURS[1])
-    right.set(xlabel="grasp moved by [mm]", ylabel="force [N]")
+    right.set(xlabel="displacement of the grasp [mm]", ylabel="force [N]")
     for axis in (left, right):
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.25)

@@ -1,4 +1,4 @@
-"""What the report says of wind, snow, fruit and cuts that a branch was put under."""
+"""The report's section on wind, snow, fruit and cuts that act on a branch."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,7 +54,7 @@ def read_load(path: Path) -> LoadFile:
     """Read what ``limber load --name`` kept.
 
     Raises:
-        InputError: it cannot be read, or says something else.
+        InputError: it cannot be read, or has other content.
     """
     return read_json_as(path, LoadFile, "the result of a load")
 
@@ -62,32 +62,35 @@ def read_load(path: Path) -> LoadFile:
 def load_rows(load: LoadFile) -> list[list[str]]:
     """Return what the loads do to the branch, each with its interval where one is known."""
     tip = 1e3 * float(np.linalg.norm(load.tip_displacement_m))
-    rows = [["what", "value", "95 % interval"],
+    rows = [["quantity", "value", "95 % interval"],
             ["force of the wind [N]", f"{np.linalg.norm(load.wind_force_n):.3g}", ""],
             ["added mass [kg]", f"{load.added_mass_kg:.4g}", ""],
             ["mass cut off [kg]", f"{load.cut_mass_kg:.4g}", ""],
-            ["the tip moves by [mm]", f"{tip:.1f}", ""],
-            ["of that down [mm]", f"{1e3 * load.sag_m:.1f}",
+            ["displacement of the tip [mm]", f"{tip:.1f}", ""],
+            ["downward part of it [mm]", f"{1e3 * load.sag_m:.1f}",
              _between(load.sag_interval_m, 1e3, 1)],
-            ["greatest strain", f"{load.greatest_strain:.5f}",
+            ["largest strain", f"{load.greatest_strain:.5f}",
              _between(load.greatest_strain_interval, 1.0, 5)],
-            ["of what the wood bears", f"{100 * load.strain_over_limit:.0f} %", ""],
+            ["largest strain over the failure strain of the wood",
+             f"{100 * load.strain_over_limit:.0f} %", ""],
             ["first frequency [Hz]", f"{load.frequencies_hz[0]:.3f}",
              _between(load.first_frequency_interval_hz, 1.0, 3)],
             ["first frequency before [Hz]", f"{load.frequencies_before_hz[0]:.3f}", ""]]
     if load.bears_times is not None:
-        ended = {"strain": "until the wood fails", "equilibrium": "until it finds no rest"}.get(
-            load.held_by or "", "more was not tried")
-        rows.append([f"bears these loads so many times ({ended})", f"{load.bears_times:.2f}",
+        ended = {"strain": "then the wood fails", "equilibrium": "then it has no equilibrium"}.get(
+            load.held_by or "", "larger loads were not tried")
+        rows.append([f"factor on these loads that the branch bears ({ended})",
+                     f"{load.bears_times:.2f}",
                      _between(load.bears_times_interval, 1.0, 2)])
     if load.gusts is not None:
         mean = 1e3 * float(np.linalg.norm(load.gusts.mean_tip_displacement_m))
         rows += [["mean wind [m/s]", f"{load.gusts.mean_speed_m_s:.2f}", ""],
-                 ["the tip moves in the mean wind by [mm]", f"{mean:.1f}", ""],
-                 ["peak of the gusts over the mean load", f"{load.gusts.factor:.2f}", ""],
-                 ["swaying over that of a branch that follows at once",
+                 ["displacement of the tip in the mean wind [mm]", f"{mean:.1f}", ""],
+                 ["peak load of the gusts over the mean load", f"{load.gusts.factor:.2f}", ""],
+                 ["dynamic amplification of the sway (1: quasi-static)",
                   f"{load.gusts.dynamic:.2f}", ""],
-                 ["damping of the first mode, with the air's", f"{100 * load.gusts.damping:.1f} %",
+                 ["damping of the first mode, including the air",
+                  f"{100 * load.gusts.damping:.1f} %",
                   ""]]
     return [row for row in rows if row[1] not in ("0", "0.0")]
 
@@ -113,10 +116,10 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
     nodes, corners = np.unique(mesh.surface_faces(), return_inverse=True)
     corners = corners.reshape(-1, 3)
     positions, _, _ = read_pc2(frames)
-    values = read_arrays(frames.with_suffix(".npz"), "fields of a motion")
+    values = read_arrays(frames.with_suffix(".npz"), "the fields of a motion")
     arrays = {**values, "positions": positions}
     require_shapes(frames, arrays, {"positions": (2, len(nodes), 3),
-                                    "principal_strain": (2, len(nodes))}, "a load's frames")
+                                    "principal_strain": (2, len(nodes))}, "the frames of a load")
     strain = 100 * arrays["principal_strain"][1][corners].mean(axis=1)
     shades = plt.get_cmap("inferno")
     largest = max(float(strain.max()), 1e-9)
@@ -144,6 +147,6 @@ def strain_along_path(from_m: np.ndarray, to_m: np.ndarray, strain: np.ndarray) 
     figure = Figure(figsize=(6.0, 3.2), layout="constrained")
     axes = figure.add_subplot()
     axes.bar(from_m, 100 * strain, to_m - from_m, align="edge", edgecolor="white")
-    axes.set(xlabel="from the root along the main path [m]", ylabel="greatest strain [%]")
+    axes.set(xlabel="distance from the root along the main path [m]", ylabel="largest strain [%]")
     axes.spines[["top", "right"]].set_visible(False)
     return figure

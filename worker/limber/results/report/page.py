@@ -1,4 +1,4 @@
-"""``report.html``: what was done to a branch, told in figures and tables, in one file."""
+"""``report.html``: figures and tables of all results of a branch, in one file."""
 
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
@@ -35,7 +35,7 @@ from limber.results.report.tables import (
 from limber.store import Branch
 from limber.version import VERSION
 
-_SOURCE_LABELS = {"file": "made from", "unit": "its unit", "sha256": "its sha256",
+_SOURCE_LABELS = {"file": "source", "unit": "unit of length", "sha256": "sha256 of the source",
                   "truth": "known truth"}
 
 
@@ -48,7 +48,7 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
         calipers: Diameters that somebody measured, to hold beside the scan's.
 
     Raises:
-        InputError: the picture is none, or a diameter stands beyond the branch.
+        InputError: the picture is not a PNG, or a diameter's position is beyond the branch.
         MissingDependencyError: what the extra ``report`` brings is not installed.
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
@@ -75,7 +75,7 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
 
 def _each(build: Callable[..., Section], names: Iterable[str], title: str = "",
           missing: str = "") -> list[Callable[[Branch], Section]]:
-    """What builds a section for each name; without any, one that says what is missing."""
+    """Return a builder for each name's section; without names, for one that is missing."""
     found: list[Callable[[Branch], Section]] = [partial(build, name=name) for name in names]
     return found or ([lambda _branch: Section(title, missing=missing)] if title else [])
 
@@ -87,7 +87,7 @@ def _names(branch: Branch, stage: str) -> list[str]:
 
 
 def _held_back(branch: Branch) -> list[Section]:
-    """What makes the estimate unsure, and what would help: before anything else is read."""
+    """The causes of the estimate's uncertainty and their remedies: the first section."""
     if not branch.has("estimate.json"):
         return []
     estimate = read_estimate(branch.path("estimate.json"))
@@ -95,20 +95,20 @@ def _held_back(branch: Branch) -> list[Section]:
     if not rows:
         return []
     total = max((estimate.get("young_deviation") or {}).get("total") or [float("nan")])
-    return [Section("What holds the estimate back", text=[
-        f"Young's modulus is known to a standard deviation of {100 * total:.1f} % where it is "
-        "known least. Most of that comes from the following, largest first."],
+    return [Section("What limits the estimate", text=[
+        f"The largest standard deviation of Young's modulus along the branch is {100 * total:.1f} "
+        "%. Its main causes follow, largest first."],
         tables=[("", rows)])]
 
 
 def _summary(branch: Branch, picture: Path | None) -> Section:
     section = Section("Summary")
     if picture is not None:
-        section.pictures.append((inline_png(read_png(picture)), "The scene, rendered."))
+        section.pictures.append((inline_png(read_png(picture)), "Rendered scene."))
     if is_assumed(_virtual_result(branch)):
         section.text.append(ASSUMED)
     result = branch.made.result if branch.made else {}
-    rows = [["what", "value"]]
+    rows = [["item", "value"]]
     source = branch.manifest.source
     rows += [[_SOURCE_LABELS.get(key, key.replace("_", " ")), str(value)]
              for key, value in source.items() if isinstance(value, str | int | float)]
@@ -124,8 +124,8 @@ def _summary(branch: Branch, picture: Path | None) -> Section:
         interval = result.get(f"{name}_interval_{unit}")
         if interval:
             values = [f"{scale * v:.4g}" for v in (result[f"expected_{name}_{unit}"], *interval)]
-            rows.append([f"{name} of wood, doubted twigs by their probability (95 %) "
-                         f"[{'cm3' if scale > 1 else unit}]",
+            rows.append([f"{name} of wood, uncertain twigs weighted by their probability (95 % "
+                         f"interval) [{'cm3' if scale > 1 else unit}]",
                          f"{values[0]} ({values[1]} to {values[2]})"])
     section.tables.append(("", rows))
     return section
@@ -138,9 +138,9 @@ def _pull(branch: Branch, name: str) -> Section:
     pull = read_pull(branch.path(f"pulls/{name}"))
     if _is_virtual(branch, name):
         section.text.append(
-            f"This pull was simulated, with {'a known' if _has_truth(branch) else 'an assumed'} "
-            "Young's modulus and sensor noise, on another and finer mesh: there is no robot "
-            "recording of this branch.")
+            "This pull was simulated on a separate, finer mesh, with "
+            f"{'a known' if _has_truth(branch) else 'an assumed'} Young's modulus and sensor "
+            "noise. There is no robot recording of this branch.")
     section.draw(figures.pull(pull), "Force on the branch and displacement of the grasp over time.")
     return section
 
@@ -162,7 +162,7 @@ def _estimate(branch: Branch) -> Section:
         if estimate.get("truth"):
             estimate["truth"]["assumed"] = True
     for title, rows in [
-            ("What makes it unsure: standard deviations", deviation_rows(estimate)),
+            ("Sources of uncertainty: standard deviations", deviation_rows(estimate)),
             ("Pulls predicted by a fit without them: RMS errors",
              held_out_rows(estimate))]:
         if rows:
@@ -182,13 +182,14 @@ def _swing(branch: Branch) -> Section:
     section = Section(f"Swing {swing.pull}", text=swing.warnings,
                       tables=[("", swing_section.swing_rows(swing))])
     section.draw(swing_section.swing_over_time(swing),
-                 "The marker that swings most, along its way: seen (dots) and simulated.")
+                 "Displacement of the marker that swings most, along its path: observed (dots) "
+                 "and simulated.")
     return section
 
 
 def _vibration(branch: Branch) -> Section:
     modulus, vibrations = vibration_rows(branch.path("vibration.json"))
-    return Section("Ringing", tables=[("", modulus), ("Vibrations of the record", vibrations)])
+    return Section("Ringing", tables=[("", modulus), ("Vibrations in the recording", vibrations)])
 
 
 def _simulation(branch: Branch, name: str) -> Section:
@@ -198,13 +199,13 @@ def _simulation(branch: Branch, name: str) -> Section:
     section.draw(figures.motion(frames), "Strain and kinetic energy, and the force on the grasp, "
                                          "over time.")
     if not entry.result["converged"]:
-        section.text.append("The branch could not follow to the end; the frames stop at the last "
-                            "good state.")
+        section.text.append("The simulation did not converge to the end; the frames stop at the "
+                            "last converged state.")
     tip = np.linalg.norm(entry.result["tip_displacement_m"])
     section.text.append(
-        f"{entry.result['frame_count']} frames. At the end the tip has moved by "
-        f"{1e3 * tip:.1f} mm and the branch holds {entry.result['energy_j']:.4g} J; smallest "
-        f"det F {min(frames['min_det_f']):.3f}.")
+        f"{entry.result['frame_count']} frames. At the end the tip has moved by {1e3 * tip:.1f} "
+        f"mm and the branch stores {entry.result['energy_j']:.4g} J. The smallest det F is "
+        f"{min(frames['min_det_f']):.3f}.")
     return section
 
 
@@ -219,7 +220,7 @@ def _load(branch: Branch, name: str) -> Section:
                          "The branch as scanned (grey) and at rest under the loads, from the "
                          "front and from the side.")
         except InputError as error:
-            section.text.append(f"It cannot be drawn: {error}")
+            section.text.append(f"The bent branch cannot be drawn: {error}")
     return section
 
 

@@ -1,4 +1,4 @@
-"""What the report says of the energy field, of paths, and of the robot that followed one."""
+"""The report's sections on the energy field, on paths, and on their execution by a robot."""
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_arrays
@@ -39,37 +39,39 @@ def plan_section(branch: Branch, name: str) -> Section:
                            comparison_rows(plan)))
     saved, added = plan["energy_saved_percent"], plan["length_added_percent"]
     section.text.append((
-        "The start lies in the goal: the paths have no length, and there is nothing to save."
+        "The start is inside the goal, so the paths have no length and no energy can be saved."
         if saved is None or added is None else
-        f"The gentle path saves {saved:.1f} % of the energy along the "
-        f"path for {added:+.1f} % of length.") + f" Seed {plan['seed']}.")
+        f"The gentle path saves {saved:.1f} % of the energy along the path and changes the length "
+        f"by {added:+.1f} %.") + f" Seed {plan['seed']}.")
     if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
-        section.text.append(f"Certificate: on the energy field it is at most {gap:.1f} % above the "
-                            "best possible path; no path is cheaper than the lower bound.")
+        section.text.append(f"Certificate: on the energy field, its cost is at most {gap:.1f} % "
+                            "above that of the best possible path. No path costs less than the "
+                            "lower bound.")
     if whole := (plan.get("certificate") or {}).get("full_model"):
         if whole["gap_percent"] is not None:
             section.text.append(
-                f"On the full model, the field being off by {1e3 * whole['field_error_j']:.2g} mJ: "
-                f"at most {whole['gap_percent']:.1f} % above the best possible path.")
+                f"On the full model, its cost is at most {whole['gap_percent']:.1f} % above that "
+                "of the best possible path; the field has an error of "
+                f"{1e3 * whole['field_error_j']:.2g} mJ.")
     if moving := plan.get("in_motion"):
-        peaks = ", ".join(f"{key} {peak['moving']:.3g} ({peak['standing']:.3g} standing still)"
+        peaks = ", ".join(f"{key} {peak['moving']:.3g} ({peak['standing']:.3g} quasi-static)"
                           for key, peak in moving["peaks"].items())
         section.text.append(
-            f"Moved in time on the full model, with inertia, at {1e3 * moving['speed_m_s']:.0f} "
-            f"mm/s, the whole motion keeps its limits: peaks {peaks}.")
+            "A simulation over time on the full model, with inertia and at "
+            f"{1e3 * moving['speed_m_s']:.0f} mm/s, keeps all limits. Peaks: {peaks}.")
     for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
     return section
 
 
 def execution_section(branch: Branch, name: str) -> Section:
-    section = Section(f"By the robot: {name}", tables=[
+    section = Section(f"Executed by the robot: {name}", tables=[
         ("", execution.execution_rows(branch.manifest.stages[f"execute:{name}"].result))])
     try:
         section.draw(execution.force_along_the_way(
             branch.path(f"executions/{name}/samples.csv")),
-            "Force of the gripper on the branch as felt (smoothed), and as predicted where the "
-            "gripper was: there, standing and back.")
+            "Force of the gripper on the branch: measured (smoothed), and predicted at the "
+            "gripper's measured position. The robot moves to the goal, waits and returns.")
     except InputError as error:
-        section.text.append(f"Its forces cannot be drawn: {error}")
+        section.text.append(f"The forces cannot be drawn: {error}")
     return section

@@ -24,33 +24,33 @@ _GRID = 160  # points of the slice along its longer side
 
 
 def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
-    """Return the figures of plan ``name`` with their captions; none of one that stays in place."""
+    """Return the figures of plan ``name`` with their captions; none if the plan does not move."""
     plan = read_plan(branch.path(f"plans/{name}.json"))
     if plan.summary["plan"]["length_m"] <= _STILL:
         return []
     field = EnergyField.read(branch.path("energy.npz"))
     shown = [
-        (along_paths(plan), "Energy above the hanging state (strain and weight), gripper force and "
-                            "largest strain along both paths, on the full model; the energy of the "
-                            "field that the planner saw is dashed."),
+        (along_paths(plan), "Energy above the rest shape (strain and weight), gripper force and "
+                            "largest strain along both paths, on the full model. Dashed: energy "
+                            "of the field that the planner used."),
         (paths_over_slice(field, plan, _tree_of(branch, name)),
          "Both paths over the energy field, in the plane that fits them best; white where the "
-         "branch was not sampled. The cross is the rest pose; grey, as seen onto that plane, what "
-         "D-RRT* searched."),
+         "branch was not sampled. The cross is the rest pose. Grey: the search tree of D-RRT*, "
+         "projected onto that plane."),
         (convergence(plan), "Cost of the best path so far over the planner's iterations, relative "
-                            "to the last."),
+                            "to the final cost."),
     ]
     if plan.summary.get("certificate"):
         if branch.has(f"plans/{name}-bound.npz"):
             bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
-            shown.append((paths_over_bound(field, bound, plan), "Both paths over the bound, in the "
-                          "same plane: what any path from there to the goal costs at least. The "
-                          "gentlest path runs down it as steeply as it falls."))
-        shown.append((certificate(plan), "What the gentle path costs, and what no path on the "
-                      "energy field costs less than, as the grid of the proof is refined."))
+            shown.append((paths_over_bound(field, bound, plan), "Both paths over the lower bound "
+                          "on the cost of any path from there to the goal, in the same plane. The "
+                          "gentlest path follows its steepest descent."))
+        shown.append((certificate(plan), "Cost of the gentle path, and lower bound on the cost of "
+                      "every path on the energy field, as the grid of the certificate is refined."))
     if plan.summary.get("detour"):
         shown.append((trade_off(plan), "Energy against length of the gentlest paths for several "
-                      "weights of distance; no path lies below the dashed line."))
+                      "weights of distance. No path is below the dashed line."))
     return shown
 
 
@@ -105,7 +105,7 @@ def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Fi
     figure, axis = view.figure()
     known = cost[np.isfinite(cost)]
     top = float(known.max()) if len(known) else 1.0
-    view.fill(figure, axis, cost, top, "cost to the goal at least", "cividis", lines=True)
+    view.fill(figure, axis, cost, top, "lower bound on the cost to the goal", "cividis", lines=True)
     view.draw_paths(axis)
     return figure
 
@@ -204,14 +204,14 @@ def convergence(plan: PlanFile) -> "Figure":
 def certificate(plan: PlanFile) -> "Figure":
     """Draw how the lower and the upper bound on the best path's cost close, grid by grid."""
     levels = plan.summary["certificate"]["levels"]
-    figure, axis = chart(6, 3.2, "cells of the grid [mm]", "cost", has_grid=True)
+    figure, axis = chart(6, 3.2, "cell size of the grid [mm]", "cost", has_grid=True)
     spacing = 1e3 * np.array([level["spacing_m"] for level in levels])
     lower, upper = (np.array([level[name] for level in levels], float)
                     for name in ("lower", "upper"))
     axis.fill_between(spacing, lower, upper, color=PATH_COLOURS["plan"], alpha=0.15,
-                      label="the best path lies here")
+                      label="range of the best path")
     axis.plot(spacing, upper, "o-", color=PATH_COLOURS["plan"], label="best path found")
-    axis.plot(spacing, lower, "o--", color=PATH_COLOURS["plan"], label="no path is cheaper: proven")
+    axis.plot(spacing, lower, "o--", color=PATH_COLOURS["plan"], label="proven lower bound")
     axis.set(xscale="log", ylim=(0.0, None))
     axis.invert_xaxis()
     axis.set_xticks(spacing, [f"{value:.2g}" for value in spacing])
@@ -230,15 +230,15 @@ def trade_off(plan: PlanFile) -> "Figure":
     bounded = [point for point in curve if point["lower_bound_jm"] is not None]
     lines = [1e3 * point["lower_bound_jm"] - point["metre_jm"] * span for point in bounded]
     floor = np.maximum(np.max(lines, axis=0), 0.0)
-    figure, axis = chart(6, 3.6, "length of the path [mm]", "energy over length [mJ m]",
+    figure, axis = chart(6, 3.6, "length of the path [mm]", "energy along the path [mJ m]",
                          has_grid=True)
     # A path that is allowed to be longer may be any shorter one: the curve only falls.
     best = np.minimum.accumulate(energy)
     axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
-                      color=PATH_COLOURS["plan"], alpha=0.15, label="the best lies here")
+                      color=PATH_COLOURS["plan"], alpha=0.15, label="range of the best path")
     axis.plot(span, floor, "--", color=PATH_COLOURS["plan"], lw=1, label="proven bound")
     axis.plot(length, energy, "o-", color=PATH_COLOURS["plan"], ms=4, label="gentlest found")
-    axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="length allowed")
+    axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="allowed length")
     axis.set_ylim(0.0, None)
     axis.legend(frameon=False, fontsize=8)
     return figure

@@ -1,4 +1,4 @@
-"""What the report says of how a branch rang."""
+"""The report's section on the vibration of a branch."""
 
 from pathlib import Path
 
@@ -24,14 +24,14 @@ def vibration_rows(path: Path) -> tuple[list[list[str]], list[list[str]]]:
     """Return the modulus, and the vibrations of the record, as rows with a header.
 
     Raises:
-        InputError: the file cannot be read, or says something else.
+        InputError: the file cannot be read, or has other content.
     """
-    told = read_json_as(path, VibrationFile, "how a branch rang")
+    told = read_json_as(path, VibrationFile, "the result of a vibration")
     low, high = told.young_interval_pa
-    modulus = [["what", "value", "95 % interval"],
+    modulus = [["quantity", "value", "95 % interval"],
                ["Young's modulus, mean of the branch [MPa]", f"{told.young_pa / 1e6:.4g}",
                 f"{low / 1e6:.4g} to {high / 1e6:.4g}"],
-               ["of the record, not explained", f"{100 * told.left_over:.0f} %", ""]]
+               ["unexplained part of the recording", f"{100 * told.left_over:.0f} %", ""]]
     vibrations = [["frequency [Hz]", "+-", "damping", "+-"]]
     vibrations += [[f"{frequency:.4g}", f"{spread:.2g}", f"{100 * ratio:.2f} %",
                     f"{100 * wide:.2g} %"]

@@ -11,7 +11,7 @@ from limber.core.errors import InputError
 
 @dataclass
 class Section:
-    """One part of the page; ``missing`` tells which command would fill it."""
+    """One part of the page; ``missing`` is the command that would fill it."""
 
     title: str
     text: list[str] = field(default_factory=list)
@@ -28,10 +28,11 @@ def read_png(path: Path) -> bytes:
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).", "It was to open the report.",
-                         "Leave out --picture, or name the PNG of `limber scene`.") from error
+        raise InputError(f"{path} cannot be read ({error.strerror}).",
+                         "It should be shown at the top of the report.",
+                         "Omit --picture, or name the PNG that `limber scene` rendered.") from error
     if not data.startswith(b"\x89PNG"):
-        raise InputError(f"{path} is not a PNG file.", "The page shows PNG.", "Name a PNG.")
+        raise InputError(f"{path} is not a PNG file.", "The report shows only PNG.", "Name a PNG.")
     return data
 
 

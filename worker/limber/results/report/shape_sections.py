@@ -1,4 +1,4 @@
-"""What the report says of a branch's shape: scan and skeleton, cylinders, mesh."""
+"""The report's sections on a branch's shape: scan and skeleton, cylinders, mesh."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,13 +22,13 @@ from limber.store.loading import load_skeleton, load_targets
 
 _DOUBTS_SHOWN = 12
 _QUALITY_LABELS = {
-    "volume_ratio": "mesh over surface volume",
+    "volume_ratio": "volume of the mesh over volume of the surface",
     "min_dihedral_deg": "smallest angle between faces [degrees]",
     "min_radius_ratio": "worst shape of a tetrahedron (1 regular, 0 flat)",
-    "mean_radius_ratio": "mean shape",
+    "mean_radius_ratio": "mean shape of the tetrahedra",
     "elements_across": "elements across the branch",
-    "surface_distance_mean": "mean distance of mesh and surface [local radii]",
-    "surface_distance_max_m": "largest distance of mesh and surface [m]",
+    "surface_distance_mean": "mean distance between mesh and surface [local radii]",
+    "surface_distance_max_m": "largest distance between mesh and surface [m]",
     "fork_distance_mean": "mean distance at forks [local radii]",
     "fork_distance_max": "largest distance at forks [local radii]"}
 
@@ -40,16 +40,16 @@ def scan_section(branch: Branch) -> Section:
         return section
     targets = _targets(branch)
     section.draw(figures.scan_and_skeleton(branch, targets),
-                 "The aligned cloud (grey) with the centreline tree, one colour an order, the "
-                 "control points (rings) and named targets (stars); from the front and from the "
-                 "side.")
+                 "The aligned cloud (grey) with the centreline tree (one colour per branching "
+                 "order), the control points (rings) and the named targets (stars), from the "
+                 "front and from the side.")
     if targets:
         section.tables.append(("Named targets", [
             ["target", "x [m]", "y [m]", "z [m]", "mass [kg]"],
             *([target["name"], *(f"{value:.3f}" for value in target["position_m"]),
                f"{target['mass_kg']:.4g}"] for target in targets)]))
     section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
-                                        "it is known, one colour an order.")
+                                        "known; one colour per branching order.")
     result = branch.made.result if branch.made else {}
     section.text += result.get("warnings") or []
     doubtful = doubtful_parts(load_skeleton(branch))
@@ -66,8 +66,8 @@ def _doubt_table(doubtful: list[Doubt]) -> tuple[str, list[list[str]]]:
                         "length_m": doubt.length, "radius_m": doubt.radius, "value": doubt.value}
                        for doubt in doubtful[:_DOUBTS_SHOWN]])
     rest = len(doubtful) - _DOUBTS_SHOWN
-    more = f"; {rest} more: limber skeleton" if rest > 0 else ""
-    return f"Doubtful parts of the skeleton, places in the branch's frame [m]{more}", rows
+    more = f"; `limber skeleton` lists {rest} more" if rest > 0 else ""
+    return f"Uncertain parts of the skeleton, positions in the branch's frame [m]{more}", rows
 
 
 def cylinders_section(branch: Branch, calipers: Sequence[Caliper]) -> Section:
@@ -79,7 +79,7 @@ def cylinders_section(branch: Branch, calipers: Sequence[Caliper]) -> Section:
     compared = qsm_tables.against_calipers(skeleton, list(calipers))
     shares = branch.made and branch.made.result.get("length_shares")
     if shares:
-        section.tables.append(("How the radii are known", share_rows(shares)))
+        section.tables.append(("Sources of the radii", share_rows(shares)))
     section.tables.append(("By branching order (0 is the main axis)",
                            order_rows(qsm_tables.by_order(skeleton))))
     section.tables.append(("Diameters along the main path",
@@ -87,7 +87,8 @@ def cylinders_section(branch: Branch, calipers: Sequence[Caliper]) -> Section:
     if compared:
         section.tables.append(("Against calipers", caliper_rows(compared)))
     section.draw(figures.diameters(skeleton, compared),
-                 "Diameter along the main path; the band is two standard deviations to each side.")
+                 "Diameter along the main path; the band is plus or minus two standard "
+                 "deviations.")
     return section
 
 
@@ -105,7 +106,7 @@ def mesh_section(branch: Branch) -> Section:
                                                   "modulus; base in black, grasp patch in red.")
     result = branch.made.result if branch.made else {}
     quality = result.get("mesh_quality") or {}
-    rows = [["what", "value"]]
+    rows = [["quantity", "value"]]
     for key in ("surface_volume_m3", "mesh_volume_m3"):
         if result.get(key) is not None:
             rows.append([key.replace("_m3", " [cm3]").replace("_", " "),

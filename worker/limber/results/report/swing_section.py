@@ -1,4 +1,4 @@
-"""What the report says of a free swing that the branch was fitted to."""
+"""The report's section on a free swing to which the branch was fitted."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _Interval = tuple[float, float]
 _Track = list[list[tuple[float | None, float | None, float | None]]]
-"""Of each time, each marker's place [m]; None where it was not seen."""
+"""Position of each marker at each time [m]; None where it was not observed."""
 
 
 class SwingFile(FileContent):
@@ -40,40 +40,43 @@ def read_swing(path: Path) -> SwingFile:
     """Read what ``limber swing`` wrote.
 
     Raises:
-        InputError: it cannot be read, says something else, or its tracks are of unequal length.
+        InputError: it cannot be read, has other content, or its tracks have unequal lengths.
     """
-    swing = read_json_as(path, SwingFile, "a swing")
+    swing = read_json_as(path, SwingFile, "the result of a swing")
     counts = {len(markers) for track in (swing.seen_m, swing.simulated_m) for markers in track}
     if len(swing.seen_m) != len(swing.times_s) or len(swing.simulated_m) != len(swing.times_s) or (
             len(counts) != 1 or not counts.pop()) or any(
             None in place for markers in swing.simulated_m for place in markers):
-        raise InputError(f"{path}: seen and simulated are not of the same markers at its times.",
-                         "A swing was expected.", "It is damaged: run `limber swing` again.")
+        raise InputError(f"{path}: the observed and simulated tracks do not have the same markers "
+                         "and times.",
+                         "The result of a swing was expected.",
+                         "The file is damaged. Run `limber swing` again.")
     return swing
 
 
 def swing_rows(swing: SwingFile) -> list[list[str]]:
-    """Return what a free swing told, a row a quantity: value and 95 % interval."""
+    """Return the results of a free swing, one row per quantity: value and 95 % interval."""
     release = [swing.release_s + side * 1.96 * swing.release_deviation_s
                for side in (-1, 1)]
-    rows = [["what", "value", "95 % interval"]]
+    rows = [["quantity", "value", "95 % interval"]]
     for label, value, interval, form, scale in (
             ("Young's modulus, mean [MPa]", swing.young_pa, swing.young_interval_pa,
              ".4g", 1e-6),
             ("damping ratio of the first vibration", swing.damping_ratio,
              swing.damping_ratio_interval, ".3g", 1.0),
-            ("let go at [s]", swing.release_s, release, ".4g", 1.0)):
+            ("time of release [s]", swing.release_s, release, ".4g", 1.0)):
         low, high = interval
         rows.append([label, f"{scale * value:{form}}",
                      f"{scale * low:{form}} to {scale * high:{form}}"])
     return [*rows, ["first frequency [Hz]", f"{swing.frequency_hz:.4g}", "-"],
-            ["left over, of the largest displacement", f"{100 * swing.relative_residual:.2g} %",
+            ["residual relative to the largest displacement",
+             f"{100 * swing.relative_residual:.2g} %",
              "-"]]
 
 
 def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacement [m] of the marker that swings most, along its way: seen (NaN where
-    it was not) and simulated, shape [f] each."""
+    """Return the displacement [m] of the marker that swings most, along its path: observed (NaN
+    where it was not) and simulated, shape [f] each."""
     seen, simulated = np.array(swing.seen_m, float), np.array(swing.simulated_m, float)
     most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
     way = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
@@ -81,12 +84,12 @@ def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
 
 
 def swing_over_time(swing: SwingFile) -> "Figure":
-    """Draw seen and simulated displacement of the marker that swings most."""
+    """Draw observed and simulated displacement of the marker that swings most."""
     from limber.results.report.estimate_figures import OBSERVED, SIMULATED
 
     figure, axes = chart(5.2, 3.0, "time [s]", "displacement [mm]")
     seen, simulated = along_its_way(swing)
-    axes.plot(swing.times_s, 1e3 * seen, ".", ms=4, color=OBSERVED, label="seen")
+    axes.plot(swing.times_s, 1e3 * seen, ".", ms=4, color=OBSERVED, label="observed")
     axes.plot(swing.times_s, 1e3 * simulated, color=SIMULATED, label="simulated")
     axes.legend(frameon=False)
     return figure

@@ -4,8 +4,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-ASSUMED = ("The modulus of the simulated pull is assumed: this branch was not pulled. The estimate "
-           "shows that the assumed modulus is found again, and nothing about the real branch.")
+ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is assumed. The "
+           "estimate shows only that the assumed modulus is recovered. It states nothing about "
+           "the real branch.")
 
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
@@ -34,7 +35,7 @@ def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
     """How many 95 % intervals hold the truth, in words; arguments of :func:`modulus_rows`."""
     truth = pull["young_true_pa"]
     held = sum(_holds(estimate, number, value) for number, value in enumerate(truth))
-    return f"{held} of {len(truth)} intervals of 95 % hold the " + (
+    return f"{held} of {len(truth)} intervals (95 %) contain the " + (
         f"assumed modulus. {ASSUMED}" if is_assumed(pull) else "true modulus.")
 
 
@@ -49,7 +50,7 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
     for label, key, unit in [
             ("path length", "length_m", "m"),
             ("energy along the path", "energy_integral_jm", "J m"),
-            ("energy sum, 5 mm steps", "energy_sum_nmm", "N mm"),
+            ("sum of energy, 5 mm steps", "energy_sum_nmm", "N mm"),
             ("peak energy", "peak_energy_j", "J"), ("peak force", "peak_force_n", "N")]:
         before, after = plan["baseline"].get(key), plan["plan"].get(key)
         if before is None or after is None:
@@ -60,21 +61,21 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
 
 
 def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return what makes each modulus unsure, as standard deviations in percent.
+    """Return the sources of each modulus's uncertainty, as standard deviations in percent.
 
     Args:
         estimate: ``young_deviation`` with ``sensor``, ``geometry``, ``mesh`` and ``total``, each
             [K] of log E or None where that was not examined; ``fractions`` [K].
     """
     parts = estimate.get("young_deviation") or {}
-    known = {"sensor": "by sensors", "geometry": "by the scan's shape", "mesh": "by the mesh",
-             **({"path": "by the gripper's path"} if parts.get("path") else {}),
-             **({"hung": "by the mass of twigs"} if parts.get("hung") else {}),
-             **({"grip": "by the length in the gripper"} if parts.get("grip") else {}),
+    known = {"sensor": "from sensors", "geometry": "from the scan's shape", "mesh": "from the mesh",
+             **({"path": "from the gripper's path"} if parts.get("path") else {}),
+             **({"hung": "from the mass of twigs"} if parts.get("hung") else {}),
+             **({"grip": "from the length in the gripper"} if parts.get("grip") else {}),
              "total": "together"}
     if not any(parts.get(name) for name in known):
         return []
-    rows = [["control point", "place (0 base, 1 tip)", *known.values()]]
+    rows = [["control point", "position (0 base, 1 tip)", *known.values()]]
     for number, place in enumerate(estimate["fractions"]):
         shares = ["not examined" if not parts.get(name) else "not known"
                   if parts[name][number] is None else f"{100 * parts[name][number]:.1f} %"
@@ -84,7 +85,7 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return what makes the moduli unsure, largest first, and what would shrink each.
+    """Return the causes of the moduli's uncertainty, largest first, and how to reduce each.
 
     Args:
         estimate: ``causes``, each with ``cause``, ``share``, ``deviation`` and ``advice``
@@ -93,14 +94,15 @@ def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     causes = estimate.get("causes") or []
     if not causes:
         return []
-    rows = [["cause", "part of the variance", "deviation of E by it", "what would shrink it"]]
+    rows = [["cause", "fraction of the variance", "resulting deviation of E",
+             "what would reduce it"]]
     return rows + [[each["cause"], f"{100 * each['share']:.0f} %",
                     f"up to {100 * min(each['deviation'], 99.0):.1f} %", each["advice"]]
                    for each in causes]
 
 
 def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return how well each pull is foretold by a fit that did not see it.
+    """Return how well each pull is predicted by a fit without it.
 
     Args:
         estimate: ``held_out``, pull's name to ``rms_m``, ``rms_force_n``, ``relative_distance``,
@@ -109,7 +111,8 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     scores = estimate.get("held_out") or {}
     if not scores:
         return []
-    rows = [["pull", "points [mm]", "of their travel", "force [N]", "of its peak", "foretold by"]]
+    rows = [["pull", "points [mm]", "relative to travel", "force [N]", "relative to peak",
+             "predicted by"]]
     for name, score in scores.items():
         rows.append([
             name, _known(score.get("rms_m"), "{:.2f}", 1e3),
@@ -122,8 +125,8 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def share_rows(shares: Mapping[str, float]) -> list[list[str]]:
-    """Return which share of the axes' length each state of the radius has."""
-    return [["radius", "share of the axes' length"],
+    """Return the fraction of the axes' length that has each state of the radius."""
+    return [["radius", "fraction of the axes' length"],
             *([name, f"{100 * share:.1f} %"] for name, share in shares.items())]
 
 
@@ -136,13 +139,13 @@ def order_rows(orders: Sequence[Mapping[str, float]]) -> list[list[str]]:
              for name in ("branch_count", "length_m", "volume_m3")}
     whole["taper"] = sum(part["taper"] * part["length_m"] for part in orders) / max(
         whole["length_m"], 1e-300)
-    return [["order", "branches", "length [m]", "volume [cm3]", "taper [mm of radius a m]"],
+    return [["order", "branches", "length [m]", "volume [cm3]", "taper [mm of radius per m]"],
             *(row(str(part["order"]), part) for part in orders), row("all", whole)]
 
 
 def diameter_rows(diameters: Sequence[Mapping[str, float]]) -> list[list[str]]:
-    """Return diameters at shares of the main path's length."""
-    return [["share of the main path", "from the root [m]", "diameter [mm]",
+    """Return diameters at fractions of the main path's length."""
+    return [["fraction of the main path", "from the root [m]", "diameter [mm]",
              "standard deviation [mm]"],
             *([f"{100 * row['share']:.0f} %", f"{row['along_m']:.3f}",
                f"{1e3 * row['diameter_m']:.2f}", _known(row["sigma_m"] or None, "{:.2f}", 1e3)]
@@ -150,7 +153,7 @@ def diameter_rows(diameters: Sequence[Mapping[str, float]]) -> list[list[str]]:
 
 
 def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the scan's diameters beside those that calipers found."""
+    """Return the scan's diameters and those measured with calipers."""
     return [["from the root [m]", "calipers [mm]", "scan [mm]", "difference",
              "in standard deviations"],
             *([f"{row['along_m']:.3f}", f"{1e3 * row['measured_m']:.2f}",
@@ -159,15 +162,16 @@ def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def doubt_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the doubtful parts of a skeleton.
+    """Return the uncertain parts of a skeleton.
 
     Args:
         doubtful: Each with ``kind``, ``branch``, ``at`` [3], ``length_m``, ``radius_m`` and
             ``value`` (see :class:`limber.geometry.skeleton.doubtful_parts.Doubt`).
     """
-    told = {"unlikely branch": "probability {:.2f}", "unresolved radius": "sigma {:.0%} of it",
+    told = {"unlikely branch": "probability {:.2f}",
+            "unresolved radius": "sigma {:.0%} of the radius",
             "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
-    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "how doubtful"]]
+    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty"]]
     for part in doubtful:
         value = part["value"]
         if part["kind"] in ("kink", "starts backwards"):

@@ -1,1 +1,1 @@
-"""What a viewport shows of a branch, as arrays."""
+"""The content of a branch's 3D view, as arrays."""

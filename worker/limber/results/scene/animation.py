@@ -1,4 +1,4 @@
-"""What moves in a scene: frames with their values, and marks along them."""
+"""The moving parts of a scene: frames with their values, and marks along them."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ _FRAME_SCALARS = {
     "strain_energy_density_j_m3": ("strain_energy", "strain energy density", "J/m³", "inferno"),
     "principal_strain": ("strain", "largest principal strain", "%", "inferno"),
     "principal_stress_pa": ("stress", "largest principal stress", "Pa", "inferno"),
-    "det_f": ("det_f", "volume relative to that at rest", "", "viridis")}
+    "det_f": ("det_f", "volume relative to the rest volume", "", "viridis")}
 """Arrays of ``frames/NAME.npz`` [frames, vertices]: name in the scene, title, unit, colours."""
 _FRAME_VALUES = {"energies_j": "frame_energy", "kinetic_energies_j": "frame_kinetic_energy",
                  "min_det_f": "frame_min_det_f", "largest_principal_strains": "frame_strain"}
@@ -34,8 +34,8 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
     names = [name.removesuffix(".pc2") for name in branch.names("frames") if name.endswith(".pc2")]
     data.info["motions"] = names
     if motion is not None and motion not in names:
-        raise BranchFolderError(f"There are no frames {motion!r}.",
-                                f"There are: {', '.join(names) or 'none'}.",
+        raise BranchFolderError(f"The branch has no frames named {motion!r}.",
+                                f"Its frames are: {', '.join(names) or 'none'}.",
                                 "Name one of them, or run `limber simulate`.")
     name = motion or (plan if plan in names else None)
     if name is None and plan is None and names:
@@ -46,10 +46,11 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
     positions, _, _ = read_pc2(branch.path(f"frames/{name}.pc2"))
     if positions.shape[1] != count:
         if motion is None and _is_of_an_earlier_mesh(branch, name):
-            data.info["notes"].append(f"{name} is of an earlier mesh: its motion is not shown")
+            data.info["notes"].append(f"{name} belongs to an earlier mesh, so its motion is not "
+                                      "shown")
             return
         raise BranchFolderError(
-            f"frames/{name}.pc2 moves {positions.shape[1]} vertices; the mesh's surface has "
+            f"frames/{name}.pc2 has {positions.shape[1]} vertices; the mesh's surface has "
             f"{count}.",
             "The frames belong to another mesh; Blender would silently show the rest shape.",
             "Run the stage that makes them again.")
@@ -63,13 +64,13 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
 
 
 def _finished(branch: Branch, name: str) -> str:
-    """Return when frames were written, as the manifest says: a file's own time a copy changes."""
+    """Return when frames were written, from the manifest: copying changes a file's own time."""
     return max((entry.finished for entry in branch.manifest.stages.values()
                 if f"frames/{name}.pc2" in entry.writes), default="")
 
 
 def _is_of_an_earlier_mesh(branch: Branch, name: str) -> bool:
-    """Whether the mesh has been made anew since the frames were."""
+    """Whether the mesh has been made again since the frames were written."""
     stages = branch.manifest.stages
     meshed = max((stages[key].finished for key in ("reconstruct", "mesh") if key in stages),
                  default="")
@@ -82,8 +83,9 @@ def _about(branch: Branch, name: str, count: int) -> FramesFile:
     path = branch.path(f"frames/{name}.json")
     about = read_frames_file(path)
     if about.frame_count not in (None, count):
-        raise BranchFolderError(f"{path} speaks of {about.frame_count} frames; there are {count}.",
-                                "They do not belong together.", "Run the stage again.")
+        raise BranchFolderError(f"{path} describes {about.frame_count} frames, but there are "
+                                f"{count}.", "The two files do not belong together.",
+                                "Run the stage again.")
     return about
 
 
@@ -105,12 +107,13 @@ def _add_values(data: SceneData, branch: Branch, name: str, about: FramesFile,
     if not branch.has(f"frames/{name}.npz"):
         return
     path = branch.path(f"frames/{name}.npz")
-    content = read_arrays(path, "values of a motion's frames")
+    content = read_arrays(path, "the values of a motion's frames")
     for key, (scalar, title, unit, colours) in _FRAME_SCALARS.items():
         # Those of another motion, or of a part of it, are left out.
         if key not in content or content[key].shape != (count, vertex_count):
             continue
-        require_shapes(path, content, {key: (count, vertex_count)}, "values of a motion's frames")
+        require_shapes(path, content, {key: (count, vertex_count)},
+                       "the values of a motion's frames")
         add_frame_scalar(data, scalar, content[key], title, unit, colours)
 
 

@@ -1,4 +1,4 @@
-"""The file that carries a scene to Blender's process: arrays by name, and what they are."""
+"""The file that passes a scene to Blender's process: arrays by name, and their meaning."""
 
 import json
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ FORMAT = 2
 
 @dataclass
 class SceneData:
-    """Arrays by name and a dictionary that says what they are; see limber.results.scene.contents"""
+    """Arrays by name and a dictionary that describes them; see limber.results.scene.contents"""
 
     arrays: dict[str, np.ndarray]
     info: dict[str, Any] = field(default_factory=dict)

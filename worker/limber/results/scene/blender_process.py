@@ -38,7 +38,7 @@ def blender_command() -> list[str]:
     if not blender:
         raise MissingDependencyError(
             "There is no bpy package in this Python and no Blender was found.",
-            "A scene needs one of them.",
+            "A scene needs one of the two.",
             "Install bpy (pip install 'limber[blender]'), or set LIMBER_BLENDER to a Blender.")
     return [blender, "--background", "--factory-startup", "--python-exit-code", "3",
             "--python", script]

@@ -1,4 +1,4 @@
-"""What colours mean: scales with units, ticks in words, and the colours themselves."""
+"""Colour scales: their units, the labels of their ticks, and the colours themselves."""
 
 from typing import Any
 
@@ -69,7 +69,7 @@ def levels_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
 
 
 def _places(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
-    """Return where values stand on a scale, 0 to 1."""
+    """Return the positions of values on a scale, 0 to 1."""
     low, high = scale["low"], scale["high"]
     if scale["log"]:
         values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
@@ -77,7 +77,7 @@ def _places(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
 
 
 def with_unit(value: float, unit: str, size: float) -> str:
-    """Return ``value`` in words, with the prefix that suits ``size``; of a share with % too."""
+    """Return ``value`` in words, with the prefix that suits ``size``; a fraction may be in %."""
     if not unit:
         return f"{value:.3g}"
     if unit == "%":

@@ -1,4 +1,4 @@
-"""What was measured over what the estimated branch does: distances at the moments of a pull."""
+"""Measured against simulated: distances to the estimated branch at the moments of a pull."""
 
 from typing import Any
 

@@ -49,7 +49,7 @@ class Axis:
         return cls(title, unit, low, low + 1.06 * (high - low) if high > low else low + 1.0)
 
     def place(self, values: float | np.ndarray) -> np.ndarray:
-        """Return where values stand, as shares of the axis."""
+        """Return the positions of values, as fractions of the axis."""
         values = np.asarray(values, float)
         if self.log:
             values = np.log(np.maximum(values, 1e-300))
@@ -57,7 +57,7 @@ class Axis:
         return (values - self.low) / (self.high - self.low)
 
     def ticks(self) -> list[list[Any]]:
-        """Return ``[share, words]`` of a few round values."""
+        """Return ``[fraction, label]`` of a few round values."""
         values = _decades(self.low, self.high) if self.log else _steps(self.low, self.high)
         largest = max((abs(value) for value in values), default=1.0)
         # On a logarithmic axis each tick has a prefix of its own.
@@ -79,7 +79,7 @@ class Graph:
 
     def line(self, label: str, color: tuple[float, float, float], x: np.ndarray, y: np.ndarray,
              *, is_dotted: bool = False) -> None:
-        """Add a line, or single points; where there is no number it is left out."""
+        """Add a line, or single points; values that are not numbers are omitted."""
         x, y = np.asarray(x, float), np.asarray(y, float)
         known = np.isfinite(x) & np.isfinite(y)
         chosen = np.flatnonzero(known)
@@ -140,7 +140,7 @@ def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
     true = np.array(truth.get("young_pa") or [], float)
     axis = Axis.over("Young's modulus", "Pa", [young, interval[is_known], true], log=True)
     graph = Graph("Young's modulus along the branch",
-                  Axis("place on the main path (0 base, 1 tip)", "", 0.0, 1.0), axis)
+                  Axis("position on the main path (0 base, 1 tip)", "", 0.0, 1.0), axis)
     if is_known.sum() > 1:
         graph.band("95 %", SIMULATED, place[is_known], *interval[is_known].T)
     graph.line("estimated", SIMULATED, place, young)

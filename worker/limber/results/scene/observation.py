@@ -109,7 +109,7 @@ def _in_frames(data: SceneData, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _around(points: np.ndarray, distance: np.ndarray, seen: np.ndarray, vertices: np.ndarray,
             ) -> np.ndarray:
-    """Return distances [frames, m] at all vertices, by the inverse square; 0 where none is seen."""
+    """Return distances [frames, m] at all vertices, by the inverse square; 0 where not observed."""
     weights = np.maximum(np.linalg.norm(vertices[:, None] - points, axis=2), 1e-9) ** -2
     total = seen @ weights.T
     values = np.where(seen, distance, 0.0) @ weights.T

@@ -1,4 +1,4 @@
-"""Paths to a goal in a scene: their points, poses and energies, what was searched, the goal."""
+"""Paths to a goal in a scene: points, poses, energies, search trees and the goal."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
         data.info["paths"][key] = {"title": title, "note": _path_note(summary.get(key) or {})}
     gap = (summary.get("certificate") or {}).get("gap_percent")
     if gap is not None and "plan" in data.info["paths"]:
-        data.info["paths"]["plan"]["note"] += f", {gap:.1f} % off the least cost at most"
+        data.info["paths"]["plan"]["note"] += f", at most {gap:.1f} % above the least cost"
     _add_trees(data, branch, plan)
     _add_energy_scale(data)
     data.info["plan"] = plan

@@ -1,4 +1,4 @@
-"""The robot along a path: where its links are in each frame, from the joints of a dry run."""
+"""The robot along a path: pose of its links in each frame, from the joints of a dry run."""
 
 from pathlib import Path
 

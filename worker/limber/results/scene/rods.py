@@ -63,7 +63,7 @@ def rods(points: np.ndarray, lines: np.ndarray, radius: float | np.ndarray,
          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices [v, 3] m, triangles [f, 3] and the point of each vertex [v] of open tubes.
 
-    Lines without length have none.
+    Lines without length get no rod.
     """
     points = np.asarray(points, float)
     size = np.broadcast_to(np.asarray(radius, float), len(points))

@@ -1,4 +1,4 @@
-"""What stands still in a scene: surface values, the scan, the skeleton, marks and the view."""
+"""The static parts of a scene: surface values, scan, skeleton, marks and the view."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -49,7 +49,7 @@ def add_cloud(data: SceneData, branch: Branch) -> None:
 
 
 def add_skeleton(data: SceneData, branch: Branch) -> None:
-    """Add the centreline: nodes, parents, radii with their standard deviation, doubt and flags."""
+    """Add the centreline: nodes, parents, radii with standard deviation, uncertainty and flags."""
     if not branch.has("skeleton.swc"):
         return
     skeleton = load_skeleton(branch)
@@ -111,7 +111,7 @@ def add_marks(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
 
 
 def add_targets(data: SceneData, targets: Sequence[NamedTarget]) -> None:
-    """Add named places, in their order; ``info["targets"]`` names them."""
+    """Add named positions, in their order; ``info["targets"]`` names them."""
     data.info["targets"] = [target.name for target in targets]
     if targets:
         data.arrays["targets"] = np.array([target.position for target in targets], float)
