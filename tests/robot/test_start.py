@@ -48,7 +48,7 @@ def test_every_other_branch_at_the_same_pose_is_refused_with_both_values():
         told = str(stop.value)
         assert f"joint {worst + 1} (" in told
         assert f"is at {np.degrees(joints[worst]):.1f} degrees" in told
-        assert f"and {np.degrees(JOINTS[worst]):.1f} was expected" in told
+        assert f"instead of {np.degrees(JOINTS[worst]):.1f}" in told
 
 
 @pytest.mark.parametrize("joint, name", list(enumerate(

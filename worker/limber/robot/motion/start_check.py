@@ -43,8 +43,8 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
     turn = length(turn_between(start, pose))
     if turn > ROTATION_RAD:
         told.append(f"the gripper is turned by {np.degrees(turn):.1f} degrees against the path's "
-                    f"start: its rotation vector is {in_degrees(pose[3:])} degrees, and "
-                    f"{in_degrees(start[3:])} was expected")
+                    f"start: its rotation vector is {in_degrees(pose[3:])} degrees instead of "
+                    f"{in_degrees(start[3:])}")
     told += [] if start_joints is None else different_joints(joints, start_joints, names)
     if told:
         raise SafetyStop(
@@ -63,8 +63,8 @@ def different_joints(joints: np.ndarray, wanted: np.ndarray, names: Sequence[str
         turns = (joints[number] - wanted[number]) / (2 * np.pi)
         whole = round(turns) != 0 and abs(turns - round(turns)) * 2 * np.pi <= JOINT_RAD
         told.append(f"joint {number + 1} ({names[number]}) is at "
-                    f"{np.degrees(joints[number]):.1f} degrees, and "
-                    f"{np.degrees(wanted[number]):.1f} was expected"
+                    f"{np.degrees(joints[number]):.1f} degrees instead of "
+                    f"{np.degrees(wanted[number]):.1f}"
                     + (" (whole turns apart)" if whole else ""))
     return told
 
