@@ -50,7 +50,7 @@ def test_what_is_a_model_and_what_is_refused(tmp_path):
     (tmp_path / "thin.swc").write_text("1 0 0 0 0 0 -1\n2 0 0 0 1 0.1 1\n")
     for path, settings, told in (
             ("thin.swc", MeshSurfaceSettings(), "radius 0"),
-            ("rtwig.csv", MeshSurfaceSettings(root=(0.0, 0.0, 0.0)), "has its own")):
+            ("rtwig.csv", MeshSurfaceSettings(root=(0.0, 0.0, 0.0)), "defines its own root")):
         with pytest.raises(InputError, match=told):
             mesh_surface(tmp_path / path, tmp_path / "b.branch", settings)
     assert not Branch.open(tmp_path / "b.branch").manifest.stages

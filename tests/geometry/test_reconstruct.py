@@ -154,7 +154,7 @@ def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):
     bad = tmp_path / "ball.xyz"
     normal = np.random.default_rng(0).normal(size=(2000, 3))
     np.savetxt(bad, normal / np.linalg.norm(normal, axis=1)[:, None])
-    with pytest.raises(InputError, match="branch-like"):
+    with pytest.raises(InputError, match="shape of a branch"):
         reconstruct(bad, folder / "g.branch")
     assert (folder / "g.branch" / "branch.json").read_bytes() == before
     Branch.open(folder / "g.branch")

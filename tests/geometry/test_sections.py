@@ -100,5 +100,5 @@ def test_what_is_no_table_of_sections_is_refused(tmp_path):
                             columns="x_mm,y_mm,z_mm,width_mm,depth_mm,mass_kg"), "m")
     wrong = table(tmp_path / "b.csv").read_text(encoding="utf-8").replace("24.0,", "0.0,", 1)
     (tmp_path / "b.csv").write_text(wrong, encoding="utf-8")
-    with pytest.raises(InputError, match="thickness"):
+    with pytest.raises(InputError, match="width or height"):
         read_sections(tmp_path / "b.csv", "m")

@@ -84,14 +84,14 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     assert other["length_m"] == pytest.approx(told["length_m"], rel=1e-6)
     far = (OFFSET + 2000).tolist()
     edits.write_text(json.dumps([{"do": "delete", "at": far}]))
-    with pytest.raises(InputError, match=r"Edit 1 .*on no branch"):
+    with pytest.raises(InputError, match=r"Edit 1 .*not belong to any branch"):
         review_skeleton(target, edits_path=edits)
     assert len(review_skeleton(target)["edits"]) == 1
     warned: list[str] = []
     undone = reconstruct(scan, target, SETTINGS, edits_path=edits,
                          progress=Progress(on_warning=warned.append))
     assert undone["length_m"] == pytest.approx(result["length_m"])
-    assert any("Edit 1 (delete)" in text and "left out" in text for text in warned)
+    assert any("Edit 1 (delete)" in text and "skipped" in text for text in warned)
     edits.write_text("[]")
     assert review_skeleton(target, edits_path=edits)["edits"] == []
     assert not (target / "edits.json").exists()

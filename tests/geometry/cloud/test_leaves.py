@@ -110,7 +110,7 @@ def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> 
     Cloud(points).write_ply(scan)
     result = reconstruct(scan, folder, ReconstructSettings(leave_out=True, leaves="cut"))
     assert result["length_m"] == pytest.approx(branch.skeleton.length, rel=0.15)
-    assert any("leaves" in text and "cut off" in text for text in result["warnings"])
+    assert any("leaves" in text and "detected and removed" in text for text in result["warnings"])
     assert result["leaf_mass_kg"] == pytest.approx(0.2 * area, rel=0.3)
     opened = Branch.open(folder)
     cloud = read_cloud(opened.path("cloud.ply"))

@@ -46,7 +46,7 @@ def test_crop_box_and_voxels():
 
 
 @pytest.mark.parametrize(("points", "complaint"), [
-    (np.ones((100, 3)), "at one place"),
+    (np.ones((100, 3)), "at the same position"),
     (_rod(40), "has 40 points"),
 ])
 def test_refused(points, complaint):
@@ -99,7 +99,7 @@ def test_lost_digits_are_told():
     points = generate_branch(73).cloud.points
     far = points + [500_000.0, 4.6e6, 120.0]
     assert len(prepare(Cloud(far), 1.0).cloud) == len(points)
-    with pytest.raises(InputError, match=r"steps of 0\.5"):
+    with pytest.raises(InputError, match=r"resolution of 0\.5"):
         prepare(Cloud(far.astype(np.float32).astype(float)), 1.0)
     near = (points + [500.0, 4600.0, 12.0]).astype(np.float32).astype(float)
     assert not prepare(Cloud(near), 1.0).warnings

@@ -81,6 +81,6 @@ def test_installed_packages_add_theirs(monkeypatch, tmp_path):
 
     monkeypatch.setattr(formats, "entry_points", lambda group: [Entry("broken"), Entry(group)])
     registry = formats.Registry("cloud", "limber.things")
-    with pytest.warns(UserWarning, match="broken adds no format of a cloud"):
+    with pytest.warns(UserWarning, match="broken could not register a format of a cloud"):
         assert formats.suffixes_of(registry.readers()) == (".foo",)
     assert [one.name for one in registry] == ["dots"]

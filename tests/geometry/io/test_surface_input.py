@@ -39,7 +39,7 @@ def test_a_sound_surface_passes_unchanged():
 def test_holes_are_refused_at_their_place():
     """A missing face: three open edges, one of them named."""
     whole = bar()
-    with pytest.raises(InputError, match=r"has holes: 3 open edges, one at \(") as told:
+    with pytest.raises(InputError, match=r"has holes: 3 open edges, one of them at \(") as told:
         usable_surface(Surface(whole.vertices, whole.faces[1:]), FILE)
     assert "fill" in str(told.value)
 
@@ -56,7 +56,7 @@ def test_edges_of_more_than_two_faces_are_refused():
 def test_faces_turned_inwards_are_turned_back():
     """An inverted surface is put right, with a word about it."""
     surface, warnings = usable_surface(bar(turned=True), FILE)
-    assert surface.volume > 0 and "turned" in warnings[0]
+    assert surface.volume > 0 and "flipped" in warnings[0]
 
 
 def test_faces_in_and_out_are_refused():
@@ -64,7 +64,7 @@ def test_faces_in_and_out_are_refused():
     whole = bar()
     faces = whole.faces.copy()
     faces[3] = faces[3, ::-1]
-    with pytest.raises(InputError, match="point in and out") as told:
+    with pytest.raises(InputError, match="point inwards and faces that point outwards") as told:
         usable_surface(Surface(whole.vertices, faces), FILE)
     assert "normals" in str(told.value)
 
@@ -79,7 +79,7 @@ def test_several_bodies_are_refused(turned):
 @pytest.mark.parametrize("turned", [False, True])
 def test_cavities_are_refused(turned):
     """A shell within the body, whichever way it faces."""
-    with pytest.raises(InputError, match="within its largest one"):
+    with pytest.raises(InputError, match="inside its largest one"):
         usable_surface(joined(bar(), bar((0, 0, 0), (0.005, 0.005, 0.1), turned)), FILE)
 
 
@@ -89,7 +89,7 @@ def test_a_surface_that_crosses_itself_is_refused():
     vertices = np.asarray(tube.vertices).copy()
     top = vertices[:, 2] > 0.099
     vertices[top] += [0.0, 0.0, -0.25]
-    with pytest.raises(InputError, match="crosses itself") as told:
+    with pytest.raises(InputError, match="intersects itself") as told:
         usable_surface(Surface(vertices, np.asarray(tube.faces)), FILE)
     assert "Boolean" in str(told.value)
 
@@ -109,8 +109,8 @@ def test_faces_without_area_are_left_out():
     assert len(surface.faces) == len(whole.faces) and "without area" in warnings[0]
 
 
-@pytest.mark.parametrize(("scale", "text"), [(1000.0, "200 m long: is its unit millimetres"),
-                                             (0.001, "0.2 mm long: is its unit")])
+@pytest.mark.parametrize(("scale", "text"), [(1000.0, "200 m long. Is its unit millimetres"),
+                                             (0.001, "0.2 mm long. Is its unit")])
 def test_a_wrong_unit_is_suspected(scale, text):
     """Millimetres read as metres, and the other way round."""
     whole = bar()

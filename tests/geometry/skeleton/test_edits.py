@@ -109,8 +109,8 @@ def test_edits_outlive_a_new_numbering() -> None:
 
 def test_edits_that_make_no_tree_are_refused() -> None:
     """Places beside all branches, the root, and circles: which edit, and why."""
-    for edit, why in (({"do": "delete", "at": (1.0, 0, 0)}, "on no branch"),
+    for edit, why in (({"do": "delete", "at": (1.0, 0, 0)}, "not belong to any branch"),
                       ({"do": "delete", "at": (0, 0, 0)}, "root cannot"),
-                      ({"do": "bridge", "at": (0, 0, 0.1), "to": (0.1, 0, 0.2)}, "circle")):
+                      ({"do": "bridge", "at": (0, 0, 0.1), "to": (0.1, 0, 0.2)}, "cycle")):
         with pytest.raises(InputError, match=rf"Edit 1.*{why}"):
             edited(_tree(), _edits(edit))

@@ -34,5 +34,5 @@ def test_what_has_no_axis_is_refused(shape: str) -> None:
               "heap": rng.random((4000, 3)) * [0.5, 0.5, 0.7],
               "can": np.column_stack([0.1 * np.cos(angle), 0.1 * np.sin(angle),
                                       rng.uniform(0, 0.3, 4000)])}[shape]
-    with pytest.raises(InputError, match="not branch-like"):
+    with pytest.raises(InputError, match="not have the shape of a branch"):
         skeletonise(points)

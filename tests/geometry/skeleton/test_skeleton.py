@@ -49,7 +49,7 @@ def test_cylinder_csv_round_trip(y_skeleton, tmp_path):
     ("1 0 0 0 0 1 -1\n2 0 0 0 1 1 -1", "2 roots"),
     ("1 0 0 0 0 1 -1\n2 0 0 0 1 -0.5 1", "negative"),
     ("1 0 0 0 0 1 -1\n2 0 0 0 x 1 1", "is not a node"),
-    ("1 0 0 0 0 1 -1\n2 0 0 0 1 1 7", "not in the file"),
+    ("1 0 0 0 0 1 -1\n2 0 0 0 1 1 7", "not exist in the file"),
     ("1 0 0 0 0 1 -1\n2 0 nan 0 1 1 1", "not finite"),
     ("# nothing", "no nodes"),
 ])

@@ -279,11 +279,11 @@ def test_pieces_and_loose_nodes_are_refused(short_box):
     two = TetMesh(np.vstack([short_box.nodes, short_box.nodes + [0.1, 0, 0]]),
                   np.vstack([short_box.tets, short_box.tets + count]),
                   point_data={"fixed": np.tile(short_box.point_data["fixed"], 2)})
-    with pytest.raises(InputError, match="2 pieces"):
+    with pytest.raises(InputError, match="2 separate pieces"):
         BranchModel(two, young=1e7, poisson=0.3, density=900)
     loose = TetMesh(np.vstack([short_box.nodes, [[1.0, 1, 1]]]), short_box.tets,
                     point_data={"fixed": np.append(short_box.point_data["fixed"], 0)})
-    with pytest.raises(InputError, match="no tetrahedron"):
+    with pytest.raises(InputError, match="not belong to any tetrahedron"):
         BranchModel(loose, young=1e7, poisson=0.3, density=900)
 
 

@@ -230,7 +230,7 @@ def test_cylinder_model_stands_beside_calipers(tmp_path):
     for text in ("74.0 %", "26.0 %", "probability 0.40", "sigma 25% of it", "-4.8 %", "-2.5",
                  "By branching order", "taper [mm of radius per m]"):
         assert text in html, text
-    for content, told in (("along_m,diameter_mm\n0.5,21\n", "0.5 m; the main path is 0.4 m"),
+    for content, told in (("along_m,diameter_mm\n0.5,21\n", "0.5 m, but the main path is 0.4 m"),
                           ("along_m,diameter_mm\n0.1,-3\n", "line 2: -3 mm"), ("", "no values")):
         path.write_text(content)
         with pytest.raises(InputError, match=told):

@@ -233,6 +233,6 @@ def read_truth(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it cannot be read, or is no such file.
     """
-    content = read_json(path, "what a branch was made with")
-    checked_as(path, _Truth, content, "what a branch was made with")
+    content = read_json(path, "a description of a generated branch")
+    checked_as(path, _Truth, content, "a description of a generated branch")
     return content

@@ -96,14 +96,14 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
     nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
     place = (nearest + prepared.origin) / UNIT_METRES[unit]
     count = f"{len(leaves)} {'leaf' if len(leaves) == 1 else 'leaves'}"
-    raise InputError(
-        f"{100 * share:.0f} % of the points look like {count}, flat and not round; the largest "
-        f"is at ({', '.join(f'{value:.6g}' for value in place)}), "
-        f"{1e4 * largest.area:.3g} cm2.",
-        f"Limber does not cut off more than {100 * UNASKED:.0f} % of a scan without being told "
-        "to: flat wood may look like a leaf.",
-        "If these are leaves, cut them off and keep their mass (--leaves cut). If they are wood, "
-        "keep all points (--leaves keep).")
+    raise InputError(f"{100 * share:.0f} % of the points look like {count}: they are flat and not "
+                     "round. The largest leaf is at "
+                     f"({', '.join(f'{value:.6g}' for value in place)}) and has "
+                     f"{1e4 * largest.area:.3g} cm2.",
+                     "Flat wood may look like a leaf, so Limber removes more than "
+                     f"{100 * UNASKED:.0f} % of a scan only on request.",
+                     "If these are leaves, remove them and keep their mass (--leaves cut). If they "
+                     "are wood, keep all points (--leaves keep).")
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
@@ -164,7 +164,7 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, dens
 def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
     """What to tell of leaves that were cut off, ``share`` of the points."""
     count = f"{len(masses)} {'leaf' if len(masses) == 1 else 'leaves'}"
-    return (f"{count} ({100 * share:.0f} % of the points, "
-            f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2) were told from the stems and cut "
-            f"off. Their mass, {1e3 * sum(m['mass_kg'] for m in masses):.3g} g, hangs on the stems "
-            "(--leaf-density; --leaves keep takes them as wood).")
+    return (f"Limber detected and removed {count} ({100 * share:.0f} % of the points, "
+            f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2). Their mass of "
+            f"{1e3 * sum(m['mass_kg'] for m in masses):.3g} g is attached to the stems "
+            "(--leaf-density). --leaves keep treats all points as wood.")

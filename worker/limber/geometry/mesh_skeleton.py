@@ -43,13 +43,14 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
             be meshed.
     """
     if settings.root is not None:
-        raise InputError("A root is given for a cylinder model.", "The model has its own.",
-                         "Leave --root out.")
+        raise InputError("A root (--root) was given for a cylinder model.",
+                         "The model defines its own root.", "Omit --root.")
     scale = UNIT_METRES[settings.unit]
     given = read_skeleton(path, scale=scale)
     if (given.radius <= 0).any():
         raise InputError(f"{int((given.radius <= 0).sum())} of {given.node_count} nodes of {path} "
-                         "have radius 0.", "A branch has a thickness.", "Give each its radius.")
+                         "have radius 0.", "A branch has a thickness.",
+                         "Give each node its radius.")
     alignment, skeleton = _aligned(given, scale, settings)
     meshed = mesh_skeleton(skeleton, ReconstructSettings(
         young=settings.young, poisson=settings.poisson, density=settings.density,

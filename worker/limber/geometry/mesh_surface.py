@@ -108,7 +108,7 @@ def section_axis(surface: Surface, root: np.ndarray | None) -> Skeleton:
             centres.append(centre)
             radii.append(np.sqrt(area / np.pi))
     if len(centres) < 4:
-        raise InputError("The surface has no clear long axis.", "It is not slender.",
+        raise InputError("The surface has no clear long axis.", "The body is not slender.",
                          "Use a surface that is longer than it is thick.")
     return _to_the_ends(np.array(centres), np.array(radii), axis, low, high, root)
 

@@ -82,14 +82,15 @@ def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: Reconst
     named = ", ".join(f"branch {m['branch']} ({1000 * m['length_m']:.0f} mm, "
                       f"{1000 * m['mass_kg']:.3g} g)" for m in first)
     more = f" and {len(masses) - _NAMED} more" if len(masses) > _NAMED else ""
-    text = (f"{len(masses)} branches of {sum(m['length_m'] for m in masses):.3g} m and "
-            f"{100 * share:.1f} % of the mass are not in the mesh: {named}{more}.")
+    text = (f"{len(masses)} branches with a length of {sum(m['length_m'] for m in masses):.3g} m "
+            f"and {100 * share:.1f} % of the mass are not in the mesh: {named}{more}.")
     asked = settings.leave_out or settings.twig_radius > 0 or settings.twig_order < 9
     if share > _LEFT_OUT_MOST and not asked:
-        raise MeshingError(
-            text, "They would weigh on the branch, but neither bend nor be grasped.",
-            "Accept that (--leave-out), mesh with fTetWild (--mesher ftetwild), or mend the "
-            "skeleton there.")
+        raise MeshingError(text,
+                           "Their weight would act on the branch, but they could neither bend nor "
+                           "be grasped.",
+                           "Accept this (--leave-out), mesh with fTetWild (--mesher ftetwild), or "
+                           "correct the skeleton there.")
     progress.warn(f"{text} Their mass is kept.")
 
 
@@ -128,6 +129,6 @@ def touching_texts(handles: int, touching: list[dict[str, Any]]) -> list[str]:
     places = "; ".join(
         f"branches {m['branches'][0]} and {m['branches'][1]} at ("
         + ", ".join(f"{v:.3f}" for v in m["at_m"]) + ")" for m in touching[:_NAMED])
-    return [f"surface.ply has {handles} handle{'s' * (handles != 1)}: branches touch and grow "
-            f"together there that are apart in the skeleton{': ' + places if places else ''}. The "
-            "swept mesh keeps them apart."]
+    return [f"surface.ply has {handles} handle{'s' * (handles != 1)}: branches that are separate "
+            f"in the skeleton touch and merge there{': ' + places if places else ''}. The swept "
+            "mesh keeps them separate."]

@@ -183,11 +183,11 @@ def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
                   ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
     cut = sum(len(leaf.points) for leaf in known.leaves)
     if len(known.result.node_of_point) + cut != len(prepared.cloud):
-        raise InputError(f"The skeleton that was found before is of {len(known.result.residual)} "
-                         f"points, the scan has {len(prepared.cloud) - cut}.",
-                         "It is of another scan.", "Reconstruct again with --force.")
+        raise InputError(f"The stored skeleton belongs to {len(known.result.residual)} points, but "
+                         f"the scan has {len(prepared.cloud) - cut}.",
+                         "The skeleton belongs to another scan.", "Reconstruct again with --force.")
     wood, leaves = cut_off(prepared, known.leaves)
-    progress(0.55, "skeleton, as it was found before")
+    progress(0.55, "skeleton of an earlier run")
     return known.result, wood, leaves
 
 
@@ -231,7 +231,7 @@ def _edited(found: SkeletonResult, edits: Sequence[Edit], progress: Progress) ->
     misfits: list[str] = []
     skeleton = edited(found.skeleton, edits, misfits)
     for text in misfits:
-        progress.warn(f"{text} It was left out.")
+        progress.warn(f"{text} The edit was skipped.")
     return replace(found, skeleton=skeleton)
 
 
@@ -316,9 +316,9 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
     text = ""
     if dropped:
         longest = max(twig["length"] for twig in dropped)
-        text = (f"{len(dropped)} twigs (up to {1000 * longest:.0f} mm) were dropped: in the depth "
-                "camera's image they do not leave their carrier, so they may be noise of its "
-                "depth (--silhouette-reach).")
+        text = (f"{len(dropped)} twigs (up to {1000 * longest:.0f} mm) were discarded. In the "
+                "depth camera's image they do not extend beyond their parent, so they may be "
+                "depth noise (--silhouette-reach).")
     return replace(found, skeleton=skeleton, node_of_point=node, residual=residual,
                    pruned=found.pruned + len(dropped)), text
 
@@ -334,10 +334,10 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
         size = np.linalg.norm(np.ptp(own.nodes, axis=0))
         extent = np.linalg.norm(np.ptp(prepared.cloud.points, axis=0))
         if size > 10 * extent:
-            raise InputError(
-                f"The skeleton is {size:.3g} m wide, the cloud {extent:.3g} m.",
-                "They do not belong together, or are in different units.",
-                "Give the skeleton in the cloud's coordinates and unit (--unit is for both).")
+            raise InputError(f"The skeleton is {size:.3g} m wide, but the cloud is {extent:.3g} m "
+                             "wide.", "They do not belong together, or have different units.",
+                             "Give the skeleton in the coordinates and the unit of the cloud "
+                             "(--unit applies to both).")
         return given_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin

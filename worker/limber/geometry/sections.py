@@ -77,8 +77,8 @@ def read_sections(path: Path, unit: str) -> Sections:
     if missing or len(rows) < 2:
         raise InputError(
             f"{path} has {len(rows)} rows and the columns {', '.join(titles) or 'none'}.",
-            "A drawn body needs two sections or more, each with its place on the axis, its width "
-            "and its height.", "Write columns x,y,z,width,height (and mass_kg, what hangs there).")
+            "A body needs at least two sections, each with a position on the axis, a width and a "
+            "height.", "Write the columns x,y,z,width,height (and mass_kg for an attached mass).")
     try:
         columns = {name: scale * np.array([float(row[title]) for row in rows])
                    for name, (title, scale) in found.items()}
@@ -90,11 +90,12 @@ def read_sections(path: Path, unit: str) -> Sections:
                     columns["height"], mass)
     if not (np.isfinite(made.axis).all() and np.all(np.minimum(made.width, made.height) > 0)
             and np.all(mass >= 0)):
-        raise InputError(f"{path} has a place that is not finite, a thickness that is not over 0, "
-                         "or a negative mass.", "No body has such a section.", "Correct the table.")
+        raise InputError(f"{path} has a position that is not finite, a width or height that is not "
+                         "positive, or a negative mass.", "A body cannot have such a section.",
+                         "Correct the table.")
     if np.any(np.linalg.norm(np.diff(made.axis, axis=0), axis=1) == 0):
-        raise InputError(f"{path} has the same place twice in a row.",
-                         "Between two sections the body has a length.", "Omit one of them.")
+        raise InputError(f"{path} has the same position in two consecutive rows.",
+                         "Consecutive sections must be apart.", "Omit one of them.")
     return made
 
 

@@ -104,10 +104,10 @@ def depth_to_cloud(camera: Camera, depth: np.ndarray, mask: np.ndarray | None = 
     """
     for name, image in (("depth image", depth), ("mask", mask)):
         if image is not None and image.shape != (camera.height, camera.width):
-            raise InputError(
-                f"The {name} has {image.shape[1]}x{image.shape[0]} pixels, the camera "
-                f"{camera.width}x{camera.height}.", "They must belong together.",
-                "Use the intrinsics of this image, not those of the colour camera.")
+            raise InputError(f"The {name} has {image.shape[1]}x{image.shape[0]} pixels, but the "
+                             f"camera has {camera.width}x{camera.height}.",
+                             "Image and intrinsics must have the same size.",
+                             "Give the intrinsics of this image, not those of the colour camera.")
     chosen = np.isfinite(depth) & (depth > 0)
     if mask is not None:
         chosen &= mask
@@ -135,7 +135,7 @@ def read_camera(path: Path) -> Camera:
     Raises:
         InputError: missing, or an entry makes no sense (named).
     """
-    content = read_toml(path, "a camera's intrinsics, without which depth images mean nothing,")
+    content = read_toml(path, "a file of camera intrinsics (depth images need it)")
     try:
         return Camera.model_validate(content)
     except ValidationError as error:

@@ -45,7 +45,7 @@ class Cloud:
         """
         axes = _first(_AXES, columns)
         if axes is None:
-            raise InputError(f"There are columns {', '.join(columns)}.", "x, y and z are missing.",
+            raise InputError(f"The columns are {', '.join(columns)}.", "x, y and z are missing.",
                              "Name the coordinates x, y, z.")
         used = set(axes)
         attributes: dict[str, np.ndarray] = {}

@@ -47,5 +47,6 @@ def _check_chunks(path: Path) -> None:
         while len(head := stream.read(8)) == 8:
             length = int.from_bytes(head[:4], "big")
             if stream.tell() + length > size:
-                raise ValueError(f"a part of {length} bytes is announced, and {size} are there")
+                raise ValueError(f"the file announces a part of {length} bytes but has only {size} "
+                                 "bytes")
             stream.seek(length + 4, 1)

@@ -67,13 +67,15 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     origin = np.round(scaled.mean(axis=0), 3)
     points = scaled - origin
     if np.ptp(points, axis=0).max() <= 1e-9 * max(float(np.abs(scaled).max()), 1e-9):
-        raise InputError(f"All {len(points)} points are at one place.",
-                         "A branch has an extent.", "Check the export's columns and digits.")
+        raise InputError(f"All {len(points)} points are at the same position.",
+                         "The points of a branch spread out in space.",
+                         "Check the columns and the number of digits of the export.")
     _enough_digits(cloud.points)
     _, middle, longest = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
     if middle < 1e-6 * longest:
         raise InputError(f"All {len(points)} points lie on one straight line.",
-                         "A branch has a thickness.", "Check the export's columns and digits.")
+                         "A branch has a thickness.",
+                         "Check the columns and the number of digits of the export.")
     cloud = cloud.with_points(points)
     single = _first_of_each(points)
     counts["duplicates"] = int((~single).sum())
@@ -88,7 +90,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         chosen = voxel_thinned(cloud.points, settings.voxel)
         counts["thinned"] = len(cloud) - len(chosen)
         cloud = cloud.subset(chosen)
-    _enough(cloud, "After cropping and cleaning the cloud")
+    _enough(cloud, "After cropping and cleaning, the cloud")
     if view is not None:
         view = replace(view, eye=view.eye - origin)
     return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view)
@@ -100,7 +102,7 @@ def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
     extent = cell.max(axis=0) + 1
     if float(extent[0]) * float(extent[1]) * float(extent[2]) > 2.0**62:
         raise InputError(f"Cells of {size:g} m are too small for this cloud.",
-                         "Their number overflows.", "Choose a larger --voxel.")
+                         "There would be too many of them to count.", "Choose a larger --voxel.")
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
     return np.sort(np.unique(key, return_index=True)[1])
 
@@ -115,7 +117,7 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
         low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
         raise InputError("The crop box holds no points.",
                          f"The cloud reaches from {low.tolist()} to {high.tolist()}.",
-                         "Give the box in the file's own coordinates and unit.")
+                         "Give the box in the coordinates and the unit of the file.")
     return cloud if keep.all() else cloud.subset(keep)
 
 
@@ -147,10 +149,10 @@ def _enough_digits(points: np.ndarray) -> None:
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     step = float(np.spacing(np.float32(np.abs(points).max())))
     if step > _COARSEST_STEP * extent and (points == points.astype(np.float32)).all():
-        raise InputError(
-            f"The coordinates, up to {np.abs(points).max():.7g}, have steps of {step:g}: the cloud "
-            f"is {extent:.3g} long.", "They were kept in single precision (7 digits), and the "
-            "shape is lost.", "Export in double precision, or with an offset subtracted.")
+        raise InputError(f"The coordinates reach {np.abs(points).max():.7g} and have a resolution "
+                         f"of {step:g}, but the cloud is only {extent:.3g} long.",
+                         "They were stored in single precision (7 digits), which loses the shape.",
+                         "Export in double precision, or subtract an offset first.")
 
 
 def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
@@ -170,8 +172,7 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
     counts["flying"] = int(flying.sum())
     rest = cloud.subset(~flying)
-    _enough(rest, "Without its flying pixels (--flying-angle 0 keeps them) the depth camera's "
-            "cloud")
+    _enough(rest, "Without flying pixels (--flying-angle 0 keeps them), the depth camera's cloud")
     return rest, view
 
 
@@ -191,7 +192,7 @@ def _own_sight(points: np.ndarray) -> tuple[np.ndarray, Sight | None]:
 def _enough(cloud: Cloud, what: str) -> None:
     if len(cloud) < POINT_MINIMUM:
         raise InputError(f"{what} has {len(cloud)} point{'s' * (len(cloud) != 1)}.",
-                         f"A skeleton needs at least {POINT_MINIMUM}.",
+                         f"A skeleton needs at least {POINT_MINIMUM} points.",
                          "Scan more densely, or crop less.")
 
 
@@ -260,27 +261,27 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     extent = float(np.ptp(points, axis=0).max())
     if extent > _LARGEST_EXTENT:
         unit = "millimetres (--unit mm)" if extent > 100 else "centimetres (--unit cm)"
-        texts.append(f"The cloud is {extent:.0f} m long: are its units {unit}?")
+        texts.append(f"The cloud is {extent:.0f} m long. Is its unit {unit}?")
     if extent < _SMALLEST_EXTENT:
-        texts.append(f"The cloud is {1000 * extent:.1f} mm long: are its units really these?")
+        texts.append(f"The cloud is {1000 * extent:.1f} mm long. Is its unit (--unit) correct?")
     if counts.get("not_finite"):
-        texts.append(f"Points left away since they are no numbers (NaN, infinity): "
-                     f"{counts['not_finite']}.")
+        texts.append("Points with coordinates that are not finite (NaN or infinity) were "
+                     f"discarded: {counts['not_finite']}.")
     if counts.get("sheets"):
         texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
-                     "wall, the ground?) and were cut out (--keep-sheets).")
+                     "wall or the ground?) and were removed (--keep-sheets keeps them).")
     if counts.get("ground"):
         texts.append(f"{counts['ground']} of {counts['read']} points lie on rough ground and were "
-                     "cut out (--keep-sheets).")
+                     "removed (--keep-sheets keeps them).")
     step = _rounding(points)
     if step > 0:
-        texts.append(f"Coordinates are rounded to {1000 * step:.4g} mm: radii can be no better "
-                     "than that (export with more digits).")
+        texts.append(f"The coordinates are rounded to {1000 * step:.4g} mm, which limits the "
+                     "accuracy of the radii. Export with more digits.")
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
-        texts.append(f"{flying} of {counts['read']} points were dropped as a depth camera's "
-                     "flying pixels (--flying-angle, --flying-speck).")
+        texts.append(f"{flying} of {counts['read']} points were discarded as flying pixels of a "
+                     "depth camera (--flying-angle, --flying-speck).")
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
-        texts.append(f"{lost} points were dropped as outliers (--outlier-ratio).")
+        texts.append(f"{lost} points were discarded as outliers (--outlier-ratio).")
     return texts

@@ -41,7 +41,7 @@ def read_points(path: Path) -> Cloud:
                          "Check the path.")
     if path.is_dir():
         raise InputError(f"{path} is a folder.", "A point cloud file was expected.",
-                         "Name one of its files, or give the folder to `limber reconstruct`.")
+                         "Give one of its files, or give the folder to `limber reconstruct`.")
     chosen = CLOUDS.of(path)
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty.", "A point cloud was expected.", "Export it again.")
@@ -55,8 +55,8 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
     cloud = cloud.with_valid_columns()
     finite = (np.abs(cloud.points) < _FARTHEST).all(axis=1)
     if not finite.any():
-        raise InputError(f"{path}: none of {len(cloud)} points is finite.",
-                         "Coordinates must be numbers; NaN and infinity are not.",
+        raise InputError(f"{path}: none of the {len(cloud)} points is finite.",
+                         "Coordinates must be finite numbers, not NaN or infinity.",
                          "Export it again.")
     if finite.all():
         return cloud
@@ -89,8 +89,8 @@ def _read_vertices(path: Path) -> Cloud:
     else:
         points = np.asarray(mesh.vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path} has vertices of {points.shape[-1]} numbers.",
-                         "A vertex has three.", "Export it again.")
+        raise InputError(f"{path} has vertices of {points.shape[-1]} coordinates.",
+                         "A vertex has three coordinates.", "Export it again.")
     # STL repeats a vertex in each of its triangles.
     return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points)
 
@@ -104,7 +104,7 @@ def _read_arrays(path: Path) -> Cloud:
     points = np.asarray(arrays.pop(key), np.float64)
     if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:
         raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
-                         "Points have shape [n, 3].", "Save them so.")
+                         "Points must have shape [n, 3].", "Save them in this shape.")
     renamed = {"normals": "normal", "colors": "color"}
     return Cloud(points[:, :3], {renamed.get(k, k): v for k, v in arrays.items()})
 

@@ -44,8 +44,8 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
     """
     found = _fields(Path(path))
     if not found:
-        raise InputError(f"{path} has no struct with {', '.join(TREEQSM_FIELDS)}.",
-                         "A TreeQSM model was expected.", "Save the QSM of TreeQSM itself.")
+        raise InputError(f"{path} has no struct with the fields {', '.join(TREEQSM_FIELDS)}.",
+                         "A TreeQSM model was expected.", "Save the QSM itself from TreeQSM.")
     try:
         radius, length, parent = (np.asarray(found[name], float).ravel()
                                   for name in ("radius", "length", "parent"))
@@ -56,8 +56,8 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
                          "Save it again.") from error
     count = len(radius)
     if not (len(length) == len(parent) == count and start.shape == axis.shape == (count, 3)):
-        raise InputError(f"{path} has fields of unequal length.", "Each cylinder has all of them.",
-                         "Save it again.")
+        raise InputError(f"{path} has fields of different lengths.",
+                         "Each field needs one value for each cylinder.", "Save it again.")
     return {"id": np.arange(1.0, count + 1), "parent": np.where(parent > 0, parent, -1.0),
             "start": start, "end": start + axis * length[:, None], "radius": radius,
             "start_radius": _thick_ends(found, radius)}
@@ -71,8 +71,9 @@ def _fields(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} cannot be read ({error.strerror}).",
                          "A TreeQSM model was expected.", "Check the path.") from error
     if is_new:
-        require_extra("matlab", ("h5py",), f"{path} is a MAT file of version 7.3, which "
-                      "(unless you save it in Matlab with -v7)")
+        require_extra("matlab", ("h5py",),
+                      f"The MAT file {path} of version 7.3 (saving it in Matlab with -v7 avoids "
+                      "this)")
         return read_apart(mat_v73_fields, path)
     return _older_fields(path)
 

@@ -27,8 +27,9 @@ def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = Non
     mask = None if mask_path is None else _image(mask_path) > 0
     seen = depth_to_cloud(camera, depth, mask)
     if len(seen.points) == 0:
-        raise InputError(f"{depth_path} has no reading on the mask.",
-                         "A cloud needs depths that are over 0.", "Check mask and depth image.")
+        raise InputError(f"{depth_path} has no reading within the mask.",
+                         "A cloud needs depths greater than 0.",
+                         "Check the mask and the depth image.")
     return Cloud(seen.points, {"sigma": seen.sigma})
 
 

@@ -77,7 +77,7 @@ class Registry(Generic[Kind]):
     def register(self, added: Kind) -> None:
         """Add a format; ValueError if there is one of that name."""
         if any(one.name == added.name for one in self.formats):
-            raise ValueError(f"There is a format {added.name!r} of a {self.what}.")
+            raise ValueError(f"A format {added.name!r} of a {self.what} already exists.")
         self.formats.insert(0, added)
 
     def __iter__(self) -> Iterator[Kind]:
@@ -88,8 +88,8 @@ class Registry(Generic[Kind]):
                 try:
                     self.register(entry.load())
                 except Exception as error:  # it must not stop work that does without it
-                    warnings.warn(f"The package of {entry.value} adds no format of a {self.what} "
-                                  f"({type(error).__name__}: {error}).", stacklevel=2)
+                    warnings.warn(f"The package of {entry.value} could not register a format of a "
+                                  f"{self.what} ({type(error).__name__}: {error}).", stacklevel=2)
         return iter(tuple(self.formats))
 
     def of(self, path: Path) -> Kind:
@@ -112,13 +112,14 @@ class Registry(Generic[Kind]):
         except (LimberError, MemoryError):
             raise
         except ImportError as error:
-            raise MissingDependencyError(
-                f"Reading {path.suffix} needs the package {error.name}.", "It is not installed.",
-                f"Install it, or export the {self.what} in another format.") from error
+            raise MissingDependencyError(f"Reading {path.suffix} files requires the package "
+                                         f"{error.name}.", "It is not installed.",
+                                         f"Install it, or export the {self.what} in another "
+                                         "format.") from error
         except Exception as error:  # each format's package raises its own
             raise machine_error(error, path) or InputError(
                 f"{path} cannot be read ({type(error).__name__}: {error}).",
-                "It is damaged, cut short, or not what its suffix says.",
+                "The file is damaged, truncated, or does not have the format of its suffix.",
                 "Export it again.") from error
 
     def write_as(self, chosen: Format, content: Any, path: Path, *further: Any) -> Any:
@@ -158,14 +159,14 @@ def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
             if one.recognises is not None and loaded(one.recognises)(path):
                 return one
     if not plain:
-        raise unknown_suffix(path, formats, f"Export the {what} as one of these.")
+        raise unknown_suffix(path, formats, f"Export the {what} in one of these formats.")
     return plain[0]
 
 
 def unknown_suffix(path: Path, formats: Iterable[Format], fix: str) -> InputError:
     """Return the refusal of a file whose suffix is of none of these formats."""
-    return InputError(f"{path.name} has a suffix that is not known.",
-                      f"Known are: {' '.join(suffixes_of(formats))}.", fix)
+    return InputError(f"{path.name} has an unknown suffix.",
+                      f"Known suffixes are {' '.join(suffixes_of(formats))}.", fix)
 
 
 def suffixes_of(formats: Iterable[Format]) -> tuple[str, ...]:

@@ -46,10 +46,10 @@ def read_apart(reader: Callable[[Path], dict[str, np.ndarray]], path: Path,
         else:
             if code == 0 and target.exists():
                 return _unpacked(read_arrays(target, "points"))
-            trouble = last[:200] or f"it ended with code {code}"
+            trouble = last[:200] or f"the reader ended with code {code}"
         raise InputError(f"{path} cannot be read ({trouble}).",
-                         "It is damaged, cut short, or not what its suffix says.",
-                         "Export it again.")
+                         "The file is damaged, truncated, or does not have the format of its "
+                         "suffix.", "Export it again.")
 
 
 def _main(reader: str, source: str, target: str, parent_id: str) -> int:

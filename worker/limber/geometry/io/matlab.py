@@ -85,11 +85,12 @@ def _numbers(found: Any, most_bytes: float) -> np.ndarray:
     import h5py
 
     if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "iuf":
-        raise ValueError("a cylinder's fields are numbers")
+        raise ValueError("the fields of a cylinder must be numbers")
     if found.external or found.is_virtual:
-        raise ValueError("its numbers are said to be in other files")
+        raise ValueError("its numbers are stored in other files, which Limber does not read")
     if found.size * 8 > most_bytes:
-        raise ValueError(f"an array of shape {found.shape} is announced, and the file is small")
+        raise ValueError(f"the file announces an array of shape {found.shape}, but is too small to "
+                         "hold it")
     if found.attrs.get("MATLAB_empty"):
         return np.zeros((0, 0))
     return np.asarray(found[()], float).T

@@ -69,13 +69,13 @@ def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[
     missing = [name for name in ("CLASSES", "MTG") if not found.get(name)]
     if missing:
         raise InputError(f"{path} has no section {' and '.join(missing)}.",
-                         "An MTG has CODE, CLASSES, DESCRIPTION, FEATURES and MTG.",
+                         "An MTG has the sections CODE, CLASSES, DESCRIPTION, FEATURES and MTG.",
                          "Choose an MTG file (FORM-A).")
     scales = {}
     for number, line in found["CLASSES"][1:]:
         words = line.split()
         if len(words) < 2 or not words[1].isdigit():
-            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is no class.",
+            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is not a class.",
                              "A class has a symbol and a scale.", "Correct that line.")
         scales[words[0]] = int(words[1])
     return scales, found["MTG"]
@@ -88,13 +88,14 @@ def _header(path: Path, body: list[tuple[int, str]]) -> tuple[int, dict[str, int
     places = next((names for names in _PLACE if all(name in features for name in names)), None)
     if places is None:
         raise InputError(f"{path} has no columns XX, YY and ZZ.",
-                         "Only an MTG with places of its vertices can be used.",
-                         f"It has: {', '.join(features) or 'no features'}.")
+                         "Limber needs the positions of the vertices of an MTG.",
+                         "Add these columns. The file has: "
+                         f"{', '.join(features) or 'no features'}.")
     radius = next((name for name in features if name.lower() in _RADII), None)
     if radius is None:
         raise InputError(f"{path} has no column Radius or Diameter.",
-                         "A branch is as thick as its vertices.",
-                         f"It has: {', '.join(features)}.")
+                         "Limber needs the thickness of the branch at its vertices.",
+                         f"Add one of these columns. The file has: {', '.join(features)}.")
     used = dict(zip(("x", "y", "z"), (features[name] for name in places), strict=True))
     return min(features.values()), used | {radius.lower(): features[radius]}
 
@@ -123,7 +124,7 @@ class _Reader:
                 stays = code.startswith("^")
                 vertex = self.last.get(column if stays else column - 1)
                 if vertex is None and (stays or column > 0):
-                    raise self.wrong(number, code, "There is no vertex that it refers to.")
+                    raise self.wrong(number, code, "It refers to a vertex that does not exist.")
             vertex = self.chain(number, code.removeprefix("^"), vertex,
                                 values if place == len(codes) - 1 else None)
             self.last = {at: one for at, one in self.last.items() if at < column}
@@ -136,15 +137,15 @@ class _Reader:
         while at < len(code):
             token = _TOKEN.match(code, at)
             if token is None or (token.group(1) is None and vertex is not None):
-                raise self.wrong(number, code, "A code is made of /, < or + and labels.")
+                raise self.wrong(number, code, "A code consists of /, < or + and labels.")
             at = token.end()
             if token.group(2) not in self.scales:
-                raise self.wrong(number, code, f"{token.group(2)} is no class of the file.")
+                raise self.wrong(number, code, f"The file has no class {token.group(2)}.")
             vertex = self.vertex(number, code, (token.group(1) or "/")[0],
                                  self.scales[token.group(2)], vertex,
                                  values if at == len(code) else None)
         if vertex is None:
-            raise self.wrong(number, code, "It names no vertex.")
+            raise self.wrong(number, code, "It does not name a vertex.")
         return vertex
 
     def vertex(self, number: int, code: str, sign: str, scale: int, before: _Vertex | None,
@@ -158,7 +159,7 @@ class _Reader:
                 while whole is not None and whole.scale >= scale:
                     whole = whole.whole
             elif before.scale >= scale:
-                raise self.wrong(number, code, "A part is of a finer scale than its whole.")
+                raise self.wrong(number, code, "A part must have a finer scale than its whole.")
         found = _Vertex(scale, whole, anchor)
         if values is not None:
             found.anchor = self.node(number, code, anchor, values)
@@ -170,7 +171,7 @@ class _Reader:
         *place, radius = values
         if np.isnan(radius):
             if parent < 0:
-                raise self.wrong(number, code, "The first vertex with a place has no radius.")
+                raise self.wrong(number, code, "The first vertex with a position has no radius.")
             radius = self.radius[parent]
         self.nodes.append(tuple(place))
         self.parent.append(parent)
@@ -185,18 +186,19 @@ class _Reader:
             try:
                 return float(text) if text not in ("", "-", "NA") else np.nan
             except ValueError as error:
-                raise self.wrong(number, text, "Places and radii are numbers.") from error
+                raise self.wrong(number, text, "Positions and radii must be numbers.") from error
         place = tuple(value(name) for name in "xyz")
         if np.isnan(place).all():
             return None
-        require_finite(self.path, {f"place in line {number}": np.array(place)}, _WHAT)
+        require_finite(self.path, {f"position in line {number}": np.array(place)}, _WHAT)
         return *place, value(self.radius_column) * _RADII[self.radius_column]
 
     def skeleton(self, scale: float) -> Skeleton:
         roots = self.parent.count(-1)
         if roots != 1:
-            raise InputError(f"{self.path} has {roots} vertices with a place on no other.",
-                             "A branch has exactly one root.", "Keep one plant in the file.")
+            raise InputError(f"{self.path} has {roots} vertices with a position that grow from no "
+                             "other vertex.", "A branch has exactly one root.",
+                             "Keep only one plant in the file.")
         nodes, radius = np.array(self.nodes), np.array(self.radius)
         require_finite(self.path, {"radii": radius}, _WHAT)
         return Skeleton.from_edges(nodes * scale, np.array(self.parent), radius * scale)

@@ -40,8 +40,8 @@ def _stream(path: Path) -> tuple[Any, dict[str, str]]:
             if (words := line.split()) and not words[0].startswith("#")}
     for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
         if not said.get(key):
-            raise InputError(f"{path} has no {key} in its header.", "A PCD file says it there.",
-                             "Export it again.")
+            raise InputError(f"The header of {path} has no entry {key}.",
+                             "A PCD header needs this entry.", "Export it again.")
     fields = said["FIELDS"]
     own = [title for title in fields if title != "_"]
     names = iter(property_names(own))

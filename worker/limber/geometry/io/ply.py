@@ -17,7 +17,7 @@ def read_ply(path: Path) -> Cloud:
     """Return the vertices of a PLY file, with its own names of what is renamed."""
     content, titles = _ply_content(path)
     if "vertex" not in content:
-        raise InputError(f"{path} has no vertices.", "A cloud is an element `vertex`.",
+        raise InputError(f"{path} has no vertices.", "A PLY point cloud has an element `vertex`.",
                          "Export it again.")
     table = content["vertex"].data
     names = list(table.dtype.names)

@@ -57,11 +57,11 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
         try:
             rows.append(_swc_node(line))
         except (ValueError, IndexError, OverflowError) as error:
-            raise InputError(
-                f"{path}, line {number}: {line.strip()[:60]!r} is not a node.",
-                "SWC lines hold: id type x y z radius parent.", "Correct that line.") from error
+            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is not a node.",
+                             "An SWC line has the fields: id type x y z radius parent.",
+                             "Correct that line.") from error
     if not rows:
-        raise InputError(f"{path} has no nodes.", "It is empty or not an SWC file.",
+        raise InputError(f"{path} has no nodes.", "The file is empty, or is not an SWC file.",
                          "Choose another file.")
     table = np.array(rows, float)
     _require_whole(path, table[:, [0, 5]])
@@ -113,7 +113,7 @@ def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
     missing = [name for name in names if not rows or name not in rows[0]]
     if missing:
         raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
-                         f"A cylinder model has: {', '.join(names)}.",
+                         f"A cylinder model has the columns {', '.join(names)}.",
                          "Rename the columns of your export.")
     return _tree_of(path, _numbers(path, rows, names), scale, rows)
 
@@ -141,7 +141,7 @@ def _tree_of(path: Path, table: np.ndarray, scale: float | None,
     first_start = table[roots[:1], 2:5]
     if len(roots) != 1 and not (np.abs(table[roots, 2:5] - first_start) < 1e-9).all():
         raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
-                         "A branch has exactly one root.", "Keep one tree in the file.")
+                         "A branch has exactly one root.", "Keep only one tree in the file.")
     root = roots[0]
     nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
     if rows and rows[root].get("start_radius"):
@@ -184,8 +184,8 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
 
 def _require_whole(path: Path, numbers: np.ndarray) -> None:
     if not (np.abs(numbers) < 2**53).all():
-        raise InputError(f"{path} has an id or a parent that is no whole number.",
-                         "Ids name the nodes.", "Correct the file.")
+        raise InputError(f"{path} has an id or a parent that is not a whole number.",
+                         "The ids of nodes are whole numbers.", "Correct the file.")
 
 
 def _numbers(path: Path, rows: Sequence[dict[str, str]], names: Sequence[str]) -> np.ndarray:
@@ -206,10 +206,10 @@ def _fitted_columns(path: Path, rows: Sequence[dict[str, str]], scale: float,
     if not (((sigma >= 0) & np.isfinite(sigma)).all()
             and np.isin(state, list(STATES.values())).all()
             and ((probability >= 0) & (probability <= 1)).all()):
-        raise InputError(
-            f"{path} has a deviation, state or probability out of its range.",
-            f"Deviations are not negative, states {min(STATES.values())} to "
-            f"{max(STATES.values())}, probabilities 0 to 1.", "Correct the file.")
+        raise InputError(f"{path} has a deviation, state or probability outside its range.",
+                         f"Deviations must not be negative, states must be {min(STATES.values())} "
+                         f"to {max(STATES.values())}, and probabilities 0 to 1.",
+                         "Correct the file.")
     return {"radius_sigma": sigma * scale, "radius_state": state.astype(np.int8),
             "probability": probability}
 
@@ -221,7 +221,7 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path} cannot be read ({error.strerror}).", "", "Check the path.",
                          ) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file.", "A skeleton is SWC or CSV text.",
+        raise InputError(f"{path} is not a text file.", "A skeleton is an SWC or CSV text file.",
                          "Choose another file.") from error
 
 
@@ -236,12 +236,13 @@ def _parents(path: Path, ids: np.ndarray, parent_ids: np.ndarray) -> np.ndarray:
     unique, counts = np.unique(ids, return_counts=True)
     if (counts > 1).any():
         raise InputError(f"{path} has id {unique[counts > 1][0]} more than once.",
-                         "Each node has an id of its own.", "Correct the file.")
+                         "Each node needs its own id.", "Correct the file.")
     where = {int(node): i for i, node in enumerate(ids)}
     lost = [int(p) for p in parent_ids if p >= 0 and int(p) not in where]
     if lost:
-        raise InputError(f"{path}: parent {lost[0]} is not in the file.",
-                         "Each node but the root hangs on another node.", "Correct the file.")
+        raise InputError(f"{path}: parent {lost[0]} does not exist in the file.",
+                         "Each node except the root must have another node as its parent.",
+                         "Correct the file.")
     return np.array([where[int(p)] if p >= 0 else -1 for p in parent_ids], np.int64)
 
 

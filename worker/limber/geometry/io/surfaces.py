@@ -34,16 +34,17 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
             | (corner[:, 2] == corner[:, 0]))
     if flat.any():
         surface = Surface(surface.vertices, corner[~flat])
-        warnings.append(f"{int(flat.sum())} faces without area were left out.")
+        warnings.append(f"{int(flat.sum())} faces without area were discarded.")
     _check_edges(surface, path)
     surface, turned = _one_body(surface, path)
     warnings += turned
     found = crossings(surface)
     if len(found):
-        raise InputError(
-            f"{path} crosses itself in {len(found)} places, one at {_place(found[0])}.",
-            "A solid does not overlap itself.",
-            "Unite its parts (in Blender: a Boolean modifier with Self), then mesh it again.")
+        raise InputError(f"{path} intersects itself at {len(found)} points, one of them at "
+                         f"{_place(found[0])}.",
+                         "The surface of a solid must not intersect itself.",
+                         "Unite its parts (in Blender: a Boolean modifier with Self), then mesh "
+                         "the surface again.")
     return surface, warnings + _unit_warnings(surface)
 
 
@@ -53,21 +54,22 @@ def _check_edges(surface: Surface, path: Path) -> None:
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     middle = surface.vertices[unique].mean(axis=1)
     if (counts == 1).any():
-        raise InputError(
-            f"{path} has holes: {int((counts == 1).sum())} open edges, one at "
-            f"{_place(middle[counts == 1][0])}.", "The surface must be closed.",
-            "Close its holes (in Blender: select non-manifold, fill), then mesh it again.")
+        raise InputError(f"{path} has holes: {int((counts == 1).sum())} open edges, one of them at "
+                         f"{_place(middle[counts == 1][0])}.", "The surface must be closed.",
+                         "Close the holes (in Blender: select non-manifold, fill), then mesh the "
+                         "surface again.")
     if (counts > 2).any():
-        raise InputError(
-            f"{path} has {int((counts > 2).sum())} edges with more than two faces, one at "
-            f"{_place(middle[counts > 2][0])}.", "Around a solid each edge has two.",
-            "Delete double and inner faces (in Blender: Merge by Distance, then select "
-            "non-manifold), then mesh it again.")
+        raise InputError(f"{path} has {int((counts > 2).sum())} edges with more than two faces, "
+                         f"one of them at {_place(middle[counts > 2][0])}.",
+                         "Each edge of a solid has two faces.",
+                         "Delete duplicate and inner faces (in Blender: Merge by Distance, then "
+                         "select non-manifold), then mesh the surface again.")
     balance = np.bincount(inverse.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(counts))
     if balance.any():
-        raise InputError(
-            f"{path}: faces point in and out, for example at {_place(middle[balance != 0][0])}.",
-            "They must be oriented alike.", "Recalculate its normals (in Blender: Shift N).")
+        raise InputError(f"{path} has faces that point inwards and faces that point outwards, for "
+                         f"example at {_place(middle[balance != 0][0])}.",
+                         "All faces must have the same orientation.",
+                         "Recalculate the normals (in Blender: Shift N).")
 
 
 def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
@@ -82,21 +84,22 @@ def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
     if len(parts) > 1:
         inner = _within(parts, volume)
         if inner:
-            raise InputError(
-                f"{path} has {len(inner)} closed surfaces within its largest one, one at "
-                f"{_place(parts[inner[0]].vertices[parts[inner[0]].faces[0, 0]])}.",
-                "A branch is solid, without cavities.",
-                "Delete what is inside (in Blender: separate by loose parts), then mesh it again.")
+            raise InputError(f"{path} has {len(inner)} closed surfaces inside its largest one, one "
+                             "of them at "
+                             f"{_place(parts[inner[0]].vertices[parts[inner[0]].faces[0, 0]])}.",
+                             "A branch is a solid without cavities.",
+                             "Delete the inner surfaces (in Blender: separate by loose parts), "
+                             "then mesh the surface again.")
         share = np.sort(np.abs(volume))[::-1] / np.abs(volume).sum()
         raise InputError(
             f"{path} has {len(parts)} separate bodies, with "
             + ", ".join(f"{100 * s:.2g} %" for s in share[:4]) + " of the volume.",
             "One connected body was expected.",
-            "Keep one (in Blender: separate by loose parts), or unite them with a Boolean "
-            "modifier, then mesh it again.")
+            "Keep one body (in Blender: separate by loose parts), or unite them with a Boolean "
+            "modifier, then mesh the surface again.")
     if volume[0] < 0:
         return Surface(surface.vertices, surface.faces[:, ::-1]), [
-            "All faces pointed inwards; they were turned."]
+            "All faces pointed inwards. They were flipped."]
     return surface, []
 
 
@@ -121,10 +124,10 @@ def _winding(surface: Surface, point: np.ndarray) -> float:
 def _unit_warnings(surface: Surface) -> list[str]:
     size = float(np.ptp(surface.vertices, axis=0).max())
     if size > _LONG:
-        return [f"The surface is {size:.0f} m long: is its unit millimetres (--unit mm)?"]
+        return [f"The surface is {size:.0f} m long. Is its unit millimetres (--unit mm)?"]
     if size < _SHORT:
-        return [f"The surface is {1000 * size:.2g} mm long: is its unit really that small? "
-                "(--unit m, cm, mm, in)"]
+        return [f"The surface is {1000 * size:.2g} mm long. Is its unit correct (--unit m, cm, "
+                "mm, in)?"]
     return []
 
 

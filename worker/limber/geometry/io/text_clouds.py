@@ -45,12 +45,12 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
     if names:
         lines = lines[1:]
     if not lines:
-        raise InputError(f"{path} has a header and no points.", "A point cloud was expected.",
+        raise InputError(f"{path} has a header but no points.", "A point cloud was expected.",
                          "Export it again.")
     table = _numbers(path, lines, separator, text)
     if table.shape[1] < 3:
-        raise InputError(f"{path} has {table.shape[1]} columns.",
-                         "Coordinates need three.", "Export it again.")
+        raise InputError(f"{path} has {table.shape[1]} columns.", "Coordinates need three columns.",
+                         "Export it again.")
     if len(names) == table.shape[1] - 1 and _counts_up(table[:, 0]):
         # R's write.table gives no title to its row names.
         names, titles = ["", *names], ["", *titles]
@@ -65,7 +65,7 @@ def _colmap(path: Path, text: str) -> tuple[list[str], list[str], np.ndarray]:
     cut = [" ".join(line.split()[:len(names)]) for line in text.splitlines()]
     lines = [line for line in cut if line and not _is_comment(line)]
     if not lines:
-        raise InputError(f"{path} has no points.", "A reconstruction of COLMAP was expected.",
+        raise InputError(f"{path} has no points.", "A COLMAP reconstruction was expected.",
                          "Export it again.")
     return names, names, _numbers(path, lines, None, "\n".join(cut))
 
@@ -128,8 +128,8 @@ def _header(path: Path, lines: list[str], separator: str | None) -> tuple[list[s
             known = dict(zip(axes, "xyz", strict=True))
             return [known.get(name, name) for name in names], titles
     if len(names) == len(_parts(lines[min(1, len(lines) - 1)], separator)):
-        raise InputError(f"{path} has columns {', '.join(names)[:200]}.", "x, y and z are missing.",
-                         "Name the coordinates x, y, z.")
+        raise InputError(f"{path} has the columns {', '.join(names)[:200]}.",
+                         "x, y and z are missing.", "Name the coordinates x, y, z.")
     return [], []
 
 
@@ -149,18 +149,18 @@ def _numbers(path: Path, lines: list[str], separator: str | None, text: str) -> 
         parts = _parts(line, separator)
         number = all_lines.index(line) + 1
         if len(parts) != width:
-            raise InputError(
-                f"{path}, line {number} has {len(parts)} values, the first has {width}.",
-                "The file may be cut short.", "Export it again, or correct that line.")
+            raise InputError(f"{path}, line {number} has {len(parts)} values, but the first line "
+                             f"has {width}.", "The file may be truncated.",
+                             "Export it again, or correct that line.")
         for part in parts:
             try:
                 float(part.replace(",", ".") if commas else part)
             except ValueError:
                 raise InputError(f"{path}, line {number}: {part.strip()[:30]!r} is not a number.",
-                                 "A cloud has one point a line, as numbers.",
+                                 "Each line of a cloud holds the numbers of one point.",
                                  "Correct that line.") from None
     raise InputError(f"{path} cannot be read as a table of numbers.",
-                     "Its lines differ in how they are written.", "Export it again.")
+                     "Its lines have different formats.", "Export it again.")
 
 
 def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:

@@ -23,7 +23,7 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import (
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_WHAT = "a skeleton as reconstruct has found it"
+_WHAT = "a skeleton stored by reconstruct"
 _SKELETON: dict[str, tuple[int | str, ...]] = {
     "nodes": ("n", 3), "parent": ("n",), "radius": ("n",), "radius_sigma": ("n",),
     "branch": ("n",), "order": ("n",), "radius_state": ("n",), "probability": ("n",)}
@@ -72,9 +72,9 @@ class FoundSkeleton:
         told = _told(path, arrays)
         if not _is_tree(skeleton.parent) or not _are_below(
                 arrays["node_of_point"], skeleton.node_count):
-            raise _damaged(path, "Its nodes hang on no tree.")
+            raise _damaged(path, "Its nodes do not form a tree.")
         if not ((skeleton.radius > 0).all() and 0 < skeleton.length < np.inf):
-            raise _damaged(path, "Its axes have no length, or no thickness.")
+            raise _damaged(path, "Its axes have no length or no thickness.")
         contraction = Contraction(arrays["contracted"], arrays["linearity"], told.iterations,
                                   told.status)
         return cls(SkeletonResult(
@@ -141,7 +141,7 @@ class _Told(BaseModel):
 def _told(path: Path, arrays: dict[str, np.ndarray]) -> _Told:
     text = arrays.get("told", np.zeros(0))
     if text.dtype.kind != "U" or text.ndim != 0:
-        raise _damaged(path, "It lacks the report of the search.")
+        raise _damaged(path, "The report of the search is missing.")
     try:
         return _Told.model_validate_json(str(text))
     except ValidationError as error:
@@ -155,7 +155,7 @@ def _leaves(path: Path, arrays: dict[str, np.ndarray], told: _Told) -> list[Leaf
     total = int(ends[-1]) if len(ends) else 0
     if len(points) != total or len(np.unique(points)) != total or not _are_below(
             points, len(arrays["node_of_point"]) + total):
-        raise _damaged(path, "Its leaves are not parts of the scan.")
+        raise _damaged(path, "Its leaves are not part of the scan.")
     return [Leaf(own, leaf.area) for own, leaf in zip(
         np.split(points, ends[:-1]), told.leaves, strict=True)] if total else []
 

@@ -128,9 +128,9 @@ def read_edits(path: Path) -> list[Edit]:
         field = ".".join(str(part) for part in place[2:])
         raise InputError(
             f"{path}: {where}{field + ': ' if field else ''}{first['msg']}.",
-            'Edits are a JSON list of objects such as {"do": "delete", "at": [x, y, z]}; do is '
-            "move, delete, merge, bridge, split, root, radius or confirm.",
-            "Correct the file; places are in the scan file's coordinates.") from error
+            "Edits are a JSON list of objects such as {\"do\": \"delete\", \"at\": [x, y, z]}. The "
+            "field do is move, delete, merge, bridge, split, root, radius or confirm.",
+            "Correct the file. Give positions in the coordinates of the scan file.") from error
 
 
 def edits_text(edits: Sequence[Edit]) -> str:
@@ -169,11 +169,11 @@ def _nearest(skeleton: Skeleton, at: Place) -> int:
     distance = np.linalg.norm(skeleton.nodes - np.array(at), axis=1)
     node = int(np.argmin(distance))
     if distance[node] > _FAR * skeleton.radius[node]:
-        raise InputError(
-            f"({', '.join(f'{value:.3f}' for value in at)}) m in the branch's frame is "
-            f"{1000 * distance[node]:.0f} mm from the nearest node.",
-            "It is on no branch.", "Give a place on an axis, in the scan file's coordinates, as "
-            "`limber skeleton` lists them.")
+        raise InputError(f"({', '.join(f'{value:.3f}' for value in at)}) m in the branch's frame "
+                         f"is {1000 * distance[node]:.0f} mm from the nearest node.",
+                         "The position does not belong to any branch.",
+                         "Give a position on an axis in the coordinates of the scan file, as "
+                         "`limber skeleton` lists them.")
     return node
 
 
@@ -189,8 +189,8 @@ def _deleted(skeleton: Skeleton, edit: DeleteBranch) -> Skeleton:
     for node in range(1, skeleton.node_count):
         keep[node] &= keep[skeleton.parent[node]]
     if keep.sum() < 2:
-        raise InputError("Nothing would be left.", "The root cannot be deleted.",
-                         "Name a place farther out.")
+        raise InputError("This edit would delete the whole skeleton.",
+                         "The root cannot be deleted.", "Give a position farther from the root.")
     return skeleton.subset(keep)
 
 
@@ -198,9 +198,10 @@ def _merged(skeleton: Skeleton, edit: MergeBranch) -> Skeleton:
     node, onto = _nearest(skeleton, edit.at), _nearest(skeleton, edit.to)
     run, other = int(skeleton.branch[node]), int(skeleton.branch[onto])
     if run == 0 or run == other:
-        raise InputError("The main branch cannot be merged into another, nor one into itself.",
-                         "A branch that is carried becomes part of another.",
-                         "Give the branch that is too many as `at`.")
+        raise InputError("The main branch cannot be merged into another branch, and no branch can "
+                         "be merged into itself.",
+                         "Only a branch that grows from another one can become part of another "
+                         "branch.", "Give the superfluous branch as `at`.")
     members = skeleton.runs()[run][1:]
     gone = np.zeros(skeleton.node_count, bool)
     gone[members[members <= node]] = True
@@ -288,8 +289,9 @@ def _way_down(skeleton: Skeleton, node: int) -> list[int]:
 
 
 def _circle() -> InputError:
-    return InputError("The branch carries what it should hang on.", "That makes a circle.",
-                      "Name the branch that is carried, and what carries it.")
+    return InputError("The branch carries the one to which it would be attached.",
+                      "The skeleton would contain a cycle.",
+                      "Give the carried branch as `at`, and the branch that carries it as `to`.")
 
 
 def _data(skeleton: Skeleton) -> dict[str, np.ndarray]:

@@ -17,7 +17,8 @@ Where = Callable[[np.ndarray], np.ndarray]
 _STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # of the radius, up to which points may scatter and show what is round
 _NAMED = 3  # gaps and loops that are named one by one
-_FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--skeleton)."
+_FIX = ("Crop the scan to one branch (--crop-low, --crop-high), or provide a skeleton "
+        "(--skeleton).")
 
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
@@ -36,31 +37,33 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
     """
     if len(graph.nodes) < 4:
         raise InputError(f"The cloud contracts to {len(graph.nodes)} points.",
-                         "It is not branch-like: no axis was found (a ball or a blob?).", _FIX)
+                         "The cloud does not have the shape of a branch: it has no axis (a ball "
+                         "or a blob?).", _FIX)
     length = float(np.linalg.norm(
         graph.nodes[graph.edges[:, 0]] - graph.nodes[graph.edges[:, 1]], axis=1).sum())
     thick = float(np.median(graph.thickness))
     if length < 4 * thick:
         raise InputError(
-            f"The axes are {length:.3g} m long at {thick:.3g} m radius.",
-            "It is not branch-like: too stout for an axis (a ball or a fruit?).", _FIX)
+            f"The axes have a length of {length:.3g} m and a radius of {thick:.3g} m.",
+            "The cloud does not have the shape of a branch: it is too thick (a ball or a "
+            "fruit?).", _FIX)
     if plants == "largest":
         return
     for plant in graph.plants:
         raise InputError(
-            f"There are two plants, {plant['distance']:.3g} m apart at "
-            f"{_place(where(plant['at']))} in the scan's coordinates: "
-            f"{100 * plant['points'] / count:.0f} % of the points stand on a base of their own.",
-            "A branch is one plant, and which of them is meant the scan does not say.",
-            f"{_FIX} Or take the larger one (--plants largest), or join them (--plants joined).")
+            f"The scan contains two plants, {plant['distance']:.3g} m apart at "
+            f"{_place(where(plant['at']))} in the scan's coordinates. "
+            f"{100 * plant['points'] / count:.0f} % of the points have a base of their own.",
+            "A branch belongs to one plant, and the scan does not show which one is meant.",
+            f"{_FIX} Or use the larger plant (--plants largest), or join them (--plants joined).")
     for piece in graph.split_off:
         share = piece["points"] / count
         if share > 0.2 and piece["distance"] > 0.25 * diagonal:
             raise InputError(
-                f"There are two far-apart clusters: {100 * share:.0f} % of the points lie "
+                f"The scan contains two distant clusters. {100 * share:.0f} % of the points lie "
                 f"{piece['distance']:.3g} m from the rest, at {_place(where(piece['at']))} in the "
-                "scan's coordinates.", "A branch is in one piece.",
-                f"{_FIX} Or take the larger one (--plants largest).")
+                "scan's coordinates.", "A branch must be connected.",
+                f"{_FIX} Or use the larger cluster (--plants largest).")
 
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
@@ -71,8 +74,8 @@ def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
     away = float(np.median(np.abs(residual + skeleton.radius[segment])))
     if round_share < 0.15 and away > _STOUT * extent:
         raise InputError(
-            f"Only {100 * round_share:.0f} % of the points lie on round axes; the others are "
-            f"{away:.3g} m away (median).", "It is not branch-like.", _FIX)
+            f"Only {100 * round_share:.0f} % of the points lie on round axes. The points have a "
+            f"median distance of {away:.3g} m from their axes.", "The cloud does not have the shape of a branch.", _FIX)
 
 
 def check_no_sheet(points: np.ndarray) -> None:
@@ -80,7 +83,7 @@ def check_no_sheet(points: np.ndarray) -> None:
     if share > 0.9:
         raise InputError(
             f"{100 * share:.0f} % of the points lie in wide flat sheets.",
-            "It is not branch-like (a wall or the ground?).", _FIX)
+            "The cloud does not have the shape of a branch (a wall or the ground?).", _FIX)
 
 
 def _sheet_share(points: np.ndarray, reach: float) -> float:
@@ -107,17 +110,18 @@ def warnings(result: Any, where: Where) -> list[str]:
         far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
             result.node_of_point]))
         if far > 0.5:
-            texts.append(f"{100 * far:.0f} % of the points are far from the given skeleton: is it "
-                         "in the cloud's coordinates and unit?")
+            texts.append(f"{100 * far:.0f} % of the points are far from the given skeleton. Does "
+                         "it have the coordinates and the unit of the cloud?")
         return texts
     texts += _joining_texts(result, where) + _doubt_texts(result, where)
     misfit = unexplained_share(result)
     if misfit > 0.15:
-        texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
-                     "pixels or a second plant? Radii there mean little.")
+        texts.append(f"{100 * misfit:.0f} % of the points do not belong to any round axis "
+                     "(leaves, flying pixels or a second plant?). The radii there are unreliable.")
     elif not shows_round(result):
-        texts.append(f"Points scatter by {1000 * result.noise:.2g} mm, over {_ROUND:.0%} of their "
-                     "axes' radius: leaves among them, which lie on no round axis, would not show.")
+        texts.append(f"The points scatter by {1000 * result.noise:.2g} mm, more than {_ROUND:.0%} "
+                     "of the radius of their axes. Leaves among them would therefore not be "
+                     "detected.")
     return texts
 
 
@@ -136,13 +140,13 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
         share = 100 * lost / len(result.contraction.points)
         largest = max(result.split_off, key=lambda piece: piece["points"])
         texts.append(
-            f"{len(result.split_off)} pieces ({share:.1f} % of the points) were left away: too "
-            "far from the rest for their size. The largest is "
-            f"{1000 * largest['distance']:.0f} mm off, at {_place(where(largest['at']))}.")
+            f"{len(result.split_off)} pieces ({share:.1f} % of the points) were discarded, "
+            "because they are too far from the rest for their size. The largest is "
+            f"{1000 * largest['distance']:.0f} mm away, at {_place(where(largest['at']))}.")
     for loop in sorted(result.loops)[::-1][:_NAMED]:
-        texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
+        texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened where branches touch.")
     if len(result.loops) > _NAMED:
-        texts.append(f"{len(result.loops) - _NAMED} shorter closed loops were opened too.")
+        texts.append(f"{len(result.loops) - _NAMED} shorter closed loops were also opened.")
     return texts
 
 
@@ -151,16 +155,15 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
     texts = []
     if result.unlikely:
         longest = max(twig["length"] for twig in result.unlikely)
-        texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were dropped: "
-                     "more likely than not they are not there (--twig-probability).")
+        texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were "
+                     "discarded, because they probably do not exist (--twig-probability).")
     if result.second_base is not None:
-        texts.append("The plant stands on a second base, at "
-                     f"{_place(where(result.second_base))}: two plants that touch? "
-                     "Cut out one of them (--crop-low, --crop-high).")
+        texts.append(f"The plant has a second base at {_place(where(result.second_base))}. Do two "
+                     "plants touch? Then crop the scan to one of them (--crop-low, --crop-high).")
     if result.other_root is not None:
-        texts.append(f"The end at {_place(where(result.other_root))} is about as likely the root "
-                     f"as that at {_place(where(result.skeleton.nodes[0]))}: name it (--root) if "
-                     "it is.")
+        texts.append(f"The end at {_place(where(result.other_root))} is about as likely to be the "
+                     f"root as the end at {_place(where(result.skeleton.nodes[0]))}. If it is the "
+                     "root, state it with --root.")
     return texts
 
 
@@ -196,10 +199,11 @@ def check_explained(result: Any, limit: float) -> None:
         result.residual > np.maximum(radius, 3 * result.noise)))
     if share > limit:
         raise InputError(
-            f"{100 * share:.0f} % of the points lie on no round axis (allowed: "
-            f"{100 * limit:.0f} %).", "Leaves, foliage or a second plant would become rods, and "
-            "radii mean little there.", "Cut the leaves out of the scan (--crop-low, --crop-high, "
-            "or in another program), or accept the axes as they come (--unexplained 1).")
+            f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
+            f"{100 * limit:.0f} %).", "Leaves or a second plant would become rods, and the radii "
+            "there are unreliable.", "Remove the leaves from the scan (--crop-low, "
+            "--crop-high, or in another program), or accept the axes as they are (--unexplained "
+            "1).")
 
 
 def _place(point: np.ndarray) -> str:

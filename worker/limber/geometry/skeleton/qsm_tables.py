@@ -81,8 +81,8 @@ def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[s
     outside = along[(along < 0) | (along > total)]
     if len(outside):
         raise InputError(
-            f"A caliper value stands at {outside[0]:.3g} m; the main path is {total:.3g} m long.",
-            "It is counted from the root along the main path, in metres.", "Correct along_m.")
+            f"A caliper value is at {outside[0]:.3g} m, but the main path is {total:.3g} m long.",
+            "along_m is measured from the root along the main path, in metres.", "Correct along_m.")
     ours = diameters(skeleton, along)
     return [{"along_m": one.along, "measured_m": one.diameter, "diameter_m": float(row[0]),
              "sigma_m": float(row[1]), "difference": float(row[0] / one.diameter - 1),
@@ -104,22 +104,23 @@ def read_calipers(path: Path) -> list[Caliper]:
         raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
                          "Check the path.") from error
     if not rows:
-        raise InputError(f"{path} has no values.", "A header and one line a diameter were "
-                         "expected.", "Give a CSV file with the columns along_m and diameter_mm.")
+        raise InputError(f"{path} has no values.",
+                         "A header and one line for each diameter were expected.",
+                         "Give a CSV file with the columns along_m and diameter_mm.")
     missing = [name for name in ("along_m", "diameter_mm") if name not in rows[0]]
     if missing:
         raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
-                         "Caliper values have along_m and diameter_mm.", "Name its columns so.")
+                         "Caliper values need along_m and diameter_mm.", "Rename the columns.")
     try:
         values = [Caliper(float(row["along_m"]), 1e-3 * float(row["diameter_mm"])) for row in rows]
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
-                         "Both columns are numbers.", "Correct the file.") from error
+                         "Both columns must hold numbers.", "Correct the file.") from error
     for number, one in enumerate(values, start=2):
         if not (0 < one.diameter < np.inf and np.isfinite(one.along)):
-            raise InputError(
-                f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} m.",
-                "A diameter is above 0, and both are finite.", "Correct that line.")
+            raise InputError(f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} "
+                             "m.", "A diameter must be positive, and both values must be finite.",
+                             "Correct that line.")
     return values
 
 

@@ -203,7 +203,8 @@ class Skeleton:
 def _check_tree(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray) -> None:
     fix = "Correct the skeleton file, or reconstruct from the cloud instead."
     if len(nodes) < 2:
-        raise InputError(f"The skeleton has {len(nodes)} nodes.", "A branch needs two.", fix)
+        raise InputError(f"The skeleton has {len(nodes)} nodes.",
+                         "A branch needs at least two nodes.", fix)
     if not (np.isfinite(nodes).all() and np.isfinite(radius).all()):
         bad = np.flatnonzero(~(np.isfinite(nodes).all(axis=1) & np.isfinite(radius)))
         raise InputError(f"Skeleton node {bad[0] + 1} has a number that is not finite.",
@@ -219,13 +220,13 @@ def _check_tree(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray) -> No
                          "A branch has exactly one root.", fix)
     if (parent >= len(nodes)).any():
         bad = int(np.flatnonzero(parent >= len(nodes))[0])
-        raise InputError(f"Skeleton node {bad + 1} has a parent that is not in the file.",
-                         "Each node but the root hangs on another node.", fix)
+        raise InputError(f"Skeleton node {bad + 1} has a parent that does not exist in the file.",
+                         "Each node except the root must have another node as its parent.", fix)
     depth = _depths(parent)
     if (depth < 0).any():
         bad = int(np.flatnonzero(depth < 0)[0])
-        raise InputError(f"Skeleton node {bad + 1} lies on or hangs on a cycle.",
-                         "A branch's skeleton is a tree.", fix)
+        raise InputError(f"Skeleton node {bad + 1} is on a cycle, or is attached to one.",
+                         "The skeleton of a branch must be a tree.", fix)
 
 
 def _depths(parent: np.ndarray) -> np.ndarray:

@@ -104,8 +104,8 @@ def _uncrossed(fork: "_Fork", first: Any, others: list, tolerance: float) -> Any
 
 
 def _warnings(plain: int, count: int) -> list[str]:
-    return [f"{plain} of {count} forks stay sharp-edged in the surface: a fillet there would cross "
-            "it or change its volume."] if plain else []
+    return [f"{plain} of {count} forks keep sharp edges in the surface, because a fillet would "
+            "intersect the surface or change its volume."] if plain else []
 
 
 def _box(fillet: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -73,12 +73,12 @@ class Surface:
             mesh = trimesh.load_mesh(path, process=True)
         except Exception as error:  # trimesh's readers raise whatever their parsers raise
             raise InputError(f"{path} cannot be read as a surface ({error}).",
-                             "STL, PLY, OBJ or OFF was expected.", "Export it anew.") from error
+                             "STL, PLY, OBJ or OFF was expected.", "Export it again.") from error
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise InputError(f"{path} has no triangles.", "A closed surface was expected.",
-                             "For a cloud of points use `limber reconstruct`.")
+                             "For a point cloud, use `limber reconstruct`.")
         vertices = np.asarray(mesh.vertices, float) * scale
         if not np.isfinite(vertices).all():
             raise InputError(f"{path} has vertices that are not finite.",
-                             "Positions must be numbers.", "Export it anew.")
+                             "Positions must be finite numbers.", "Export it again.")
         return cls(vertices, np.asarray(mesh.faces, np.int64))

@@ -43,16 +43,18 @@ class SurfaceCheck:
             MeshingError: names the first place where it is not.
         """
         if not self.watertight:
-            raise MeshingError(f"The surface has {len(self.open_edges)} open or double edges, one "
-                               f"at {_place(self.open_edges[0])} m.", "It must be closed.",
-                               "Prune the skeleton there, or close the surface's holes.")
+            raise MeshingError(f"The surface has {len(self.open_edges)} open edges or edges with "
+                               f"more than two faces, one of them at {_place(self.open_edges[0])} "
+                               "m.", "The surface must be closed.",
+                               "Prune the skeleton there, or close the holes of the surface.")
         if not self.oriented:
-            raise MeshingError("The surface's faces do not all point outwards.",
-                               "They must be oriented alike.", "Make its normals consistent.")
+            raise MeshingError("Not all faces of the surface point outwards.",
+                               "All faces must have the same orientation.",
+                               "Make the normals consistent.")
         if len(self.crossings):
-            raise MeshingError(f"The surface crosses itself in {len(self.crossings)} places, one "
-                               f"at {_place(self.crossings[0])} m.",
-                               "A solid does not overlap itself.",
+            raise MeshingError(f"The surface intersects itself at {len(self.crossings)} points, "
+                               f"one of them at {_place(self.crossings[0])} m.",
+                               "The surface of a solid must not intersect itself.",
                                "Edit the skeleton there, or smooth it.")
         return self
 

@@ -82,8 +82,8 @@ def largest_piece(joined) -> Surface:
     """
     pieces = joined.decompose()
     if not pieces:
-        raise MeshingError("The union of the cylinders is empty.", "Radii may be zero.",
-                           "Look at the skeleton's radii.")
+        raise MeshingError("The union of the cylinders is empty.", "Some radii may be zero.",
+                           "Check the radii of the skeleton.")
     if len(pieces) > 1:
         # A cavity between crossing twigs comes out as a piece of negative volume: it is filled.
         joined = max(pieces, key=lambda piece: piece.volume())
@@ -199,6 +199,6 @@ def solid(vertices: np.ndarray, faces: np.ndarray):
         vert_properties=np.ascontiguousarray(vertices, np.float64),
         tri_verts=np.ascontiguousarray(faces, np.uint64)))
     if solid.status() != manifold3d.Error.NoError:
-        raise MeshingError(f"A cylinder is no solid ({solid.status().name}).",
-                           "Its cross-sections may coincide.", "Look at the skeleton there.")
+        raise MeshingError(f"A cylinder is not a solid ({solid.status().name}).",
+                           "Its cross-sections may coincide.", "Check the skeleton there.")
     return solid

@@ -37,7 +37,8 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
     """
     radius_tip = radius_root if radius_tip is None else radius_tip
     if not (length > 0 and radius_root > 0 and radius_tip > 0):
-        raise InputError("A beam's length and radii must be over 0.", "", "Give them in metres.")
+        raise InputError("The length and the radii of a beam must be positive.", "",
+                         "Give them in metres.")
     if slice_count is None:
         slice_count = max(round(length / (radius_root + radius_tip)), 4)
     axis = np.array(direction, float) / np.linalg.norm(direction)

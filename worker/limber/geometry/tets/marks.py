@@ -111,5 +111,5 @@ def patch_nodes(mesh: TetMesh, skeleton: Skeleton, fraction: float) -> np.ndarra
 def _checked(chosen: np.ndarray, what: str) -> np.ndarray:
     if chosen.sum() < 3:
         raise MeshingError(f"The {what} has {int(chosen.sum())} nodes.",
-                           "Three are needed to hold a branch.", "Use a finer mesh.")
+                           "At least three nodes are needed to hold a branch.", "Use a finer mesh.")
     return chosen.astype(np.int64)

@@ -25,8 +25,8 @@ def fixed_mask(mesh: TetMesh, fixed: np.ndarray | None) -> np.ndarray:
     points = mesh.nodes[fixed]
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) else [0]
     if len(points) < 3 or spread[1] < 1e-6 * max(spread[0], 1e-12):
-        raise InputError(f"{len(points)} nodes are fixed, or all on one line.",
-                         "The branch could move freely; statics has no solution.",
+        raise InputError(f"{len(points)} nodes are fixed: fewer than three, or all on one line.",
+                         "The branch could move freely, so the static problem has no solution.",
                          "Mark the nodes of the base in point data `fixed`.")
     return fixed
 
@@ -34,16 +34,16 @@ def fixed_mask(mesh: TetMesh, fixed: np.ndarray | None) -> np.ndarray:
 def check_mesh(mesh: TetMesh) -> None:
     """Raise InputError for a mesh that cannot be computed: not finite, unused nodes, pieces."""
     if not np.isfinite(mesh.nodes).all():
-        raise InputError("The mesh has nodes that are not finite.", "Positions are missing.",
+        raise InputError("The mesh has nodes that are not finite.", "Each node needs a position.",
                          "Mesh the surface again.")
     if mesh.tets.ndim != 2 or mesh.tets.shape[1] not in (4, 10) or not mesh.tet_count:
-        raise InputError(f"Tetrahedra of shape {mesh.tets.shape}.",
-                         "4 or 10 nodes each are needed.", "Mesh the surface again.")
+        raise InputError(f"The tetrahedra have shape {mesh.tets.shape}.",
+                         "Each tetrahedron needs 4 or 10 nodes.", "Mesh the surface again.")
     used = np.zeros(mesh.node_count, bool)
     used[mesh.tets] = True
     if not used.all():
-        raise InputError(f"{np.count_nonzero(~used)} nodes belong to no tetrahedron.",
-                         "They would float freely.", "Remove them from the mesh.")
+        raise InputError(f"{np.count_nonzero(~used)} nodes do not belong to any tetrahedron.",
+                         "These nodes could move freely.", "Remove them from the mesh.")
     corners = mesh.tets[:, :4]
     links = sp.csr_matrix((np.ones(3 * len(corners)), (np.repeat(corners[:, 0], 3),
                                                        corners[:, 1:].ravel())),
@@ -51,7 +51,7 @@ def check_mesh(mesh: TetMesh) -> None:
     _, label = connected_components(links, directed=False)
     pieces = np.unique(label[np.unique(corners)], return_counts=True)[1]
     if len(pieces) > 1:
-        raise InputError(
-            f"The mesh is in {len(pieces)} pieces, of {', '.join(map(str, sorted(pieces)[::-1]))}"
-            " corner nodes.", "What is not joined to the fixed base would float freely.",
-            "Join the parts of the surface before meshing, or keep the largest.")
+        raise InputError(f"The mesh has {len(pieces)} separate pieces with "
+                         f"{', '.join(map(str, sorted(pieces)[::-1]))} corner nodes.",
+                         "A piece without a connection to the fixed base could move freely.",
+                         "Join the parts of the surface before meshing, or keep the largest part.")

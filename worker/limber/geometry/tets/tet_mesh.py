@@ -126,19 +126,20 @@ class TetMesh:
         counts |= dict.fromkeys(self.cell_data, self.tet_count)
         trouble = ""
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or not np.isfinite(self.nodes).all():
-            trouble = "nodes that are no places"
+            trouble = "nodes without a finite position"
         elif not (self.tet_count and self.tets.ndim == 2 and self.tets.shape[1] in (4, 10)
                   and self.tets.min() >= 0 and self.tets.max() < self.node_count):
-            trouble = "tetrahedra of nodes that are not there"
+            trouble = "tetrahedra with nodes that do not exist"
         for name, values in data.items():
             if values.dtype.kind not in "iufb" or len(values) != counts[name] or not (
                     np.isfinite(values).all()):
-                trouble = trouble or f"data {name} that are no finite number for each"
+                trouble = trouble or (f"data {name} without a finite number for each node or "
+                                      "tetrahedron")
             elif name in ("young", "density") and not (values > 0).all():
                 trouble = trouble or f"data {name} that are not positive"
         if trouble:
-            raise InputError(f"{path} has {trouble}.", "Nothing can be computed on it.",
-                             "It is damaged; make it anew.")
+            raise InputError(f"{path} has {trouble}.", "The mesh cannot be used for computations.",
+                             "The file is damaged. Make the mesh again.")
 
     def write(self, path: Path) -> None:
         """Write a VTU file that ParaView opens."""
@@ -169,7 +170,7 @@ class TetMesh:
         except Exception as error:  # of XML, base64, zlib, numpy and its own
             raise InputError(f"{path} cannot be read as a mesh ({error}).",
                              "A VTU file with tetrahedra was expected.",
-                             "Check the file, or make it anew.") from error
+                             "Check the file, or make the mesh again.") from error
         for number, block in enumerate(mesh.cells):
             if block.type in ("tetra", "tetra10"):
                 cell_data = {name: np.asarray(parts[number])

@@ -62,7 +62,7 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
         except MeshingError as error:
             if settings.mesher == "sweep":
                 raise
-            warnings.append(f"{error.seen} fTetWild took over.")
+            warnings.append(f"{error.seen} fTetWild was used instead.")
         if swept is not None and (settings.mesher == "sweep"
                                   or _share(skeleton, swept.left_out) < _LEFT_OUT_LIMIT):
             return swept
@@ -72,7 +72,7 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
     except (MeshingError, MissingDependencyError) as error:
         if swept is None and settings.mesher == "auto":
             raise
-        warnings.append(f"{error.seen} The sweep mesher took over.")
+        warnings.append(f"{error.seen} The sweep mesher was used instead.")
     swept = swept or _swept(skeleton, settings)
     return MeshResult(swept.mesh, "sweep", warnings + swept.warnings, swept.left_out)
 
@@ -89,8 +89,8 @@ def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:
     swept = sweep_tree(skeleton, spacing=settings.mesh_spacing)
     warnings = []
     if swept.left_out:
-        warnings.append(f"{len(swept.left_out)} short twigs could not be joined to the mesh; "
-                        "their mass is kept.")
+        warnings.append(f"{len(swept.left_out)} short twigs could not be joined to the mesh. Their "
+                        "mass is kept.")
     return MeshResult(swept.mesh.quadratic(), "sweep", warnings, swept.left_out)
 
 
@@ -154,11 +154,11 @@ def _checked(nodes: np.ndarray, tets: np.ndarray, surface: Surface) -> TetMesh:
     ratio = float(mesh.volumes.sum()) / surface.volume
     if not 0.95 < ratio < 1.05:
         raise MeshingError(f"fTetWild's mesh has {100 * ratio:.1f} % of the surface's volume.",
-                           "Bending stiffness goes with the square of that.",
+                           "The bending stiffness changes with the square of this ratio.",
                            "Use a smaller tolerance, or choose --mesher sweep.")
     if mesh.volumes.min() <= 1e-7 * np.median(mesh.volumes):
         raise MeshingError("fTetWild's mesh has flat tetrahedra.",
-                           "A solver cannot work on them.", "Choose --mesher sweep.")
+                           "A solver cannot use flat tetrahedra.", "Choose --mesher sweep.")
     return mesh.quadratic()
 
 

@@ -63,7 +63,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
                                "--mesh-memory-limit-mb, or choose a coarser mesh.") from error
         if code != 0 or not target.exists():
             raise MeshingError(f"fTetWild ended with code {code} ({last or 'no message'}).",
-                               "The surface may be too fine or broken.",
+                               "The surface may be too fine, or may be damaged.",
                                "Choose --mesher sweep, or a coarser mesh.")
         with np.load(target) as result:
             return result["nodes"], result["tets"]

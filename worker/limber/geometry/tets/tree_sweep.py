@@ -131,7 +131,7 @@ class _TreeSweep:
                                first_tangent)
         if shapes(mesh.nodes[mesh.tets]).min() < 0.1 * FLAT:
             if run == 0:
-                raise MeshingError("The main axis bends more sharply than it is thick.",
+                raise MeshingError("The main axis bends too sharply for its thickness.",
                                    "Prisms swept along it would overlap.",
                                    "Smooth the skeleton, or choose --mesher ftetwild.")
             return False

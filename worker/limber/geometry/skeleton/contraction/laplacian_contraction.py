@@ -198,14 +198,14 @@ class _NormalEquations:
         try:
             self._factor.factorise(lower.data)
         except NotPositiveDefiniteError as error:
-            raise WorkError(f"The contraction's linear system is singular ({error}).",
-                            "Many points may lie on top of each other.",
-                            "Thin the cloud (--voxel).") from error
+            raise WorkError(f"The linear system of the contraction is singular ({error}).",
+                            "Many points may coincide.", "Thin the cloud (--voxel).") from error
         return _finite(self._factor.solve(hold[:, None] * points))
 
 
 def _finite(points: np.ndarray) -> np.ndarray:
     if not np.isfinite(points).all():
-        raise WorkError("The contraction gave numbers that are not finite.",
-                        "The cloud's Laplacian may be degenerate.", "Thin the cloud (--voxel).")
+        raise WorkError("The contraction produced numbers that are not finite.",
+                        "The Laplacian of the cloud may be degenerate.",
+                        "Thin the cloud (--voxel).")
     return points

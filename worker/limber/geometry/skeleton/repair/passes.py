@@ -87,7 +87,7 @@ class Repaired:
     @property
     def last_fit(self) -> AxisFit:
         """The last fit, once there is one."""
-        assert self.fit is not None, "the first fit comes before what asks for it"
+        assert self.fit is not None, "the first fit must run before its results are used"
         return self.fit
 
 
@@ -146,49 +146,55 @@ def _fill_in(now: Repaired) -> Repaired:
     return now.of(filled_in(now.skeleton, now.points)) if now.beside <= LEAF_SHARE else now
 
 
-STEADY = Pass("steady radii", "Where points are missing, a first radius is a hair's.",
+STEADY = Pass("steady radii", "Where points are missing, a first radius is far too small.",
               lambda now: now.of(steadied(now.skeleton, now.points)))
-DROP_BARE_ENDS = Pass("drop bare ends", "The contraction overshoots an end, and no point is there.",
+DROP_BARE_ENDS = Pass("drop bare ends",
+                      "The contraction overshoots an end, beyond the last points.",
                       lambda now: now.of(without_bare_ends(now.skeleton, now.points)))
-DROP_STRANDS = Pass("drop strands", "Where a scan has holes, one branch holds two strands.",
+DROP_STRANDS = Pass("drop strands", "Where a scan has holes, one branch has two parallel axes.",
                     _drop_strands)
-LIMIT = Pass("limit radii", "A radius is beyond what a cloud of this size can hold.",
+LIMIT = Pass("limit radii", "A radius is outside the range for a cloud of this size.",
              lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
 
 PASSES = (
     STEADY,
-    Pass("fit coarsely", "The contracted axes lie beside those that the points show.",
+    Pass("fit coarsely", "The contracted axes lie beside the axes that the points show.",
          _fit_coarsely, until=0.4),
-    Pass("fit unpinched", "A strip along a stem whose rest is hidden was fitted as a hair.",
+    Pass("fit unpinched",
+         "Where most of a stem is hidden, the fit to the visible strip is far too thin.",
          _fit_unpinched, until=0.5),
-    Pass("attach twigs", "The contraction draws a fork towards its twig.",
+    Pass("attach twigs", "The contraction pulls a fork towards its twig.",
          lambda now: now.of(attached(now.skeleton))),
-    Pass("lead twigs back", "A twig whose foot is missing hangs on a place farther out.",
+    Pass("lead twigs back", "A twig whose first part is missing is attached too far out.",
          lambda now: now.of(without_backward_starts(now.skeleton)[0])),
     DROP_BARE_ENDS,
-    Pass("lengthen ends", "The contraction draws an end in.",
+    Pass("lengthen ends", "The contraction shortens an end.",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
-    Pass("prune spurs", "A twig hardly reaches out of its carrier and the noise.", _prune_spurs),
+    Pass("prune spurs", "A twig hardly extends beyond its parent and the noise.", _prune_spurs),
     DROP_STRANDS,
     STEADY,
-    Pass("unpinch radii", "Of a strip along a stem, the radius is a hair's.",
+    Pass("unpinch radii", "Where only a strip of a stem is visible, the radius is far too small.",
          lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
     LIMIT,
-    Pass("fit finely", "Axes and radii are those of too few nodes, and of forks since moved.",
+    Pass("fit finely",
+         "Axes and radii come from too few nodes, and from forks that have moved since.",
          lambda now: now.fitted(resampled(now.skeleton), uncertainty=False), until=0.8),
     DROP_STRANDS,
-    Pass("settle", "Noise, or a strand just dropped, leaves the fit unfinished.", _settle,
-         until=1.0),
+    Pass("settle", "The fit is unfinished because of noise or a strand that was just dropped.",
+         _settle, until=1.0),
     DROP_BARE_ENDS,
-    Pass("draw ends back", "A fit lets an end slide along its axis beyond the points.",
+    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
          lambda now: now.of(ends_within(now.skeleton, now.points))),
-    Pass("fill in blank radii", "No point tells a radius, and those beside it do.", _fill_in),
+    Pass("fill in blank radii", "No point determines a radius, but adjacent radii are known.",
+         _fill_in),
     LIMIT,
-    Pass("taper radii", "A bunch of twigs that the scan did not resolve is a fat cylinder.",
+    Pass("taper radii",
+         "A bunch of twigs that the scan does not resolve appears as a thick cylinder.",
          lambda now: now.of(tapered(now.skeleton, point_counts(now.skeleton, now.points)))),
-    Pass("weigh unresolved radii", "A radius thinner than spacing or noise is taken as measured.",
+    Pass("weigh unresolved radii",
+         "A radius smaller than the spacing or the noise is treated as measured.",
          lambda now: now.of(assessed(now.skeleton, now.points, now.noise))),
-    Pass("mend kinks", "A run turns more sharply than wood.",
+    Pass("mend kinks", "A branch turns more sharply than wood does.",
          lambda now: now.of(without_kinks(now.skeleton)[0])),
 )
 """In the order in which they run; some run again after a fit."""
