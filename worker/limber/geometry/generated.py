@@ -228,10 +228,10 @@ class _Truth(BaseModel):
 
 
 def read_truth(path: Path) -> dict[str, Any]:
-    """Return the content of ``truth.json``: what a generated branch was made with.
+    """Return the content of ``truth.json``: the description of a generated branch.
 
     Raises:
-        InputError: it cannot be read, or is no such file.
+        InputError: it cannot be read, or is not such a file.
     """
     content = read_json(path, "a description of a generated branch")
     checked_as(path, _Truth, content, "a description of a generated branch")

@@ -1,4 +1,4 @@
-"""Leaves of a scan, cut off before its wood is made, and hung on it again as mass."""
+"""Leaves of a scan: removed before the wood is reconstructed, then attached to it as mass."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,7 +16,7 @@ from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
 
 UNASKED = 0.1
-"""Share of the points up to which leaves are cut off without the user's consent."""
+"""Fraction of the points up to which leaves are removed without the user's consent."""
 
 _LEAST = 0.05  # of the points, that leaves must be to be cut off
 # Of its radius, up to which a point lies on a round axis; a filled blade that a rod was fitted to
@@ -30,15 +30,15 @@ _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonResult | None = None,
                    ) -> tuple[Prepared, list[Leaf]]:
-    """Cut the leaves off a prepared scan.
+    """Remove the leaves from a prepared scan.
 
     Args:
         prepared: The scan.
-        least: Share of the points under which leaves are left in place.
+        least: Fraction of the points below which leaves are kept.
         found: The skeleton of the whole scan: what its axes show to be round is no leaf.
 
     Returns:
-        The wood, and the leaves that were cut off.
+        The wood, and the removed leaves.
     """
     points = prepared.cloud.points
     leaves = _leaves_of(points)
@@ -77,7 +77,7 @@ def _leaves_of(points: np.ndarray) -> list[Leaf]:
 
 
 def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
-    """Refuse to cut off more than ``UNASKED`` of a scan unless its user agreed.
+    """Refuse to remove more than ``UNASKED`` of a scan without the user's consent.
 
     Args:
         prepared: The whole scan.
@@ -162,7 +162,7 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, dens
 
 
 def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
-    """What to tell of leaves that were cut off, ``share`` of the points."""
+    """Warning about removed leaves, which are the fraction ``share`` of the points."""
     count = f"{len(masses)} {'leaf' if len(masses) == 1 else 'leaves'}"
     return (f"Limber detected and removed {count} ({100 * share:.0f} % of the points, "
             f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2). Their mass of "

@@ -31,7 +31,7 @@ def body_format(path: Path) -> Format:
 
 def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = SILENT,
                ) -> tuple[MeshedBody, list[dict[str, Any]]]:
-    """Return the branch that a cylinder model tells, and the masses of twigs the mesh leaves out.
+    """Return the branch of a cylinder model, and the masses of the pruned twigs.
 
     Args:
         path: In a format of :data:`~limber.geometry.io.skeletons.SKELETONS`.

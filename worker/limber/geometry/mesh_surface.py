@@ -74,7 +74,7 @@ def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
 
 def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: Alignment,
                settings: MeshSurfaceSettings, mesher: str) -> dict[str, Any]:
-    """What the stage says of a body."""
+    """Result of the stage for a body."""
     quality = measure_quality(mesh, surface.volume, skeleton, surface)
     return {
         "point_count": len(surface.vertices), "node_count": skeleton.node_count,

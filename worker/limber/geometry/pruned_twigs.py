@@ -1,4 +1,4 @@
-"""Wood that the mesh does not show as it is: twigs left out of it, and branches that touch."""
+"""Differences between mesh and plant: pruned twigs, and branches that touch."""
 
 from typing import Any
 
@@ -16,10 +16,10 @@ _LEFT_OUT_MOST = 0.03  # of the mass, that the mesh may leave out unasked
 
 def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
                     ) -> tuple[Skeleton, list[dict[str, Any]]]:
-    """Cut off thin or high-order side twigs; their mass stays, at their place.
+    """Prune thin or high-order side twigs. Their mass remains at their position.
 
     Returns:
-        The skeleton to mesh, and for each twig cut off ``mass_kg``, its ``centre_m`` and
+        The skeleton to mesh, and for each pruned twig ``mass_kg``, its ``centre_m`` and
         ``attached_m``, the point on the kept axis that carries it.
     """
     keep = np.ones(skeleton.node_count, bool)
@@ -63,7 +63,7 @@ def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | N
 
 def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: ReconstructSettings,
                   progress: Progress) -> None:
-    """Name what the mesh leaves out by branch, length and mass, heaviest first.
+    """Report the pruned twigs by branch, length and mass, heaviest first.
 
     Args:
         masses: The twigs that are not in the mesh.
@@ -72,7 +72,7 @@ def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: Reconst
         progress: Gets what the user should know.
 
     Raises:
-        MeshingError: it is over 3 % of all, and was not asked for.
+        MeshingError: they hold more than 3 % of the mass, and the user did not accept that.
     """
     if not masses:
         return
@@ -95,10 +95,10 @@ def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: Reconst
 
 
 def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
-    """Places where two branches touch that do not fork off each other there.
+    """Positions where two branches touch without a fork between them.
 
     Returns:
-        For each pair of branches ``branches`` [2] and the place ``at_m`` [3] where they overlap
+        For each pair of branches ``branches`` [2] and the position ``at_m`` [3] where they overlap
         most.
     """
     tree = cKDTree(skeleton.nodes)
@@ -123,7 +123,7 @@ def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
 
 
 def touching_texts(handles: int, touching: list[dict[str, Any]]) -> list[str]:
-    """What to tell of the handles of a surface: where branches grow together that are apart."""
+    """Warnings about handles of a surface, where separate branches have merged."""
     if handles == 0:
         return []
     places = "; ".join(

@@ -62,10 +62,10 @@ class MeshedBranch:
     """Surface and tetrahedra of an aligned skeleton.
 
     Attributes:
-        skeleton: All of it, with the twigs that the mesh leaves out.
+        skeleton: The whole skeleton, with the pruned twigs.
         surface: Closed.
         mesh: Marked with material, base, control points and grasp.
-        masses: Twigs left out, see :func:`leave_out_twigs`.
+        masses: Pruned twigs, see :func:`leave_out_twigs`.
         numbers: The stage's result as far as it is about them.
     """
 
@@ -106,7 +106,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         settings: How.
         own: The user's own skeleton in the scan's frame [m], instead of ours.
         edits: What its user changed in the skeleton, in the file's coordinates; those that no
-            longer fit are left out and told.
+            longer fit are skipped and reported.
         eye: Where the depth camera stood [m], shape [3], if the scan is its image.
         known: What an earlier run found of this scan with these settings, and did not come to use.
         keep: Gets the alignment, the skeleton and what the search came to as soon as it is found,
@@ -192,7 +192,7 @@ def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
 
 
 def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
-    """Return a cloud that says which node each point belongs to, and how far off it lies [m]."""
+    """Return a cloud with the node of each point and the distance from its surface [m]."""
     node, residual = nearest_cylinders(skeleton, cloud.points)
     return replace(cloud, attributes=cloud.attributes | {
         "skeleton_node": node.astype(np.int32), "residual": residual.astype(np.float32)})
@@ -301,7 +301,7 @@ def peak_memory_mb() -> float:
 
 def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
                   ) -> tuple[SkeletonResult, str]:
-    """Hold a skeleton against the depth camera's image: twigs and radii; and what to tell.
+    """Compare twigs and radii of a skeleton with the depth camera's image; return warnings.
 
     Args:
         found: The skeleton of the cloud.

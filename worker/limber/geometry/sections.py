@@ -61,7 +61,7 @@ def read_sections(path: Path, unit: str) -> Sections:
     Lengths are in ``unit``, or in that of a column's name (``width_mm``).
 
     Raises:
-        InputError: a column is missing, a value no number, or a thickness not positive.
+        InputError: a column is missing, a value is not a number, or a size is not positive.
     """
     text = read_text(path, "a table of sections")
     rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))

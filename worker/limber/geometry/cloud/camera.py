@@ -1,4 +1,4 @@
-"""A pinhole depth camera: its file, and the way between pixels and points.
+"""A pinhole depth camera: its file, and the mapping between pixels and points.
 
 Camera axes: x right, y down, z forward, as OpenCV and TUM's RGB-D data have them.
 """

@@ -26,7 +26,7 @@ class Cloud:
         points: Positions, shape [n, 3]; metres once they are in a branch folder.
         attributes: Name to array, shape [n] or [n, k]: ``normal`` [n, 3], ``color`` [n, 3] in
             0..255, and whatever scalars the file had.
-        not_finite: Points of the file that were left away, since they are no numbers.
+        not_finite: Number of discarded points whose coordinates are not finite.
         titles: What the file calls an attribute, where its name is another.
     """
 
@@ -79,7 +79,7 @@ class Cloud:
     def write_ply(self, path: Path) -> None:
         """Write a binary PLY file: positions as double, attributes in their own types.
 
-        Attributes get valid names, and comments tell what the scan's file called them.
+        Attributes get valid names; comments state their names in the scan's file.
         """
         from plyfile import PlyData, PlyElement
 

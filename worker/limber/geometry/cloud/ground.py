@@ -24,8 +24,8 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
 
     Args:
         points: Positions [m], shape [n, 3].
-        up: Which way is up, shape [3].
-        least: Number of points under which it is none.
+        up: The up direction, shape [3].
+        least: Smallest number of points of the ground.
 
     Returns:
         True where a point lies on it, shape [n]; None if there is none.

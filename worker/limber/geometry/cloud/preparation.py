@@ -32,7 +32,7 @@ class Prepared:
         origin: What was subtracted [m], in the file's axes, shape [3].
         counts: Number of points dropped, by reason.
         warnings: What the user should know.
-        view: Where the one depth camera stood, in the cloud's frame, if it was one.
+        view: Position of the depth camera in the cloud's frame, if there was one camera.
     """
 
     cloud: Cloud
@@ -50,11 +50,11 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         cloud: As the file has it.
         scale: Metres per unit of the file.
         settings: How.
-        eye: Where the camera stood, if it is known, in the file's coordinates, shape [3].
+        eye: Position of the camera, if known, in the file's coordinates, shape [3].
         up: Which way is up, shape [3], to look for rough ground; None: for walls and floors only.
 
     Raises:
-        InputError: too few points, or all of them at one place.
+        InputError: too few points, or all of them at one position.
     """
     settings = settings or PreparationSettings()
     counts = {"read": len(cloud), "not_finite": cloud.not_finite}

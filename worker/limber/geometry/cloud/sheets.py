@@ -20,7 +20,7 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
 
     Args:
         points: Positions [m], shape [n, 3].
-        least: Number of points under which it is none.
+        least: Smallest number of points of a sheet.
 
     Returns:
         True where a point lies on it, shape [n]; None if there is no such plane.

@@ -28,7 +28,7 @@ class View:
     """Where a cloud was seen from.
 
     Attributes:
-        eye: The camera's place [m], shape [3].
+        eye: The camera's position [m], shape [3].
         pitch: Width of a pixel at distance 1.
         fill: Share of the pixels on what was seen that are in the cloud.
     """

@@ -28,10 +28,10 @@ Function = Callable[..., Any] | str
 
 @dataclass(frozen=True)
 class Format:
-    """What is known of a kind of files.
+    """One file format.
 
     Attributes:
-        name: What people call it.
+        name: Its common name.
         suffixes: Of its files' names, in small letters with the dot.
         read: Called with the path and the registry's options; returns what the registry is of, or
             arrays of which its ``of_arrays`` makes that. None: it is only written.
@@ -41,7 +41,7 @@ class Format:
         check: Refuses a file whose header announces more than the file holds.
         isolated: Whether ``read``, a function of a module, is called in a process of its own with
             the path alone, and returns arrays: compiled code may abort on a mangled file.
-        about: What help texts say of it beside its suffixes.
+        about: What help texts state about it beside its suffixes.
     """
 
     name: str

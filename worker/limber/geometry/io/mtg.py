@@ -37,7 +37,7 @@ class _Vertex:
 
 
 def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read the nodes of an MTG: vertices with places, each on the one that it grows from.
+    """Read the nodes of an MTG: vertices with positions, each attached to its parent.
 
     A vertex without a radius or diameter has that of the node before it.
 
@@ -46,7 +46,7 @@ def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
         scale: Metres per unit, which an MTG does not say; None takes metres.
 
     Raises:
-        InputError: no MTG; no places or radii in it; or not one tree.
+        InputError: the file is not an MTG, has no positions or radii, or is not one tree.
     """
     lines = read_text(path, _WHAT).splitlines()
     scales, body = _sections(path, lines)
@@ -209,7 +209,7 @@ class _Reader:
 
 
 def write_mtg(skeleton: Skeleton, path: Path) -> None:
-    """Write an MTG: a plant of axes of nodes, with places and radii [m].
+    """Write an MTG: a plant of axes of nodes, with positions and radii [m].
 
     An axis hangs with ``+`` on the node that it grows from; nodes follow each other with ``<``.
     """

@@ -26,7 +26,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
 
     Raises:
         InputError: it has holes, edges of more than two faces, faces that point in and out,
-            several bodies or cavities, no volume, or it crosses itself. Each says where.
+            several bodies or cavities, no volume, or it intersects itself. Each states where.
     """
     warnings = []
     corner = surface.faces

@@ -29,7 +29,7 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
     commas do not separate.
 
     Raises:
-        InputError: no numbers, too few columns, or a line that is none of the table; it is named.
+        InputError: no numbers, too few columns, or a line that does not fit, which is named.
     """
     text = _decoded(path.read_bytes()).replace('"', "")
     if _COLMAP in text[:_COLMAP_HEAD]:

@@ -35,11 +35,11 @@ _Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FoundSkeleton:
-    """A skeleton in the prepared cloud's frame, and of what part of the cloud it was found.
+    """A skeleton in the prepared cloud's frame, and the part of the cloud that it belongs to.
 
     Attributes:
-        result: What the search came to.
-        leaves: What was cut off the prepared cloud first.
+        result: Result of the search.
+        leaves: Leaves that were removed from the prepared cloud first.
     """
 
     result: SkeletonResult
@@ -61,7 +61,7 @@ class FoundSkeleton:
 
     @classmethod
     def read(cls, path: Path) -> "FoundSkeleton":
-        """Read what :meth:`write` has written.
+        """Read a file that :meth:`write` has written.
 
         Raises:
             InputError: it is damaged.

@@ -15,7 +15,7 @@ _CHORD = 2.0  # radii on each side of a node that tell its turn
 
 
 class DoubtKind(StrEnum):
-    """What is doubtful about a part."""
+    """Why a part is uncertain."""
 
     unlikely = "unlikely branch"
     unresolved = "unresolved radius"
@@ -26,12 +26,12 @@ class DoubtKind(StrEnum):
 
 @dataclass(frozen=True)
 class Doubt:
-    """One doubtful part.
+    """One uncertain part.
 
     Attributes:
-        kind: What is doubtful.
+        kind: Why it is uncertain.
         branch: Its run.
-        at: A place on it [m], shape [3].
+        at: A position on it [m], shape [3].
         length: Of the part [m]; 0 for a single node.
         radius: There, the median [m].
         value: Probability of an unlikely branch; standard deviation over radius of an unresolved

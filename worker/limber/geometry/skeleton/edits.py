@@ -1,7 +1,7 @@
 """Edits of a skeleton by its user: a small list that is applied again after each reconstruction.
 
-Nodes are named by their place, not by their number: a new reconstruction numbers them anew. A
-file of edits is a JSON list, its places and radii in the coordinates and the unit of the scan's
+Edits refer to nodes by position, because each reconstruction numbers the nodes again. A
+file of edits is a JSON list. Positions and radii have the coordinates and the unit of the scan's
 file, as `limber skeleton` lists them::
 
     [{"do": "delete", "at": [0.12, 0.03, 0.85]},
@@ -33,7 +33,7 @@ class _Edit(BaseModel):
     at: Place
 
     def aligned(self, alignment: Alignment) -> Self:
-        """Return the edit with places and radius in the branch's frame [m]."""
+        """Return the edit with positions and radius in the branch's frame [m]."""
         return self._placed(alignment.apply, alignment.scale)
 
     def in_file(self, alignment: Alignment) -> Self:
@@ -48,14 +48,14 @@ class _Edit(BaseModel):
 
 
 class MoveNode(_Edit):
-    """Put the node nearest to ``at`` at ``to``."""
+    """Move the node nearest to ``at`` to ``to``."""
 
     do: Literal["move"] = "move"
     to: Place
 
 
 class DeleteBranch(_Edit):
-    """Cut off the branch nearest to ``at``, from there outwards."""
+    """Delete the branch nearest to ``at``, from there outwards."""
 
     do: Literal["delete"] = "delete"
 
@@ -71,14 +71,14 @@ class MergeBranch(_Edit):
 
 
 class Bridge(_Edit):
-    """Hang the whole branch at ``at`` on the node nearest to ``to`` instead."""
+    """Attach the whole branch at ``at`` to the node nearest to ``to`` instead."""
 
     do: Literal["bridge"] = "bridge"
     to: Place
 
 
 class SplitBranch(_Edit):
-    """Cut a branch at ``at``; what lies beyond hangs on the node nearest to ``to`` instead."""
+    """Cut a branch at ``at`` and attach the outer part to the node nearest to ``to``."""
 
     do: Literal["split"] = "split"
     to: Place
@@ -91,7 +91,7 @@ class SetRoot(_Edit):
 
 
 class SetRadius(_Edit):
-    """Set the radius at ``at``, or all along the axes from ``at`` to ``to``; known to 2 %."""
+    """Set the radius at ``at``, or along the axes from ``at`` to ``to``. Its uncertainty is 2 %."""
 
     do: Literal["radius"] = "radius"
     radius: float = Field(gt=0)
@@ -99,7 +99,7 @@ class SetRadius(_Edit):
 
 
 class ConfirmBranch(_Edit):
-    """The branch at ``at`` is there, and what carries it: no more doubt."""
+    """Confirm that the branch at ``at`` exists, and the branches that carry it."""
 
     do: Literal["confirm"] = "confirm"
 
@@ -114,7 +114,7 @@ def read_edits(path: Path) -> list[Edit]:
     """Read a file of edits.
 
     Raises:
-        InputError: it cannot be read, is no JSON, or an edit is none; says which.
+        InputError: the file cannot be read, is not JSON, or has an invalid edit, which is named.
     """
     try:
         return EDITS.validate_json(Path(path).read_bytes())
@@ -134,23 +134,23 @@ def read_edits(path: Path) -> list[Edit]:
 
 
 def edits_text(edits: Sequence[Edit]) -> str:
-    """Return edits as the text of their file: one a line, always the same for the same edits."""
+    """Return edits as the text of their file: one per line, equal for equal edits."""
     lines = [edit.model_dump_json(exclude_none=True) for edit in edits]
     return "[" + ",\n ".join(lines) + "]\n"
 
 
 def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None = None,
            ) -> Skeleton:
-    """Apply edits, in their order.
+    """Apply edits in order.
 
     Args:
-        skeleton: In the frame of the edits' places [m].
+        skeleton: In the frame of the edits' positions [m].
         edits: What to change.
-        misfits: Gets the message of each edit that does not fit, which is then left out; None
-            refuses it.
+        misfits: Receives the message of each edit that does not fit and is skipped; None
+            raises the error.
 
     Raises:
-        InputError: a place is on no axis, or an edit would leave no tree.
+        InputError: a position is not on an axis, or the result would not be a tree.
     """
     doing = {"move": _moved, "delete": _deleted, "merge": _merged, "bridge": _bridged,
              "split": _split, "root": _rooted, "radius": _with_radius, "confirm": _confirmed}
@@ -308,9 +308,9 @@ def _remade(skeleton: Skeleton, *, nodes: np.ndarray | None = None,
 
 
 def differing(skeleton: Skeleton, found: Skeleton) -> np.ndarray:
-    """Return which nodes of an edited skeleton are not as they were found, shape [n].
+    """Return which nodes of an edited skeleton differ from the found skeleton, shape [n].
 
-    A node is as it was found where one with its place, radius, carrier and probability was found.
+    A node is unchanged if a node with its position, radius, parent and probability was found.
     """
     distance, same = cKDTree(found.nodes).query(skeleton.nodes)
 

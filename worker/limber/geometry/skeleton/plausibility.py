@@ -1,4 +1,4 @@
-"""Whether a cloud and its skeleton can be a plant: what is refused, and what is told."""
+"""Check whether a cloud and its skeleton can be a plant: errors and warnings."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import Contracti
 from limber.geometry.skeleton.skeleton import Skeleton
 
 Where = Callable[[np.ndarray], np.ndarray]
-"""Takes places, shape [..., 3], to coordinates that the user knows: those of the scan's file."""
+"""Transforms positions, shape [..., 3], to the coordinates of the scan's file."""
 
 _STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # of the radius, up to which points may scatter and show what is round
@@ -23,14 +23,14 @@ _FIX = ("Crop the scan to one branch (--crop-low, --crop-high), or provide a ske
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
                     where: Where) -> None:
-    """Refuse a ball, and two plants unless ``plants`` says which to take.
+    """Refuse a ball, and two plants unless ``plants`` states which one to use.
 
     Args:
         graph: Nodes and edges of the cloud.
-        count: Number of points that it was made of.
+        count: Number of points of the cloud.
         diagonal: Size of the cloud [m].
         plants: ``refuse``, ``largest`` or ``joined``.
-        where: Takes a place of the graph to the user's coordinates.
+        where: Transforms a position in the graph to the user's coordinates.
 
     Raises:
         InputError: one of these.
@@ -68,7 +68,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
                  residual: np.ndarray) -> None:
-    """Refuse what has an axis but no roundness at all: a ball. Leaves are told, not refused."""
+    """Refuse a cloud with axes but without round sections (a ball). Leaves give a warning only."""
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))
     away = float(np.median(np.abs(residual + skeleton.radius[segment])))
@@ -87,7 +87,7 @@ def check_no_sheet(points: np.ndarray) -> None:
 
 
 def _sheet_share(points: np.ndarray, reach: float) -> float:
-    """Share of points whose surroundings within ``reach`` [m] are wide and flat, on a sample."""
+    """Fraction of points whose surroundings within ``reach`` [m] are wide and flat, on a sample."""
     tree = cKDTree(points)
     sample = points[:: max(len(points) // 300, 1)]
     flat = []
@@ -99,11 +99,11 @@ def _sheet_share(points: np.ndarray, reach: float) -> float:
 
 
 def warnings(result: Any, where: Where) -> list[str]:
-    """Return what the user should know of a skeleton.
+    """Return the warnings about a skeleton.
 
     Args:
-        result: The skeleton and what was done to get it.
-        where: Takes its places to the user's coordinates.
+        result: The skeleton and the report of its reconstruction.
+        where: Transforms its positions to the user's coordinates.
     """
     texts = []
     if result.contraction.status is ContractionStatus.given:
@@ -168,7 +168,7 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
 
 
 def shows_round(result: Any) -> bool:
-    """Whether points lie near enough to their axes' surface for their sections to show round.
+    """Whether points lie close enough to the surface around their axes to show round sections.
 
     A leaf's points do not: it becomes a rod that they fill.
     """
@@ -177,21 +177,21 @@ def shows_round(result: Any) -> bool:
 
 
 def unexplained_share(result: Any) -> float:
-    """Share of points that lie on no round axis: leaves, flying pixels, a second plant."""
+    """Fraction of points that belong to no round axis: leaves, flying pixels, a second plant."""
     # Leaves make noise look large: what lies a whole radius off is on no axis, whatever noise is.
     radius = result.skeleton.radius[result.node_of_point]
     return float(np.mean(np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)))
 
 
 def check_explained(result: Any, limit: float) -> None:
-    """Refuse a scan much of which lies on no round axis.
+    """Refuse a scan with too many points that belong to no round axis.
 
     Args:
         result: The skeleton with the residuals of its points.
-        limit: Share of points that may lie on none.
+        limit: Largest accepted fraction of such points.
 
     Raises:
-        InputError: more do.
+        InputError: the fraction exceeds ``limit``.
     """
     # A depth camera's scatter is noise, not leaves: there only what noise does not reach counts.
     radius = result.skeleton.radius[result.node_of_point]

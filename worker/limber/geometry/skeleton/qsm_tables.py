@@ -16,7 +16,7 @@ HEIGHTS = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9)
 
 @dataclass(frozen=True)
 class Caliper:
-    """One diameter that somebody measured.
+    """One measured diameter.
 
     Attributes:
         along: Distance from the root along the main path [m].
@@ -74,7 +74,7 @@ def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[s
     ``sigmas`` is None where the skeleton's deviation is not known.
 
     Raises:
-        InputError: a place lies beyond the main path.
+        InputError: a position is beyond the main path.
     """
     total = float(skeleton.arc_length[skeleton.main_path()[-1]])
     along = np.array([one.along for one in measured])

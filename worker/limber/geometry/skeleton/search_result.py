@@ -28,7 +28,7 @@ class SkeletonResult:
         residual: Distance of each point from its cylinder [m], shape [m].
         noise: Robust standard deviation of the residuals [m].
         bridges: Gaps closed: ``from``, ``to``, ``length`` [m].
-        split_off: Pieces left away: ``points``, ``distance`` [m], ``at``.
+        split_off: Discarded pieces: ``points``, ``distance`` [m], ``at``.
         loops: Lengths [m] of closed loops that were opened.
         pruned: Number of spurs pruned.
         second_base: Where the plant seems to stand on the ground a second time [m], shape [3].

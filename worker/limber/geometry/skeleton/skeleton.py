@@ -29,7 +29,7 @@ class Skeleton:
         order: Branching order, 0 for the main run, shape [n].
         radius_state: ``MEASURED``, ``LIMITED``, ``INTERPOLATED``, ``UNRESOLVED`` or ``BRIDGED``,
             shape [n].
-        probability: That the node is there at all, shape [n]; 1 where nobody doubted.
+        probability: Probability that the node exists, shape [n]; 1 where it is certain.
     """
 
     nodes: np.ndarray
@@ -189,7 +189,7 @@ class Skeleton:
                        radius_sigma=self.radius_sigma / alignment.scale)
 
     def write_swc(self, path: Path, *, unit: str = "m") -> None:
-        """Write an SWC file, in the unit that its header says; type 5 is a fork, 6 a tip, 0 else.
+        """Write an SWC file in the unit that its header states; type 5 is a fork, 6 a tip, 0 else.
         """
         counts = self.child_counts()
         kind = np.select([self.parent < 0, counts > 1, counts == 0], [1, 5, 6], 0)

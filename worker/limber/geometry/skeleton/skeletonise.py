@@ -45,7 +45,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
         points: Scanned points [m], shape [n, 3].
         settings: How.
         root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
-        up: Which way is up, shape [3]; None: z.
+        up: The up direction, shape [3]; None: z.
         camera: The points are a depth camera's, and scatter along its sight alone.
         where: Takes places of the cloud to the coordinates of its file, for errors; None: they
             are the same.

@@ -64,7 +64,7 @@ def total_length(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> 
 
 
 def total_volume(skeleton: Skeleton) -> Total:
-    """Return the volume of all cylinders [m^3], without what of twigs lies inside their carriers.
+    """Return the volume of all cylinders [m^3], without the parts of twigs inside their parents.
 
     Args:
         skeleton: With the deviations of its radii, and the probabilities of its nodes.

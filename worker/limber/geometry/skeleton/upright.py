@@ -15,7 +15,7 @@ def upright_rotation(skeleton: Skeleton, up: np.ndarray, upright: bool) -> np.nd
 
     Args:
         skeleton: In the file's axes.
-        up: Which way is up in the file's axes, shape [3].
+        up: The up direction in the file's axes, shape [3].
         upright: False only turns ``up`` to z.
     """
     first = shortest_turn(np.asarray(up, float), np.array([0.0, 0.0, 1.0]))

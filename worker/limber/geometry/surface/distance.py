@@ -9,7 +9,7 @@ from limber.geometry.surface.surface import Surface
 
 
 def distance_to_surface(points: np.ndarray, surface: Surface) -> np.ndarray:
-    """Distances [m] of points [n, 3] from the nearest place on a surface, shape [n]."""
+    """Distances [m] of points [n, 3] from a surface, shape [n]."""
     corner = surface.vertices[surface.faces]
     low, high = corner.min(axis=1), corner.max(axis=1)
     origin = low.min(axis=0)

@@ -40,7 +40,7 @@ class SurfaceCheck:
         """Return self if valid.
 
         Raises:
-            MeshingError: names the first place where it is not.
+            MeshingError: it is not; the message names the first position.
         """
         if not self.watertight:
             raise MeshingError(f"The surface has {len(self.open_edges)} open edges or edges with "

@@ -118,7 +118,7 @@ class TetMesh:
         """Refuse a mesh as read from ``path`` that nothing can be computed on.
 
         Raises:
-            InputError: places or data that are not finite, nodes that are not there, or moduli
+            InputError: positions or data that are not finite, missing nodes, or moduli
                 and densities that are not positive.
         """
         data = {**self.point_data, **self.cell_data}

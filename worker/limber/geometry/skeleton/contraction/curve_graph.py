@@ -28,11 +28,11 @@ class CurveGraph:
         support: Number of points of each node, shape [n].
         bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m], ``price``
             (1: an end goes straight on; more: the odder).
-        split_off: Each piece that was left away: ``points``, ``distance`` [m], ``at``.
+        split_off: Each discarded piece: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
         plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
             [m], ``at``.
-        owner: The node that each point belongs to, -1 where it was left away, shape [m].
+        owner: The node that each point belongs to, -1 for a discarded point, shape [m].
     """
 
     nodes: np.ndarray
@@ -54,7 +54,7 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     Args:
         points: Scanned points [m], shape [n, 3].
         contracted: The same points after contraction [m], shape [n, 3].
-        gap_factor: The paper's gamma: a step longer than so many median steps is a gap.
+        gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
         bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
         up: Which way is up, shape [3].
         join_plants: Join even pieces that look like two plants.
@@ -175,7 +175,7 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
 
 
 def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
-    """Take the bridges of the largest piece; the others are left away.
+    """Take the bridges of the largest piece and discard the other pieces.
 
     Returns:
         Whether each node was kept.

@@ -56,7 +56,7 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
     Args:
         points: Scanned points [m], shape [n, 3].
         source: Where the root is [m], shape [3].
-        gap_factor: The paper's gamma: a step longer than so many median steps is a gap.
+        gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
         bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
         up: Which way is up, shape [3].
         join_plants: Join even pieces that look like two plants.

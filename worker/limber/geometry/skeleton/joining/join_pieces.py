@@ -1,4 +1,4 @@
-"""Pieces of a scan: which belong to one plant and are bridged, and which are left away."""
+"""Pieces of a scan: which belong to one plant and are bridged, and which are discarded."""
 
 from dataclasses import fields
 

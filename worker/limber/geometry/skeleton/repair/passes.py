@@ -43,7 +43,7 @@ class Repaired:
         skeleton: As far as it is.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
-        prune: A twig stays if it reaches so many radii of its carrier beyond that.
+        prune: A twig is kept if it extends this many radii of its parent beyond the parent.
         camera: The points are a depth camera's.
         fit: The last fit.
         pinched: What the first fit started from, where one side alone was seen of wood: that may
