@@ -51,9 +51,9 @@ Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Takes in a skeleton as it was found, and all that the search for it came to."""
 
 _OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # of cloud.ply, whatever the scan's are
-_LEAVES_ASKED = 0.2  # share of points on no round axis, from which leaves are looked for
-# Share of leaves that tells them by shape alone: of bare branches seen from one side up to 0.11 is
-# flat, of leafy seedlings 0.6 and more.
+_LEAVES_ASKED = 0.2  # fraction of points on no round axis, above which leaves are searched for
+# From this fraction of flat points on, shape alone shows leaves. Bare branches seen from one side
+# have up to 0.11, leafy seedlings 0.6 and more.
 _MOSTLY = 0.3
 
 
@@ -109,7 +109,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
             longer fit are skipped and reported.
         eye: Where the depth camera stood [m], shape [3], if the scan is its image.
         known: What an earlier run found of this scan with these settings, and did not come to use.
-        keep: Gets the alignment, the skeleton and what the search came to as soon as it is found,
+        keep: Receives the alignment, the skeleton and the result of the search as soon as found,
             before anything that may still refuse it or fail; not what is ``known``.
         progress: Called as it goes; gets what the user should know.
 

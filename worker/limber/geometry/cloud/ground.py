@@ -10,12 +10,12 @@ import scipy
 
 _CELL = 0.03  # of the cloud's diagonal
 _LEAST_CELLS = 40
-_BROAD, _FILLED = 0.11, 0.25  # least standard deviation across, over the diagonal; share of its box
+_BROAD, _FILLED = 0.11, 0.25  # least standard deviation across, over the diagonal; part of its box
 _STEEPEST = np.deg2rad(40.0)
 _ROUGH = 0.03  # of the diagonal, that ground may be off its plane
 _BELOW, _NOTHING = 4.0, 0.03  # standard deviations of that below the plane, where so few cells lie
 _LAYER = 3.5  # standard deviations of points around the ground of their cell that belong to it
-_ABOVE = 0.3  # share of cells that may have points in the next layer: plants
+_ABOVE = 0.3  # fraction of cells that may have points in the next layer: plants
 _ROUNDS = 10
 
 

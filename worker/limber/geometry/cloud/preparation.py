@@ -17,7 +17,7 @@ from limber.geometry.settings import PreparationSettings
 POINT_MINIMUM = 50
 _LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans as a branch
 _SMALLEST_EXTENT = 0.02
-_SHEET_LEAST = 0.08  # share of points that makes a wall or the ground
+_SHEET_LEAST = 0.08  # fraction of points that makes a wall or the ground
 _SHEETS_MOST = 6  # a box has no more
 _AT_ONCE = 200_000  # points whose neighbours are held in memory together
 _COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
@@ -51,7 +51,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         scale: Metres per unit of the file.
         settings: How.
         eye: Position of the camera, if known, in the file's coordinates, shape [3].
-        up: Which way is up, shape [3], to look for rough ground; None: for walls and floors only.
+        up: The up direction, shape [3], to look for rough ground; None: for walls and floors only.
 
     Raises:
         InputError: too few points, or all of them at one position.

@@ -11,7 +11,7 @@ import numpy as np
 _WINDOW, _STRIDE, _WINDOWS = 10, 5, 4000  # points in a row that show a plane; as many are looked at
 _PLANE = 1e-3  # across it over its narrower extent, up to which points lie in one
 _BENT = 0.02  # narrower extent over the longer one, from which that plane is known
-_LEAST, _SHARE = 20, 0.15  # number and share of windows that must show planes
+_LEAST, _SHARE = 20, 0.15  # number and fraction of windows that must show planes
 _APART = 0.03  # sine of the angles between planes, under which they are parallel: a sorted grid
 _NEAR = 3e-3  # by how much half of these planes may miss the camera, over the cloud's extent
 _TUKEY, _EXACT = 4.0, 1e-9  # how many times as far as the median what counts may miss; that is none

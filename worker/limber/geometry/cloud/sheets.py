@@ -12,7 +12,7 @@ _REACH = 0.05  # of the cloud's diagonal: what is looked at around a point
 _FLAT, _WIDE = 0.01, 0.3  # variance across a sheet, and along its narrower side, over the next
 _TRIES = 200
 _BROAD = 0.11  # least standard deviation of a sheet across, over the diagonal: leaves have 0.08
-_FILLED = 0.25  # least share of a sheet's own box that it fills
+_FILLED = 0.25  # least fraction of a sheet's own box that it fills
 
 
 def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:

@@ -30,7 +30,7 @@ class View:
     Attributes:
         eye: The camera's position [m], shape [3].
         pitch: Width of a pixel at distance 1.
-        fill: Share of the pixels on what was seen that are in the cloud.
+        fill: Fraction of the pixels on what was seen that are in the cloud.
     """
 
     eye: np.ndarray
@@ -54,7 +54,7 @@ class Sight:
 
     @cached_property
     def fill(self) -> float:
-        """Share of the pixels on what was seen that are in the cloud: thinned images lack some.
+        """Fraction of the pixels on what was seen that are in the cloud: thinned images lack some.
 
         Of the places in the middle between two pixels that are two apart, as many as have one.
         """

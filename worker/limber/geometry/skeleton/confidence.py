@@ -102,7 +102,7 @@ def given_carrier(skeleton: Skeleton) -> np.ndarray:
 
 
 def shares(skeleton: Skeleton) -> dict[str, float]:
-    """Share of the axes' length in each state."""
+    """Fraction of the axes' length in each state."""
     step = skeleton.steps[1:]
     total = max(float(step.sum()), 1e-300)
     return {name: float(step[skeleton.radius_state[1:] == value].sum()) / total

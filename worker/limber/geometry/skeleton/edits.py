@@ -301,7 +301,7 @@ def _data(skeleton: Skeleton) -> dict[str, np.ndarray]:
 
 def _remade(skeleton: Skeleton, *, nodes: np.ndarray | None = None,
             parent: np.ndarray | None = None) -> Skeleton:
-    """Return the skeleton with other places or parents; runs and orders are found anew."""
+    """Return the skeleton with other positions or parents; runs and orders are computed again."""
     return Skeleton.from_edges(
         skeleton.nodes if nodes is None else nodes,
         skeleton.parent if parent is None else parent, skeleton.radius, **_data(skeleton))

@@ -74,7 +74,7 @@ class _Search:
     Attributes:
         points: [m], shape [m, 3].
         settings: How.
-        up: Which way is up, shape [3].
+        up: The up direction, shape [3].
         diagonal: Size of the cloud [m].
     """
 
@@ -113,7 +113,7 @@ class _Search:
                                    np.maximum(graph.thickness[keep], least)), count
 
     def to_fit(self, graph: CurveGraph, thin: np.ndarray) -> np.ndarray:
-        """Points for the fit [m]: what the graph left away must not draw the rest towards it."""
+        """Points for the fit [m]: points that the graph discarded must not attract the rest."""
         some = self.points[thinned(self.points, FIT_POINT_LIMIT)]
         if (graph.owner < 0).any():
             some = some[graph.owner[cKDTree(thin).query(some)[1]] >= 0]

@@ -107,7 +107,7 @@ def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormal
 
 def resample(points: np.ndarray, radius: np.ndarray, spacing: np.ndarray | float,
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and radii anew along a polyline, ``spacing`` (a number, or one a point) apart."""
+    """Resample points and radii along a polyline, ``spacing`` (a number, or one a point) apart."""
     along = arc_lengths(points)
     wanted = np.broadcast_to(np.asarray(spacing, float), along.shape)
     # Equal steps in the integral of 1/spacing follow a spacing that changes along the way.

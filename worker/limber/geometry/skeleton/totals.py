@@ -127,7 +127,7 @@ def _share_of_all(relative: np.ndarray, volume: np.ndarray) -> float:
 
 
 def _hidden_share(skeleton: Skeleton, members: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Share of each of a side run's cylinders that lies inside its carrier, shape [k]."""
+    """Fraction of each of a side run's cylinders that lies inside its carrier, shape [k]."""
     end = np.cumsum(step)
     inside = float(skeleton.radius[members[0]]) - (end - step)
     return np.clip(inside / np.maximum(step, 1e-300), 0.0, 1.0)

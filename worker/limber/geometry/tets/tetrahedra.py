@@ -78,7 +78,7 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
 
 
 def _share(skeleton: Skeleton, runs: list[int]) -> float:
-    """Share of the skeleton's volume that the runs have."""
+    """Fraction of the skeleton's volume that the runs have."""
     volume = skeleton.radius**2 * skeleton.steps
     return float(volume[np.isin(skeleton.branch, runs)].sum() / volume.sum())
 
@@ -189,7 +189,7 @@ def _from_cache(place: Path) -> tuple[np.ndarray, np.ndarray] | None:
         stored = read_arrays(place, "tetrahedra")
         require_shapes(place, stored, {"nodes": ("n", 3), "tets": ("t", 4)}, "tetrahedra")
     except InputError:
-        return None  # not there, or cut short: it is made anew
+        return None  # missing or truncated: the mesh is made again
     return stored["nodes"], stored["tets"]
 
 

@@ -56,7 +56,7 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
         contracted: The same points after contraction [m], shape [n, 3].
         gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
         bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
-        up: Which way is up, shape [3].
+        up: The up direction, shape [3].
         join_plants: Join even pieces that look like two plants.
     """
     links, spacing = neighbour_links(points)

@@ -35,9 +35,9 @@ NEIGHBOURS = 12
 _LINE_NEIGHBOURS = 20
 _MOST_ATTRACTION = 1e3  # chosen: beyond it the linear system loses digits
 _SOLVES = 12  # at most
-_LINEAR, _FEW_LEFT = 0.95, 0.03  # when a point counts as contracted; share of others at the end
+_LINEAR, _FEW_LEFT = 0.95, 0.03  # when a point counts as contracted; fraction of others at the end
 _GROWTH = 3.0
-_STILL_THICK = 0.6  # share of points not yet on a line, down to which the weights grow
+_STILL_THICK = 0.6  # fraction of points not yet on a line, down to which the weights grow
 
 
 class ContractionStatus(StrEnum):
@@ -62,11 +62,11 @@ class Contraction:
     Attributes:
         points: Contracted points [m], recentred against the scan, shape [n, 3], in the order of
             the input.
-        linearity: Share of the variance around each point that lies along one line, 1/3 to 1,
+        linearity: Fraction of the variance around each point that lies along one line, 1/3 to 1,
             shape [n]: 1 where the cloud has become a curve.
         iterations: Number of linear solves.
         status: How it ended.
-        history: One dict an iteration: ``moved`` [m], ``active`` (share of points not yet on a
+        history: One dict an iteration: ``moved`` [m], ``active`` (fraction of points not yet on a
             curve), ``seconds``.
         drawn: Contracted points [m] before they were recentred: less right, but they tell
             branches apart up to the fork, where circles mix them, shape [n, 3].
@@ -152,7 +152,7 @@ def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
 
 
 def local_linearity(points: np.ndarray) -> np.ndarray:
-    """Share of the variance of each point's neighbourhood along its main direction, shape [n]."""
+    """Fraction of the variance around each point along its main direction, shape [n]."""
     count = min(_LINE_NEIGHBOURS, len(points))
     _, near = cKDTree(points).query(points, k=count)
     offset = points[near] - points[near].mean(axis=1, keepdims=True)

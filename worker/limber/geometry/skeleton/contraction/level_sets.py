@@ -58,7 +58,7 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
         source: Where the root is [m], shape [3].
         gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
         bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
-        up: Which way is up, shape [3].
+        up: The up direction, shape [3].
         join_plants: Join even pieces that look like two plants.
         width: Of a level [m]; None: as narrow as the points' spacing allows.
     """

@@ -15,7 +15,7 @@ _SITES = 6000  # points that get a circle of their own; the others take their ne
 _LINE = 30
 _ROUND_ENOUGH = 0.5  # residual over radius up to which points count as a circle
 _LARGEST = 4.0  # radius over how far points were drawn: a half circle is drawn by 0.4 radii
-_STRAIGHT = 0.8  # share of variance along one line, under which there is no axis to speak of
+_STRAIGHT = 0.8  # fraction of variance along one line, under which there is no axis to speak of
 _FARTHEST = 1.5  # how far a point may be put off its line, in how far it was drawn
 
 
@@ -90,7 +90,7 @@ def _on_lines(points: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def _lines(near: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, share of variance along the main axis, and axes (main one last) of neighbours."""
+    """Mean, fraction of variance along the main axis, and axes (main one last) of neighbours."""
     total = weight.sum(axis=1)
     middle = (weight[:, None, :] @ near)[:, 0] / total[:, None]
     offset = near - middle[:, None]

@@ -6,7 +6,7 @@ from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, rooted
 from limber.geometry.skeleton.repair.spurs import prune_spurs
 
 _ROOT_SHARE = 0.45  # of the thickest end, from which an end may be the root
-_ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and share of height, that tell
+_ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and fraction of height, that tell
 _END_POINTS, _END_REACHES = 30, 4  # that tell how thick an end is; over so many times its reach
 # Radii of its carrier up to which a side arm may be a strand around the rim of a ragged foot.
 _STRAND = 5.0

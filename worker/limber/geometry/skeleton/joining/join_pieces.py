@@ -32,7 +32,7 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
         spread: How far its points reach from each node [m], shape [n].
         gap: Steps up to this length [m] are no gap (the paper's gamma rule).
         bridge_limit: No bridge is longer [m], unless its end points straight at what it reaches.
-        up: Which way is up, shape [3].
+        up: The up direction, shape [3].
         join_plants: Join even what looks like two plants.
     """
     label = labels(len(nodes), edges)

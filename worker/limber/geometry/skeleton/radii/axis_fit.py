@@ -51,7 +51,7 @@ _HELD = 2  # trusted rounds in which the limit stays that of most sensors
 
 @dataclass(frozen=True)
 class AxisFit:
-    """A fitted skeleton and what the points said.
+    """A fitted skeleton and the evidence of the points.
 
     Attributes:
         skeleton: Axes, radii, their standard deviations and states.
@@ -76,7 +76,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     Args:
         skeleton: Where the axes about are, with first radii; its topology is kept.
         points: Scanned points [m], shape [m, 3].
-        rounds: Gauss-Newton rounds; points choose their cylinder anew in each.
+        rounds: Gauss-Newton rounds; points choose their cylinder again in each.
         settled: The axes are where they belong: what is left to find is fine.
         along_sight: The points are a depth camera's: they scatter along its sight alone.
         uncertainty: Find each radius's standard deviation too; without, it and the states stay

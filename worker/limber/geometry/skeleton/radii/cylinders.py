@@ -32,7 +32,7 @@ def on_cylinders(skeleton: Skeleton, points: np.ndarray,
     """Where points lie along the cylinders that they are nearest to, or inside of.
 
     Returns:
-        Lower and upper node of each, shape [m] each, the share of the way between them, shape
+        Lower and upper node of each, shape [m] each, the fraction of the way between them, shape
         [m] (1 throughout in the first cylinder of a twig, whose radius is the twig's), and the
         way from the axis to the point [m], shape [m, 3].
     """
@@ -46,7 +46,7 @@ def on_cylinders(skeleton: Skeleton, points: np.ndarray,
 
 @dataclass(frozen=True)
 class Match:
-    """For each of m points: the upper node of its cylinder, the share of the way to it, the unit
+    """For each of m points: the upper node of its cylinder, the fraction of the way to it, the unit
     normal away from the axis [m, 3], the distance from the surface [m], the radius there [m], and
     whether that is the twig's all along."""
 

@@ -26,7 +26,7 @@ def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_rad
         radius: Radii [m], shape [n].
 
     Returns:
-        The upper node, the share of the way up to it, the unit vector from the axis to the point,
+        Upper node, fraction of the way up to it, unit vector from the axis to the point,
         shape [m, 3], the distance from the surface [m], positive outside, and the radius [m].
     """
     count = len(points)
@@ -63,7 +63,7 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
 
     Args:
         segment: Cylinder of each point, shape [m].
-        share: Share of the way up it, shape [m].
+        share: Fraction of the way up it, shape [m].
         low: Derivative of the radius there in the lower node's, shape [m].
         high: In the upper node's, shape [m].
         normal: Unit vector from the axis to the point, shape [m, 3].
@@ -179,7 +179,7 @@ def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray
 
 @njit(cache=True)
 def _below(angle: float, sharpness: float, bessel: float) -> float:
-    """Share of von Mises' distribution around 0 below an angle, which counts whole turns.
+    """Fraction of von Mises' distribution around 0 below an angle, which counts whole turns.
 
     Its series (Hill, ACM Algorithm 518, 1977), or the normal one that it comes near to.
     """

@@ -13,14 +13,14 @@ PLACES = 180  # on the circle, of which each is weighed
 _CLEAR = 12.0  # concentration from which a point tells which sides were seen
 _ONE_SIDED = 0.3  # length of the mean normal, from which one side may be all that was seen
 _BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not seen
-_FEW = 0.12  # share of points there that noise can put
+_FEW = 0.12  # fraction of points there that noise can put
 _FRONT, _EDGE = np.deg2rad(40.0), np.deg2rad(65.0)
 _ALONG = 0.65  # scatter at the edges over that in front, under which it is along the sight alone
 # Beyond about that no sensor sees a surface. Which it is moves a radius where noise hides the arc's
 # ends: fitted circles whose limit was another by 4 to 19 degrees came out 0.8 to 1.1 % off a degree
 # for noise over 0.12 of the radius, and in proportion less below.
 _GRAZING, _GRAZING_SIGMA = np.deg2rad(81.0), np.deg2rad(4.0)
-_GRAZING_MOVES, _ARC_HIDDEN = 0.55, 0.12  # share of the radius a radian; noise over radius
+_GRAZING_MOVES, _ARC_HIDDEN = 0.55, 0.12  # fraction of the radius a radian; noise over radius
 _LEAST_SEEN = 0.01
 _RING_LOST = 12.0  # square of radius over noise, under which a ring's middle is not seen empty
 _FLAT = 0.10  # relative difference of scatter across and along the sight that is one side's

@@ -28,7 +28,7 @@ def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
     Args:
         skeleton: Fitted to the cloud.
         view: Where it was seen from.
-        factor: A twig stays if, as the camera saw it, it or a twig on it reaches so many radii
+        factor: A twig stays if, as the camera saw it, it or a twig on it reaches this many radii
             of its carrier beyond the carrier's axis.
 
     Returns:

@@ -18,7 +18,7 @@ _NEAR = 1.2  # carrier's radii by which that may miss the carrier's axis
 
 
 def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
-    """Return the skeleton with such twigs hung anew, and how many there were."""
+    """Return the skeleton with such twigs attached again, and their number."""
     parent, keep, count = skeleton.parent.copy(), np.ones(skeleton.node_count, bool), 0
     runs = skeleton.runs()
     carried = set(np.flatnonzero(skeleton.child_counts() > 1).tolist())

@@ -28,7 +28,7 @@ from limber.geometry.skeleton.repair.strands import without_strands
 from limber.geometry.skeleton.skeleton import Skeleton
 
 LEAF_SHARE = 0.5
-"""Share of points over two radii off their axis from which a scan shows leaves, not branches."""
+"""Fraction of points over two radii off their axis from which a scan shows leaves, not branches."""
 
 _COARSE = 1.5  # local radii between the nodes of the first fit
 _NOISY = 0.2  # of the median radius
@@ -80,7 +80,7 @@ class Repaired:
 
     @property
     def beside(self) -> float:
-        """Share of points farther off their axis than twice its radius, as leaves lie."""
+        """Fraction of points farther off their axis than twice its radius, as leaves lie."""
         fit = self.last_fit
         return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
 
@@ -99,7 +99,7 @@ class Pass:
         name: Names it in tests and to developers.
         repairs: What is wrong before it, a sentence.
         run: The repair.
-        until: Share of all passes' work that is done after it; None: it takes next to no time.
+        until: Fraction of all passes' work that is done after it; None: it takes next to no time.
     """
 
     name: str

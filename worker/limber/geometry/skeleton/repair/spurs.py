@@ -11,7 +11,7 @@ def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, fa
         nodes: Positions [m], shape [n, 3].
         parent: Parents, -1 for the root, shape [n].
         thickness: Radii [m], shape [n].
-        factor: A side twig stays if it reaches so many times the radius of the node it starts
+        factor: A side twig is kept if it reaches this many times the radius of the node it starts
             from beyond that node.
 
     Returns:
