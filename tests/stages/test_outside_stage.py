@@ -121,7 +121,7 @@ def test_its_line_in_a_job_file(package, tmp_path):
     assert task.label == "count" and task.settings.least_radius == 0.004
     assert line_of_task(task)[0] == "count" and task_of_line(line_of_task(task)) == task
     jobs.write_text(jobs.read_text().replace("4 mm", "4 kg"))
-    with pytest.raises(InputError, match=r"line 5: least_radius: .*It is in m"):
+    with pytest.raises(InputError, match=r"line 5: least_radius: .*It must be in m"):
         read_jobs(jobs)
 
 
