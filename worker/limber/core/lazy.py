@@ -26,7 +26,7 @@ def exports(package: str, places: Mapping[str, str],
 
 
 def loaded(function: Any) -> Any:
-    """Return a function, or what its place ``module:name`` stands for."""
+    """Return a function, or the object at the path ``module:name``."""
     if not isinstance(function, str):
         return function
     module, _, name = function.partition(":")

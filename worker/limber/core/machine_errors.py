@@ -29,7 +29,7 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
 
     Args:
         error: As Python or the system raised it.
-        place: The file or folder that was at work, where the error names none.
+        place: The file or folder in use, if the error does not name one.
     """
     if isinstance(error, MemoryError):
         return WorkError("Out of memory.", "", "Use a coarser mesh or a thinner cloud.")

@@ -1,12 +1,12 @@
-"""What long work tells: how far it is, and warnings; the same for a terminal and a test.
+"""What long work reports: progress and warnings, in the same way for a terminal and a test.
 
 A long function takes ``progress: Progress = SILENT`` and calls it as it goes::
 
     progress(0.4, "contracting", iteration=7)
 
-A call raises :class:`limber.core.errors.Cancelled` once the work has been cancelled, so every call
-is also a place where the work can stop. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
-What the user should know though the work goes on is told with ``progress.warn(message)``.
+A call raises :class:`limber.core.errors.Cancelled` once the work has been cancelled, so the
+work can stop at every call. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
+A warning that does not stop the work is reported with ``progress.warn(message)``.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ Sink = Callable[[float, str, dict[str, Any]], None]
 
 
 class Progress:
-    """Passes what work tells to whom it concerns; raises ``Cancelled`` after :meth:`cancel`.
+    """Passes progress and warnings to their receivers; raises ``Cancelled`` after :meth:`cancel`.
 
     Args:
         sink: Gets fraction, message and numbers.
@@ -49,7 +49,7 @@ class Progress:
             self._sink(start + (stop - start) * clipped, message, numbers)
 
     def warn(self, message: str) -> None:
-        """Tell the user something that does not stop the work."""
+        """Warn the user of something that does not stop the work."""
         if self._on_warning is not None:
             self._on_warning(message)
 
@@ -191,7 +191,7 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def damage_told_to(tell: Callable[[str], None]) -> Iterator[None]:
-    """Hand the first warning about a damaged cache to ``tell``; it comes from deep below.
+    """Pass the first warning about a damaged cache to ``tell``; it comes from a lower layer.
 
     Where one file of a cache is damaged others mostly are too: the user reads of one.
     """

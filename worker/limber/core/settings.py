@@ -1,8 +1,8 @@
-"""Settings that a user chooses: what all models of them share, and how a refused value is told.
+"""Settings that a user chooses: the common base of their models, and errors on refused values.
 
 A model is the one source of an option's name, type, range, default and help; of its place in
-``--help``, in the JSON schema and in the add-on's panel; and of what a manifest remembers. The
-unit of a value stands in its description in square brackets.
+``--help``, in the JSON schema and in the add-on's panel; and of what a manifest records. The
+description of a value states its unit in square brackets.
 """
 
 import difflib
@@ -59,7 +59,7 @@ class Settings(BaseModel):
     """Base of all settings and inputs: frozen, and closed to names that it does not know.
 
     Attributes:
-        groups: Title to the names of the fields that stand under it; a model that inherits adds
+        groups: Title to the names of the fields below it; a model that inherits adds
             to those of its bases.
         common: Fields that ``--help`` shows, beside those that must be given: what most users
             choose. ``--help-all`` shows the others too.
@@ -75,7 +75,7 @@ class Settings(BaseModel):
 
     @classmethod
     def group_of(cls, name: str) -> str:
-        """Return the title that a field stands under."""
+        """Return the title that a field belongs to."""
         for base in cls.__mro__:
             for title, names in vars(base).get("groups", {}).items():
                 if name in names:

@@ -22,7 +22,7 @@ def in_unit(value: Any, unit: str) -> Any:
     """Return a number, or numbers, of a text with a unit in ``unit``; other values as they are.
 
     Raises:
-        ValueError: the text has another unit than one that ``unit`` can be got from.
+        ValueError: the text has a unit that cannot be converted to ``unit``.
     """
     if isinstance(value, list):
         return [in_unit(item, unit) for item in value]

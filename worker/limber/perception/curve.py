@@ -106,7 +106,7 @@ class BentCurve:
     def jacobian(self) -> np.ndarray:
         """Derivative of the nodes [m] to a rotation step at the knots: [n, 3, knots, 3].
 
-        A turn d of a segment moves all nodes after it by d x (the segment's vector).
+        A rotation d of a segment moves all nodes after it by d x (the segment's vector).
         """
         steps = np.einsum("nij,nj->ni", self.turns, np.diff(self.rest.nodes, axis=0))
         cross = np.zeros((len(steps), 3, 3))

@@ -34,14 +34,14 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
             progress: Progress = SILENT) -> tuple[Observations, list[str]]:
     """Find the control points in every frame of a pull's clouds or depth images.
 
-    The gripper's pose tells where the branch is at the grasp; the first frame must show the
+    The gripper's pose gives the position of the branch at the grasp; the first frame must show the
     branch at rest: against it the camera's pose is checked and corrected.
 
     Args:
         folder: The pull's folder.
         pull: The pull; its robot stream and ``entry`` are used.
         skeleton: The branch at rest.
-        fractions: Places of the control points along its main path.
+        fractions: Positions of the control points along its main path.
         progress: Reports each frame.
 
     Returns:
@@ -102,7 +102,7 @@ def list_frames(folder: Path, kind: str) -> list[tuple[float, Path]]:
 
 
 def read_depth(path: Path, camera: Camera) -> np.ndarray:
-    """Read a 16-bit depth image into metres, shape [height, width]; 0 is no reading."""
+    """Read a 16-bit depth image into metres, shape [height, width]; 0 means no reading."""
     pixels = read_pixels(path, "a 16-bit depth image (PNG)")
     return (pixels if pixels.ndim == 2 else pixels[..., 0]) / camera.depth_scale
 

@@ -33,9 +33,9 @@ def with_noise(camera: Camera, depth: np.ndarray, rng: np.random.Generator, *,
         camera: Gives the noise of depth, sigma = disparity_sigma z^2 / (f b).
         depth: [m], 0 where nothing is seen.
         rng: Source of randomness.
-        flying_share: Share of the branch's pixels that fly off, taken from its silhouette.
+        flying_share: Fraction of the branch's pixels that fly off, taken from its silhouette.
         flying_reach_m: They lie up to so far behind the surface.
-        missing_share: Share of pixels without a reading.
+        missing_share: Fraction of pixels without a reading.
 
     Returns:
         Depth [m] quantised to the camera's ``depth_scale``.

@@ -37,7 +37,7 @@ class TrackedFrame:
         positions: On the branch's axis [m], shape [K, 3].
         covariance: [m^2], shape [K, 3, 3].
         visible: Whether the cloud shows the branch around each point, shape [K].
-        inlier_share: Share of the cloud's points that the curve explains.
+        inlier_share: Fraction of the cloud's points that the curve explains.
         curve: The fitted curve; the start for the next frame.
     """
 
@@ -50,7 +50,7 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class Anchor:
-    """A material point whose place is known: where the gripper holds.
+    """A material point with a known position: where the gripper holds.
 
     Attributes:
         arc: Arc length of the curve's point nearest to the grasp [m].
@@ -119,7 +119,7 @@ class CurveTracker:
 
 
 def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np.ndarray]:
-    """Find how a cloud of the branch at rest lies against its skeleton: the camera pose's error.
+    """Find the offset of a cloud of the branch at rest from its skeleton: the camera pose's error.
 
     Returns:
         Rotation matrix [3, 3] and translation [m], shape [3], that take the cloud onto the

@@ -1,8 +1,7 @@
-"""How well a cell is known: standard deviations of errors that stay through a recording.
+"""Calibration errors of a cell: standard deviations of errors constant over a recording.
 
-Noise averages out over frames; a gripper frame that lies a millimetre beside where it is thought
-to be does not. A fit takes these errors as unknowns, with the deviations given here as what is
-known of them beforehand.
+Noise averages out over frames; an error of a millimetre in the gripper's frame does not. A
+fit takes these errors as unknowns, with the deviations given here as their prior.
 """
 
 from typing import TYPE_CHECKING
@@ -70,5 +69,5 @@ that laying turned them."""
 
 
 def calibration_of(entry: "PullEntry") -> CalibrationEntry:
-    """What is known of a pull's cell; the defaults where its recording does not say."""
+    """Return the calibration of a pull's cell; the defaults if its recording does not state it."""
     return entry.calibration or CalibrationEntry()

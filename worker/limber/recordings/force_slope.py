@@ -39,7 +39,7 @@ class ForceSlope:
     """Stiffness seen by the actuator.
 
     Attributes:
-        slope: [N/m] over the loaded part of the way out.
+        slope: [N/m] over the loaded part of the outward path.
         interval: Its 95 % interval [N/m]; wide enough for residuals that follow each other.
         contact: Displacement at which force sets in [m], on the actuator's scale.
         contact_seen: Whether the recording starts before contact.
@@ -48,9 +48,9 @@ class ForceSlope:
         stiffening: Slope of the second half of the loaded part over that of the first, minus 1.
         slips: Displacements at which the force drops at once [m].
         slope_before_slip: [N/m] up to the first slip, or None where it does not slip.
-        return_slope: [N/m] of the way back, or None where there is none.
-        energy_lost: Share of the work of the way out that does not come back, or None.
-        warnings: What in the file is not as it should be.
+        return_slope: [N/m] of the return path, or None if there is none.
+        energy_lost: Fraction of the work of the outward path that is not returned, or None.
+        warnings: Problems found in the file.
     """
 
     slope: float
@@ -99,7 +99,7 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
 
 def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[str, ...] = (),
                 ) -> ForceSlope:
-    """Fit contact and slope of the way out, and the slope of the way back where there is one.
+    """Fit contact and slope of the outward path, and the slope of the return path if there is one.
 
     Contact is the bend of a constant followed by a line. The slope is that of a straight line
     through what lies over contact and the sensor's noise; its standard error allows for residuals

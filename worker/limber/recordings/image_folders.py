@@ -137,7 +137,7 @@ def _depth_images(source: Path, settings: Any) -> tuple[list[tuple[float, Path]]
 def tum_list(path: Path) -> list[tuple[float, str]]:
     """Read TUM's ``timestamp value...`` lists; lines with # are comments.
 
-    An unfinished last line is left out.
+    An incomplete last line is discarded.
 
     Raises:
         InputError: a line does not start with a time stamp.

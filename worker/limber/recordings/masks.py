@@ -28,8 +28,8 @@ def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
         far: Nothing farther [m].
         background: Depth without the branch [m]; pixels nearer by ``difference`` are foreground.
         difference: [m].
-        smallest_share: Pieces smaller than this share of the largest are dropped: flying pixels.
-            Not only the largest stays, since a hand or a leaf may cut a branch in two.
+        smallest_share: Pieces smaller than this fraction of the largest are discarded as
+            flying pixels. Other large pieces stay, since a hand or a leaf may cut a branch in two.
 
     Returns:
         True on the branch, shape [height, width]; all False where nothing is in range.

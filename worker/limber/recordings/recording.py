@@ -196,7 +196,7 @@ def read_entry(path: Path) -> PullEntry:
 
 
 def entry_of_text(text: str, where: str) -> PullEntry:
-    """Return what the text of a ``pull.toml`` says; ``where`` it stands is for messages.
+    """Return the entry of a ``pull.toml`` text; ``where`` names its source in messages.
 
     Raises:
         InputError: as :func:`read_entry`.
@@ -225,7 +225,7 @@ def write_entry(path: Path, entry: PullEntry) -> None:
 
 
 def entry_text(entry: PullEntry) -> str:
-    """Return the text of ``pull.toml``; entries that are None are left out, TOML has no null."""
+    """Return the text of ``pull.toml``; entries that are None are omitted: TOML has no null."""
     return tomlkit.dumps(_without_none(plain(entry)))
 
 

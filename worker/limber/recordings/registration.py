@@ -1,4 +1,4 @@
-"""Markers of a capture system onto their nominal places on the branch at rest."""
+"""Fit of a capture system's markers to their nominal positions on the branch at rest."""
 
 from dataclasses import dataclass
 from itertools import combinations, permutations
@@ -24,7 +24,7 @@ class Registration:
     Attributes:
         rotation: Shape [3, 3].
         shift: [m], shape [3].
-        used: Indices of the recording's markers that have a nominal place, shape [m].
+        used: Indices of the recording's markers that have a nominal position, shape [m].
         residual: Distance of each from it at rest [m], shape [m].
         warnings: What the user should know.
     """
@@ -47,7 +47,7 @@ class Registration:
 
 
 def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
-    """Read ``label,x_m,y_m,z_m`` (or another unit of length): labels and places [m], [m, 3].
+    """Read ``label,x_m,y_m,z_m`` (or another unit of length): labels, positions [m], [m, 3].
 
     Raises:
         InputError: the file cannot be read as that.
@@ -81,20 +81,20 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
 
 def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
              nominal: np.ndarray, name: str) -> Registration:
-    """Fit markers at rest rigidly onto their nominal places.
+    """Fit markers at rest rigidly to their nominal positions.
 
-    Markers are paired by name; where no name is shared and there are as many of both, by order,
-    or by the order that fits best. A marker far off is left out of the fit, if three others agree.
+    Markers are paired by name; if no name matches and both have the same number, by order,
+    or by the order that fits best. An outlier is excluded from the fit if three others agree.
 
     Args:
         points: At rest in the capture frame [m], shape [n, 3].
         labels: Of the recording's markers.
-        nominal_labels: Names in the table of nominal places.
-        nominal: Nominal places [m], shape [k, 3].
+        nominal_labels: Names in the table of nominal positions.
+        nominal: Nominal positions [m], shape [k, 3].
         name: Of the pull, for messages.
 
     Raises:
-        InputError: fewer than three markers in common, one that has a nominal place is missing,
+        InputError: fewer than three markers in common, one with a nominal position is missing,
             or they lie on a line, are mirrored, or are mistaken for each other.
     """
     pairs = [(k, j) for k, label in enumerate(labels) for j, known in enumerate(nominal_labels)

@@ -45,7 +45,7 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
     Args:
         path: The file.
         force_unit: Of the forces (torques: times metres); None takes the titles' own.
-        rate_hz: Samples a second where there is no column of times.
+        rate_hz: Samples per second, if there is no time column.
 
     Raises:
         InputError: the position of the gripper is missing.
@@ -70,7 +70,7 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
 
 
 def is_robot_table(titles: list[Title]) -> bool:
-    """Return whether columns tell a gripper's position and force, as a robot's log does."""
+    """Return whether the columns hold a gripper's position and force, as a robot's log does."""
     plain = {title.plain for title in titles}
     return all(plain & set(_ALIASES[name]) for name in (*POSE_COLUMNS[:3],
                                                              *WRENCH_COLUMNS[:3]))

@@ -49,7 +49,7 @@ def work_done(pull: Pull) -> np.ndarray:
 
 
 def force_unit_suspicion(young_pa: float) -> str | None:
-    """Say which unit the force may be in if the modulus that it implies cannot be.
+    """Return the likely unit of the force if the modulus that it implies is implausible.
 
     Args:
         young_pa: Young's modulus [Pa] that the measured work implies, forces taken as newtons.

@@ -35,12 +35,12 @@ _EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
 
 @dataclass
 class Table:
-    """A table as it stands in a file.
+    """A table as read from a file.
 
     Attributes:
         path: The file.
         titles: Of the columns, as written (a row of units below them is joined in brackets).
-        values: Shape [n, columns]; NaN where there is no number.
+        values: Shape [n, columns]; NaN in cells without a number.
         warnings: What was wrong.
     """
 
@@ -154,12 +154,12 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
 
 def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | None = None,
                   ) -> tuple[Stream, list[str]]:
-    """Read marker tracks: three columns a marker, named LABEL and x, y or z in any usual way.
+    """Read marker tracks: three columns per marker, named LABEL and x, y or z in any usual form.
 
     Args:
         path: The file.
         unit: Of the positions; None takes the titles' own, metres where they have none.
-        rate_hz: Frames a second where there is no column of times.
+        rate_hz: Frames per second, if there is no time column.
 
     Returns:
         Columns ``m0_x_m, m0_y_m, m0_z_m, ...`` [m], and the markers' labels.

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, told apart by their bytes, missed with a clear word."""
+"""Files: atomic writing, comparison by content, and a clear error for a missing file."""
 
 import hashlib
 import os

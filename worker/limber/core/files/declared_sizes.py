@@ -79,7 +79,7 @@ def check_las(path: Path) -> None:
     """Refuse a LAS or LAZ file that holds fewer points than its header announces.
 
     Raises:
-        InputError: it does, or it is no such file.
+        InputError: it does, or it is not such a file.
     """
     size = path.stat().st_size
     with open(path, "rb") as stream:

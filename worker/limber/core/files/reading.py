@@ -32,7 +32,7 @@ HARMLESS_BYTES = 256e6
 
 
 class FileContent(BaseModel):
-    """Content of a file as far as it is read: what else it says is passed over."""
+    """The part of a file's content that is read. Other entries are ignored."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
@@ -41,7 +41,7 @@ def read_text(path: str | os.PathLike, what: str) -> str:
     """Return a file's text (UTF-8, with or without a mark); ``what`` it should be, for errors.
 
     Raises:
-        InputError: it cannot be read, or is no text.
+        InputError: it cannot be read, or is not text.
     """
     try:
         return Path(path).read_text(encoding="utf-8-sig")
@@ -53,7 +53,7 @@ def read_json(path: str | os.PathLike, what: str) -> Any:
     """Return the content of a JSON file; all its numbers are finite.
 
     Raises:
-        InputError: it is none, or a number in it is not finite.
+        InputError: it is not JSON, or a number in it is not finite.
     """
     text = read_text(path, what)
     try:
@@ -66,7 +66,7 @@ def read_json_as(path: str | os.PathLike, kind: type[Content], what: str) -> Con
     """Return the content of a JSON file as ``kind``, any type that pydantic checks.
 
     Raises:
-        InputError: it is none, or not of that kind; says where.
+        InputError: it is not JSON, or not of that kind; names the position.
     """
     return checked_as(path, kind, read_json(path, what), what)
 
@@ -75,7 +75,7 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
     """Return what was read from ``path`` as ``kind``.
 
     Raises:
-        InputError: it is not of that kind; says where.
+        InputError: it is not of that kind; names the position.
     """
     try:
         return TypeAdapter(kind).validate_python(content)
@@ -95,7 +95,7 @@ def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dic
         finite: False where the caller refuses what is not finite itself, by its name and line.
 
     Raises:
-        InputError: it is none (the line is named), or a number in it is not finite.
+        InputError: it is not TOML (the line is named), or a number in it is not finite.
     """
     text = read_text(path, what)
     try:
@@ -157,7 +157,7 @@ def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], wh
     """Refuse arrays with numbers that are not finite.
 
     Raises:
-        InputError: there is one; names the array.
+        InputError: there is one; the message names the array.
     """
     for name, values in arrays.items():
         if values.dtype.kind in "fc" and not np.isfinite(values).all():
@@ -171,7 +171,7 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
     """Refuse arrays that are missing, no finite numbers, or of another shape.
 
     Args:
-        shapes: Name to shape; a letter stands for the same length wherever it stands.
+        shapes: Name to shape; a letter means the same length everywhere.
 
     Raises:
         InputError: names the first that does not fit.
@@ -197,7 +197,7 @@ def require_size(path: str | os.PathLike, announced: float, held: float, what: s
     """Refuse a file whose header announces more bytes than it holds, before memory is taken.
 
     Args:
-        announced: Bytes that so many ``what`` take at least.
+        announced: Least number of bytes that this many ``what`` take.
         held: Bytes that are there.
 
     Raises:

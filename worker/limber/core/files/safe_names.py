@@ -46,7 +46,7 @@ def inside(folder: Path, name: str) -> Path:
     """Return the path of ``name`` in ``folder``, whether it exists or not.
 
     Raises:
-        InputError: the name leads out of the folder, or a link is on the way.
+        InputError: the name points outside the folder, or its path contains a link.
     """
     path = Path(folder)
     for part in PurePosixPath(relative_name(name)).parts:

@@ -1,7 +1,7 @@
-"""Names of unfinished files that say which process they belong to, so that a dead one's can go.
+"""Names of temporary files. They identify their process, so that those of a dead one are removed.
 
-A name carries host, process id and the second in which that process started: a process id alone
-is given again.
+A name carries host, process id and the second in which that process started: the system
+reuses a process id.
 """
 
 import functools

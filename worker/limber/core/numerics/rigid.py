@@ -30,7 +30,7 @@ def rotation_angle(matrices: np.ndarray) -> np.ndarray:
 
 
 def rotated(vectors: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points [3] or [n, 3] turned by a rotation vector [rad], or each by its own."""
+    """Return points [3] or [n, 3] rotated by one rotation vector [rad], or each by its own."""
     return _rotations(vectors).apply(points)
 
 
@@ -50,7 +50,7 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def pose_between(first: np.ndarray, second: np.ndarray, part: float | np.ndarray) -> np.ndarray:
-    """Return poses at ``part`` of the way, on a straight line and the shortest rotation.
+    """Return poses at the fraction ``part`` of a straight line and the shortest rotation.
 
     Args:
         first, second: Poses, shape [6] or [n, 6].
@@ -63,7 +63,7 @@ def pose_between(first: np.ndarray, second: np.ndarray, part: float | np.ndarray
 
 
 def rotations_at(times: np.ndarray, vectors: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return rotation vectors [rad] at ``wanted`` times, by the shortest turns between given ones.
+    """Return rotation vectors [rad] at ``wanted`` times, along the shortest rotations.
 
     Args:
         times: Ascending, shape [n], n > 1.

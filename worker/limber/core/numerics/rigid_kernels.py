@@ -90,7 +90,7 @@ def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 @compiled
 def pose_between(first: np.ndarray, second: np.ndarray, part: float) -> np.ndarray:
-    """Return the pose at ``part`` of the way, on a straight line and the shortest rotation."""
+    """Return the pose at the fraction ``part`` of a straight line and the shortest rotation."""
     turn = np.zeros(6)
     turn[3:] = part * turn_between(first, second)
     turned = frame_of(turn) @ frame_of(first)

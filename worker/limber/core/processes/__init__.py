@@ -1,6 +1,6 @@
 """Processes: a pool for parts of a computation, stages as processes of their own, their end.
 
-It stands on nothing but errors and progress, so that every package may use it.
+It depends only on errors and progress, so that every package may use it.
 """
 
 from limber.core.processes.budget import core_budget, worker_count

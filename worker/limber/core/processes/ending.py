@@ -66,7 +66,7 @@ def _when_closed(handle: int, then: Callable[[], None]) -> None:
 
 
 def end_by_closing(process: subprocess.Popen, seconds: float = 5.0) -> None:
-    """Close a child's standard input, which tells it to end; kill it if it does not in time."""
+    """Close a child's standard input, which makes it end; kill it if it does not end in time."""
     if process.stdin is not None and not process.stdin.closed:
         try:
             process.stdin.close()

@@ -1,4 +1,4 @@
-"""A sign of life beside the progress: a worker that hangs is told from one that works.
+"""A heartbeat beside the progress: it distinguishes a worker that hangs from one that works.
 
 Work may be silent for long (one factorisation, a process that meshes). A thread says every few
 seconds ``{"alive": seconds, "cpu_s": seconds}``: how long the command runs, and how much its
@@ -18,10 +18,10 @@ INTERVAL_SECONDS = 2.0
 
 
 class Heartbeat:
-    """Tells ``say`` about this process while the ``with`` block runs.
+    """Reports this process to ``say`` while the ``with`` block runs.
 
     Args:
-        say: Gets the numbers, from another thread.
+        say: Receives the numbers, from another thread.
         interval_seconds: Between one and the next.
     """
 

@@ -9,7 +9,7 @@ from limber.core.processes.family import memory_mb
 
 @dataclass(frozen=True)
 class Limits:
-    """What a task may take; its process is killed when it goes over.
+    """Limits of a task; its process is killed when it exceeds them.
 
     Attributes:
         seconds: From its beginning, or None.

@@ -40,7 +40,7 @@ class Pool:
     """Processes that compute what they are given; close it, or use it in a ``with``.
 
     Args:
-        workers: How many processes; by default the core budget. Each gets its share of it.
+        workers: How many processes; by default the core budget, which they divide among them.
         begin: Called in each process before its first task.
         begin_arguments: For it.
         name: What is computed, for messages.
@@ -87,7 +87,7 @@ class Pool:
             tasks: Its arguments, once for each call.
             limits: Of each call.
             progress: Gets the mean of the calls' fractions, ``message``, how many are done, and
-                ``remaining_s`` once that can be told. Cancelling it stops all.
+                ``remaining_s`` once that is known. Cancelling it stops all.
             message: What is being done.
 
         Raises:
@@ -288,7 +288,7 @@ def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None
     Args:
         function: May take ``progress``.
         tasks: Its arguments, once for each call.
-        workers: At most so many processes; by default the core budget.
+        workers: Largest number of processes; by default the core budget.
         progress: Of all together.
         message: What is being done.
     """

@@ -77,7 +77,7 @@ def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) ->
     Args:
         pipe: Tasks come in, and None to cancel the one at work; progress and results go out.
         begin: What to call first, and its arguments.
-        cores: The share of the core budget that is ours.
+        cores: This process's part of the core budget.
     """
     # Ctrl-C reaches the whole group of processes; the parent ends this one in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

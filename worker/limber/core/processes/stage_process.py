@@ -54,7 +54,7 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
         progress: Gets what it reports.
         limits: What it may take.
         cores: How many of our cores it may use; all of them by default.
-        fix: What to do when it ends without a word.
+        fix: What to do when it ends without a result.
 
     Raises:
         LimberError: as :func:`run_stage`.

@@ -57,7 +57,7 @@ class Bag:
             to the topics that hold such messages.
         others: Topics with messages of other types, as ``topic (type)``.
         broken: Messages that could not be decoded.
-        pull_toml: What Limber says of the pull, where it wrote the bag; else empty.
+        pull_toml: Limber's description of the pull if Limber wrote the bag; else empty.
     """
 
     path: Path

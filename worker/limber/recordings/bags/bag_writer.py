@@ -27,7 +27,7 @@ _Message = tuple[float, str, str, Any]
 def write_mcap(path: Path, folder: Path, pull: Pull) -> dict[str, int]:
     """Write a pull and the frames in its folder; returns how many messages each topic has.
 
-    Times start at 0. Wrenches and poses that were not measured are left out.
+    Times start at 0. Wrenches and poses that were not measured are omitted.
 
     Raises:
         MissingDependencyError: the packages are not installed.

@@ -1,4 +1,4 @@
-"""Frames of reference in a bag: what its transforms say of where one lies in another."""
+"""Frames of reference in a bag: the pose of one in another, from its transforms."""
 
 from dataclasses import dataclass
 
@@ -63,7 +63,7 @@ class Frames:
 
     def between(self, frame: str, within: str, times: np.ndarray,
                 ) -> tuple[np.ndarray, Rotation] | None:
-        """Return position [n, 3] and turn of ``frame`` in ``within``; None if nothing says."""
+        """Return position [n, 3] and turn of ``frame`` in ``within``; None if it is not known."""
         way = self._way(within.lstrip("/"), frame.lstrip("/"))
         if way is None:
             return None

@@ -10,7 +10,7 @@ from limber.recordings.time_series import Stream
 
 
 def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return what a C3D file tells of its markers: ``points`` [3, m, n], rate, unit, labels.
+    """Return the markers of a C3D file: ``points`` [3, m, n], rate, unit, labels.
 
     Compiled code reads it, which a mangled file may abort.
     """
@@ -30,7 +30,7 @@ def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: objec
     """Return marker tracks [m] and labels of arrays as :func:`c3d_arrays` gives them.
 
     Raises:
-        InputError: there are no points, no times, or places that are not finite.
+        InputError: there are no points, no times, or positions that are not finite.
     """
     points, labels = data["points"], [str(label) for label in data["labels"]]
     if not points.size:

@@ -48,7 +48,7 @@ RECORDINGS = Registry("recording", "limber.recordings", [
 
 
 def kind_names() -> tuple[str, ...]:
-    """Return what a user may say a recording is."""
+    """Return the kinds of recording that a user may give."""
     return "auto", *(one.name for one in RECORDINGS)
 
 

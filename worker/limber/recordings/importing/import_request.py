@@ -41,7 +41,7 @@ class RobotKnown:
     Attributes:
         joint_poses: Where its gripper is by its joint angles.
         noise: Of its force sensor.
-        errors: What is left open of a recording of so many seconds.
+        errors: Calibration errors of a recording of this many seconds.
     """
 
     joint_poses: JointPoses
@@ -59,7 +59,7 @@ class ImportRequest:
         name: Of the pull.
         settings: How to read it.
         branch: What is known of the branch.
-        robot: What is known of the robot, where a cell says it.
+        robot: What is known of the robot, if a cell states it.
         progress: Called as it goes; gets what the user should know.
     """
 
@@ -73,7 +73,7 @@ class ImportRequest:
 
     @property
     def given(self) -> set[str]:
-        """What of the settings is not as it is without being asked for."""
+        """Names of the settings that differ from their defaults."""
         return {name for name, field in ImportSettings.model_fields.items()
                 if getattr(self.settings, name) != field.default}
 
@@ -91,7 +91,7 @@ class ImportRequest:
         return float(x), float(y), float(z)
 
     def registered(self, rest: np.ndarray, labels: list[str]) -> Registration | None:
-        """Return how markers [m, 3] are laid onto their places on the branch, if those are given.
+        """Return the fit of markers [m, 3] to their positions on the branch, if those are given.
         """
         if self.settings.nominal is None:
             return None
@@ -152,7 +152,8 @@ def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
 def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
     """Return the pull with what its robot's cell leaves open.
 
-    A pull that tells it stays as it is; without a cell it is said what is taken.
+    A pull that states its calibration stays as it is; without a cell the assumed values are
+    reported.
     """
     settings, robot = request.settings, request.robot
     if pull.entry.calibration is not None:

@@ -24,7 +24,7 @@ def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
     """Refuse what does not go together with a load.
 
     Raises:
-        InputError: no markers; two loads; nothing says where it hangs; or inertia counts.
+        InputError: no markers, two loads, a load without a position, or a dynamic pull.
     """
     settings = request.settings
     if chosen.holds != "markers":
@@ -48,7 +48,7 @@ def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
 
 
 def import_load(read: tuple[Stream, list[str]], request: ImportRequest) -> dict[str, Any]:
-    """Make a pull of marker tracks of a branch under a load, and say what it comes to."""
+    """Make a pull of marker tracks of a branch under a load, and return its numbers."""
     stream, labels = read
     for message in stream.warnings:
         request.progress.warn(message)
@@ -156,8 +156,9 @@ def _farthest(moved: np.ndarray) -> int:
 
 
 def against_load(moved: np.ndarray, load: np.ndarray) -> str:
-    """Say it where markers go against the load (displacements [m], load [N]); across it is well:
-    an upright branch gives way to a weight sideways.
+    """Return a warning if markers move against the load (displacements [m], load [N]), else "".
+
+    A motion across the load is plausible: an upright branch bends sideways under a weight.
     """
     size = np.linalg.norm(moved, axis=1)
     mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)

@@ -35,7 +35,7 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
         ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
     Raises:
-        InputError: the recording cannot be read as what it is said to be.
+        InputError: the recording cannot be read as its stated kind.
     """
     request.progress(0.1, f"reading {kind}")
     chosen, settings = recording_format(kind), request.settings
