@@ -1,4 +1,4 @@
-"""The file ``estimate.json``, read back: what the report and predictions take from it, checked."""
+"""Read ``estimate.json`` and check what the report and predictions take from it."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -133,12 +133,12 @@ class _Estimate(_Told):
 
 
 def read_estimate(path: Path) -> dict[str, Any]:
-    """Return the content of ``estimate.json``, checked: finite, and of one size throughout.
+    """Return the content of ``estimate.json`` after checking finite values and consistent sizes.
 
-    A number that was not measured is None there.
+    A number that was not measured is None.
 
     Raises:
-        InputError: it cannot be read, or is no estimate; says where.
+        InputError: the file cannot be read or is not an estimate. The message states the position.
     """
     content = read_json(path, "an estimate")
     checked_as(path, _Estimate, content, "an estimate")

@@ -1,4 +1,4 @@
-"""The branch that is estimated: its model, and where along it Young's modulus is asked for."""
+"""The branch that is estimated: its model and the control points of Young's modulus."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,10 +29,10 @@ class Subject:
         mesh: Its tetrahedra.
         skeleton: Its axes.
         control_points: [m], shape [K, 3].
-        weights: Young's modulus of the tetrahedra from the control points', [tet_count, K].
-        model: With the values to start from.
-        start: These values.
-        field: How the modulus runs between the control points; None: as the weights say.
+        weights: Map Young's modulus from the control points to the tetrahedra, [tet_count, K].
+        model: The model with the initial values.
+        start: The initial values.
+        field: Interpolation prior between the control points. None: the weights interpolate.
     """
 
     mesh: TetMesh
@@ -58,18 +58,18 @@ class Subject:
             young=self.young(values), poisson=values.poisson, density=values.density))
 
     def without_weight(self) -> "Subject":
-        """Return it as a branch without weight."""
+        """Return the same branch without weight."""
         return replace(self, model=self.model.with_parameters(gravity=(0.0, 0.0, 0.0)))
 
 
 def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
                gravity: tuple[float, float, float], settings: EstimateSettings) -> Subject:
-    """Return the branch of a mesh, its axes and the masses that hang on it; the start is uniform.
+    """Return the branch of a mesh, its axes and its point masses, with uniform initial moduli.
 
-    It hangs as it was scanned, whatever Young's modulus will come out.
+    Its rest shape is prestressed by gravity: the scanned shape holds for every Young's modulus.
 
     Raises:
-        InputError: a modulus of the mesh, to start from, is not positive.
+        InputError: an initial modulus of the mesh is not positive.
     """
     points = control_points(skeleton, settings.fractions)
     wrong = np.flatnonzero(~(mesh.cell_data["young"] > 0))

@@ -1,7 +1,7 @@
-"""Young's modulus along a branch from its pulls: where the fit starts, and how it is fitted.
+"""Fit Young's modulus along a branch to its pulls: initial values and fit.
 
-:mod:`limber.estimation.judgement` has what was found and how sure it is, what of it is written
-:mod:`limber.estimation.summary`.
+:mod:`limber.estimation.judgement` holds the result and its uncertainty.
+:mod:`limber.estimation.summary` selects what is written.
 """
 
 from collections.abc import Callable
@@ -51,13 +51,13 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     """Estimate Young's modulus of a branch from its pulls.
 
     Args:
-        log: Remembers evaluations; what a stopped run left there is taken over.
+        log: Stores the evaluations. Those of a stopped run are reused.
         cache: As for :func:`fit_pulls`.
 
     Raises:
-        InputError: pulls that cannot tell Young's modulus.
+        InputError: the pulls cannot determine Young's modulus.
         WorkError: the simulation finds no equilibrium.
-        Cancelled: stopped before the first step.
+        Cancelled: the user stopped the fit before its first step.
     """
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
@@ -121,10 +121,10 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
               progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
               ) -> Estimate:
-    """Judge what the data can tell, fit it, and say how sure the result is.
+    """Check what the data determine, fit the moduli, and compute their uncertainty.
 
     Args:
-        cache, digest: Where bases of reduced models are kept, and what they depend on; see
+        cache, digest: Folder of the reduced bases, and digest of what they depend on; see
             :class:`limber.estimation.fitting.reduced_fit.Reduction`.
     """
     require_scale_in_principle(objective.forwards)
@@ -266,10 +266,10 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
 
 
 def best_so_far(objective: Objective) -> Fit:
-    """Return the best of a stopped fit.
+    """Return the best evaluation of a stopped fit.
 
     Raises:
-        Cancelled: there is none.
+        Cancelled: there is no evaluation yet.
     """
     best = objective.log.best
     if best is None or len(best.parameters) != objective.space.size:

@@ -1,4 +1,4 @@
-"""From a branch and its pulls to what an optimiser needs."""
+"""Prepare a fit: forward simulations and free parameters of a branch and its pulls."""
 
 
 import numpy as np
@@ -22,7 +22,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
     """Make the forward simulation of each pull.
 
     Raises:
-        InputError: a pull has nothing that could be compared, or watches other points.
+        InputError: a pull has nothing to compare, or observes other points.
     """
     forwards = []
     for pull in pulls:
@@ -45,10 +45,10 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
 
 
 def require_scale_in_principle(forwards: list[Forward]) -> None:
-    """Refuse pulls of which no amount of data would give the scale of Young's modulus.
+    """Reject pulls that cannot determine the scale of Young's modulus.
 
     Raises:
-        InputError: all are pose-driven, slow, without gravity and without measured force.
+        InputError: all pulls are slow and pose-driven, without gravity or measured force.
     """
     for forward in forwards:
         entry = forward.entry
@@ -81,7 +81,7 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
 
 
 def is_watched(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
-    """Whether a slow pull's force leads and the gripper's recorded path is an observation.
+    """Whether a slow pull's force is prescribed and the gripper's recorded path is observed.
 
     So it is wherever the force was measured, of a clamped grasp the torque too, and the gripper's
     frame may be off. Without the force there is nothing else to lead but the path; it then counts
@@ -97,7 +97,7 @@ def is_watched(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> 
 
 def parameter_space(subject: Subject, forwards: list[Forward], settings: EstimateSettings,
                     ) -> ParameterSpace:
-    """What is free, and what is known beforehand of what is not asked for.
+    """Return the free parameters, with the priors of those that were not requested.
 
     Poisson's ratio, the density where weight or inertia acts, and the form of the field are free
     within their priors; asked for (``--fit-poisson``, ``--fit-density``), they are so without.

@@ -1,7 +1,7 @@
-"""The way a gripper goes in a virtual pull: where the branch goes when it is pulled sideways.
+"""Path of a gripper in a virtual pull: that of the branch when it is pulled sideways.
 
-Slow pulls follow that way once. Fast ones shake the branch along it, or pull and let go. A weight
-needs no way: it hangs.
+Slow pulls follow that path once. Fast ones shake the branch along it, or pull and release it. A
+hung weight needs no path.
 
 A path invented in space would compress a branch (it buckles) or stretch it (it tears): its length
 is fixed and nobody knows beforehand how it bends. A hand feels that and yields. Here the truth is
@@ -34,7 +34,7 @@ SHAKES = 2.0
 
 @dataclass(frozen=True)
 class MotionWanted:
-    """How a virtual gripper moves.
+    """Requested motion of a virtual gripper.
 
     Attributes:
         kind: ``pull`` (slow, the branch turns freely), ``turned`` (slow, held back in turning),
@@ -60,7 +60,7 @@ class MotionWanted:
 
 @dataclass(frozen=True)
 class MotionMade:
-    """What came of it, at each time.
+    """Resulting motion at each time.
 
     Attributes:
         poses: Of the grasp point [m, rad], shape [n, 6].
@@ -75,10 +75,10 @@ class MotionMade:
 
 def moved(model: BranchModel, grasp: Grasp, wanted: MotionWanted, *,
           progress: Progress = SILENT) -> MotionMade:
-    """Move a branch as wanted.
+    """Move a branch as requested.
 
     Raises:
-        WorkError: no force moves the grasp as far, or the motion cannot be followed.
+        WorkError: no force moves the grasp that far, or the motion cannot be computed.
     """
     count = len(wanted.times)
     if wanted.kind == "weight":
@@ -191,7 +191,7 @@ def _made(poses: np.ndarray, held: np.ndarray, forces: np.ndarray, torques: np.n
 
 def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: float,
                     ) -> np.ndarray:
-    """Return forces across ``axis`` that grow from 0 to 1 N and turn on the way, shape [n, 3].
+    """Return forces across ``axis`` that grow from 0 to 1 N while turning, shape [n, 3].
 
     Args:
         axis: From base to grasp, shape [3].

@@ -1,4 +1,4 @@
-"""Young's modulus between the control points: how it runs there is not known.
+"""Interpolation prior: Young's modulus between the control points is uncertain.
 
 The paper takes inverse-distance weights of the moduli. A modulus that runs straight between the
 control points, falls monotonically, or differs in side branches explains a pull as well, with
@@ -118,7 +118,7 @@ class YoungField:
 
 def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
                fractions: tuple[float, ...]) -> YoungField:
-    """Return the field whose form is not known; of a single modulus, the uniform one.
+    """Return the field with an unknown interpolation; for a single modulus, the uniform one.
 
     Args:
         fractions: Places of the control points on the main path, growing, shape [K].

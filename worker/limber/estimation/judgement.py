@@ -1,4 +1,4 @@
-"""What an estimate found, how well it explains the pulls, and how sure it is."""
+"""Result of an estimate, its fit to the pulls, and its uncertainty."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -48,18 +48,18 @@ WIDE = 0.15
 
 @dataclass
 class Estimate:
-    """What an estimate found.
+    """Result of an estimate.
 
     Attributes:
         fit: The optimiser's end.
-        objective: What it minimised; its parameter space tells what was linked.
+        objective: What it minimised. Its parameter space has the links.
         uncertainty: Covariance and intervals.
-        identifiability: Judged before the fit.
+        identifiability: Computed before the fit.
         warnings: What the user should know.
-        held_out: Per pull, how a fit that did not see it foretells it: RMS distance [m] and RMS
-            force error [N], also over the pull's own travel and peak force.
-        model_error: What residuals cannot show: of the branch's shape and of its mesh.
-        is_weightless: Whether the branch's weight was left out, since it could not carry it.
+        held_out: Per pull, the prediction of a fit without it: RMS distance [m] and RMS force
+            error [N], also relative to the pull's travel and peak force.
+        model_error: Errors of shape and mesh, which residuals do not show.
+        is_weightless: Whether the estimate ignores the weight because the branch cannot carry it.
     """
 
     fit: Fit
@@ -73,7 +73,7 @@ class Estimate:
 
     @property
     def stopped(self) -> bool:
-        """Whether it was stopped before its end."""
+        """Whether the user stopped it."""
         return self.fit.status is FitStatus.stopped
 
     @property
@@ -83,7 +83,7 @@ class Estimate:
 
     @property
     def deviations(self) -> dict[str, Any]:
-        """Relative standard deviations of the moduli by where they come from."""
+        """Relative standard deviations of the moduli by source."""
         groups = list(self.objective.space.groups)
         sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
         error = self.model_error
@@ -93,7 +93,7 @@ class Estimate:
 
     @property
     def young(self) -> np.ndarray:
-        """Of the material [Pa], shape [K]: without what the mesh is known to be too stiff by."""
+        """Young's modulus of the material [Pa], corrected for the mesh's excess stiffness, [K]."""
         return self.values.young * self.model_error.mesh_factor
 
     @property
@@ -105,7 +105,7 @@ class Estimate:
 
     @property
     def causes(self) -> dict[str, np.ndarray]:
-        """Variance of log E at the control points by where it comes from, each of shape [K]."""
+        """Variance of log E at the control points by cause, each of shape [K]."""
         sure = self.uncertainty
         parts = variance_parts(self.fit.evaluation, self.objective,
                                sure.variance_factor * sure.repetition)
@@ -123,7 +123,7 @@ class Estimate:
 
     @property
     def is_bad(self) -> str | None:
-        """Why there is no result to pass on; None: there is one."""
+        """Why the fit gives no valid result; None if it does."""
         space = self.objective.space
         bound = [name for name in space.on_bound(self.fit.evaluation.free)
                  if name not in {prior for prior, _, _ in space.priors}]
@@ -143,7 +143,7 @@ class Estimate:
 
 
 def judge_fit(found: Estimate, progress: Progress) -> None:
-    """Say how well the model fits, which errors of the cell it found, and which data are off."""
+    """Report the quality of the fit, the errors of the cell, and the outliers."""
     if found.uncertainty.variance_factor > MISFIT_FACTOR:
         progress.warn(
             f"The fit is poor: the residuals are {found.uncertainty.variance_factor**0.5:.1f} "
@@ -165,7 +165,7 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
 
 
 def hold_out(found: Estimate, settings: EstimateSettings) -> None:
-    """Score each pull by a fit that did not see it; enters ``found.held_out``."""
+    """Score the prediction of each pull by a fit without it, into ``found.held_out``."""
     for index, forward in enumerate(found.objective.forwards):
         rest = without(found.objective, index)
         fit = gauss_newton(rest, found.fit.evaluation.free, robust=settings.robust,
@@ -190,10 +190,10 @@ def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> 
 
 
 def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSettings) -> None:
-    """Score a pull that the estimate was not asked to use; enters ``found.held_out``.
+    """Score the prediction of a pull that the estimate does not use, into ``found.held_out``.
 
     Raises:
-        LimberError: it has nothing that could be compared.
+        LimberError: the pull has nothing to compare.
     """
     forward = forwards_of([pull], subject, settings)
     alone = Objective(forward, found.objective.space,
@@ -203,7 +203,7 @@ def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSe
 
 
 def require_result(found: Estimate) -> None:
-    """Refuse a fit that ended at no result.
+    """Reject a fit without a valid result.
 
     Raises:
         WorkError: with the reason.
@@ -219,10 +219,10 @@ def require_result(found: Estimate) -> None:
 def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,
                 *, axes: Path | None, cloud: np.ndarray | None,
                 progress: Progress = SILENT) -> None:
-    """Find what residuals cannot show of an estimate: errors of the branch's shape and mesh.
+    """Compute the errors of shape and mesh, which residuals do not show.
 
     Args:
-        axes: The table of cylinders that were fitted to the scan, or None.
+        axes: Table of the cylinders fitted to the scan, or None.
         cloud: The scan's points [m], shape [n, 3], or None.
     """
     subject = subject.without_weight() if found.is_weightless else subject

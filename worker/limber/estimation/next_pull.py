@@ -1,4 +1,4 @@
-"""What a pull that nobody has made yet would tell of Young's modulus, and what it would risk.
+"""Expected information on Young's modulus from a future pull, and its risk.
 
 The pull is made on the branch as it is estimated, without noise, and put into the very problem that
 a fit would solve: its derivatives, with errors of cell and sensors eliminated, are the information
@@ -71,7 +71,7 @@ class Known:
 
     @classmethod
     def estimated(cls, found: dict[str, Any]) -> "Known":
-        """What the content of an ``estimate.json`` tells; nothing without finite intervals."""
+        """Return the knowledge in an ``estimate.json``; none without finite intervals."""
         groups = list(found["groups"])
         form = [k for k, name in enumerate(found["parameters"]) if name.startswith("form")]
         wanted, count = groups + form, len(groups)
@@ -99,14 +99,14 @@ class Known:
         return replace(self, measured=0.5 * (measured + measured.T))
 
     def gain(self, after: "Known") -> float:
-        """Return by how many bits ``after`` says more."""
+        """Return the information gain of ``after`` in bits."""
         return 0.5 * float(np.linalg.slogdet(self.total)[1]
                            - np.linalg.slogdet(after.total)[1]) / np.log(2.0)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What a pull would be measured with, and in how many frames."""
+    """Sensors, calibration and number of frames of a future pull."""
 
     sensor: SensorEntry = SensorEntry()  # noqa: RUF009 (frozen)
     calibration: CalibrationEntry = CalibrationEntry()  # noqa: RUF009 (frozen)
@@ -124,7 +124,7 @@ class Cell:
                    len(seen.times) if seen is not None and is_alike else _RECORDED_FRAMES)
 
     def in_frames(self, count: int) -> "Cell":
-        """Return the cell in which ``count`` frames tell as much as all of this one's.
+        """Return the cell in which ``count`` frames hold the information of all of this one's.
 
         What varies from frame to frame averages out; what stays through a recording does not.
         """
@@ -140,8 +140,8 @@ class Cell:
 
 @dataclass(frozen=True)
 class PullChoice:
-    """A pull to think of: its place on the main path, the direction in which it starts [rad], and
-    its travel over the arc length."""
+    """A candidate pull: its position on the main path, its initial direction [rad], and its
+    travel over the arc length."""
 
     fraction: float
     phase: float
@@ -150,7 +150,7 @@ class PullChoice:
 
 @dataclass(frozen=True)
 class ExpectedPull:
-    """What comes of it.
+    """Expected result of a candidate pull.
 
     Attributes:
         choice: Which pull.
@@ -172,13 +172,13 @@ class ExpectedPull:
 
     @property
     def bits_per_percent(self) -> float:
-        """What it tells for each percent of strain."""
+        """Information for each percent of strain."""
         return self.bits / (100.0 * self.peak_strain)
 
 
 @dataclass(frozen=True)
 class Suggested:
-    """Pulls, the best first; those that would strain or pull too much; and how many cannot be."""
+    """Pulls, best first; those that exceed a limit; and the number of impossible ones."""
 
     pulls: list[ExpectedPull]
     too_much: list[ExpectedPull]
@@ -188,7 +188,7 @@ class Suggested:
 def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
             fractions: tuple[float, ...], *, max_strain: float, max_force: float = np.inf,
             workers: int | None = None, progress: Progress = SILENT) -> Suggested:
-    """Return pulls by what they tell for each percent of strain.
+    """Return pulls in the order of their information for each percent of strain.
 
     Places and directions are compared at one travel; for the best of them others are tried.
 
@@ -238,7 +238,7 @@ def _tried(choice: PullChoice, subject: Subject, values: Values, known: Known, c
 
 def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: Known,
                   cell: Cell) -> ExpectedPull:
-    """Make a pull on the branch as it is thought to be, and see what it tells.
+    """Simulate a pull on the branch as estimated, and return its information.
 
     Raises:
         WorkError: the branch cannot be pulled so.

@@ -1,4 +1,4 @@
-"""What is estimated, and the vector that an optimiser sees."""
+"""The estimated parameters and the free vector of the optimiser."""
 
 from dataclasses import dataclass, replace
 
@@ -35,13 +35,13 @@ class Values:
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """Which of the values are free, and which control points share one modulus.
+    """The free parameters, and the control points that share one modulus.
 
     The free vector holds log E of each group, then the form of the field, Poisson's ratio, log
     density, log alpha and log beta as far as they are free.
 
     Attributes:
-        base: Values of what is not free, and the start of what is.
+        base: Values of the fixed parameters, and initial values of the free ones.
         groups: Group of each control point, shape [K]; groups are numbered from 0.
         extra: Free ones: all that describe the form, named "form ...", or none; then out of
             "poisson", "density", "alpha", "beta", in this order.
@@ -143,7 +143,7 @@ class ParameterSpace:
         return replace(self, links=links)
 
     def on_bound(self, free: np.ndarray, share: float = 1e-3) -> list[str]:
-        """Names of free values that lie on a bound."""
+        """Names of the free values at a bound."""
         lower, upper = self.bounds()
         width = share * (upper - lower)
         at = (free <= lower + width) | (free >= upper - width)

@@ -1,4 +1,4 @@
-"""What a branch of an estimated modulus does under another load: where its points come to rest."""
+"""Equilibrium of a branch with estimated moduli under another load."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,10 +17,10 @@ from limber.recordings.synchronisation import Frames
 
 
 def require_one_load(settings: PredictSettings) -> None:
-    """Refuse no load, or two.
+    """Require exactly one load.
 
     Raises:
-        InputError: there is not one.
+        InputError: there is no load, or there are two.
     """
     if (settings.weight is None) == (settings.load is None):
         raise InputError("A prediction needs exactly one load.",

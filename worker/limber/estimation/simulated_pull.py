@@ -1,4 +1,4 @@
-"""Simulated pulls with a known Young's modulus and sensor noise, where no robot has been.
+"""Simulated pulls with a known Young's modulus and sensor noise, without a robot.
 
 The truth lives on another mesh than the fit: finer, swept along the axes, of the true geometry
 where the branch was generated. What is known of it goes into ``pull.toml`` under ``truth``, so
@@ -51,7 +51,7 @@ DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 
 @dataclass(frozen=True)
 class TrueBranch:
-    """What a virtual pull is made with.
+    """The branch of a virtual pull.
 
     Attributes:
         mesh: With point data ``fixed``.
@@ -125,7 +125,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     """Pull the true branch and measure it; returns the pull and the true displacements [m].
 
     Raises:
-        InputError: settings that do not go together. WorkError: the branch cannot be pulled so.
+        InputError: the settings contradict each other. WorkError: the pull is impossible.
     """
     rng = np.random.default_rng(settings.seed)
     model = _model(truth, settings, progress)
@@ -210,7 +210,7 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool
 
 def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, displacements: list[np.ndarray],
                         settings: VirtualPullSettings) -> None:
-    """Write what a D455 would see of a pull's states: ``depth/`` and ``camera.toml``."""
+    """Write simulated D455 depth images of a pull: ``depth/`` and ``camera.toml``."""
     camera = viewing(truth.mesh.nodes, displacements)
     write_camera(folder / "camera.toml", camera)
     (folder / "depth").mkdir(exist_ok=True)

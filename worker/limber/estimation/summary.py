@@ -1,4 +1,4 @@
-"""What an estimate writes: the stage's result, and the whole of ``estimate.json``."""
+"""What an estimate writes: the result of the stage and ``estimate.json``."""
 
 from typing import Any
 
@@ -47,7 +47,7 @@ def _reduced_error(found: Estimate) -> dict[str, Any]:
 
 
 def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, Any]:
-    """Return what ``estimate.json`` has beside the summary."""
+    """Return the content of ``estimate.json`` beside the summary."""
     evaluation, objective = found.fit.evaluation, found.objective
     told: dict[str, Any] = {
         "control_points_m": subject.control_points,

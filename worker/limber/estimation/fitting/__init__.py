@@ -1,1 +1,1 @@
-"""What an optimiser minimises, and the optimisers."""
+"""Objective and optimisers."""

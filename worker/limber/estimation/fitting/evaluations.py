@@ -1,4 +1,4 @@
-"""Every forward simulation of an estimate, kept as it happens: a stopped estimate resumes."""
+"""Log of all forward simulations of an estimate, from which a stopped estimate resumes."""
 
 import json
 import time
@@ -21,7 +21,7 @@ class EvaluationEntry:
 
 
 class EvaluationLog:
-    """Appends a JSON line an evaluation; reads what an earlier run of the same problem left.
+    """Appends one JSON line per evaluation, and reads those of an earlier run.
 
     The first line names the problem by a digest: of another problem nothing is taken over.
     """
@@ -43,11 +43,11 @@ class EvaluationLog:
         return min(found, key=lambda entry: entry.objective, default=None)
 
     def find(self, parameters: np.ndarray) -> EvaluationEntry | None:
-        """Return an earlier run's entry of exactly these parameters."""
+        """Return the entry of an earlier run with exactly these parameters."""
         return self._known.get(_key(parameters))
 
     def add(self, parameters: np.ndarray, objective: float, loss: float) -> None:
-        """Keep an evaluation; the line is on the disk before this returns."""
+        """Add an evaluation. Its line is on disk when this returns."""
         entry = EvaluationEntry(tuple(float(x) for x in parameters), float(objective),
                                 float(loss), round(time.perf_counter() - self._started, 4))
         self.entries.append(entry)
@@ -56,7 +56,7 @@ class EvaluationLog:
                 stream.write(json.dumps(entry.__dict__) + "\n")
 
     def forget(self) -> None:
-        """Remove the file: the estimate is done."""
+        """Remove the file after the estimate."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 

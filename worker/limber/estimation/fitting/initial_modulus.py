@@ -1,4 +1,4 @@
-"""Where a fit starts: the uniform modulus that explains the measured force best."""
+"""Initial values of a fit: the uniform modulus that explains the measured force best."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Errors of cell and sensors as unknowns of a fit: what each does to what is measured.
+"""Errors of cell and sensors as unknowns of a fit, and their effect on the measurements.
 
 Gripper frame, zero and gain of the force, camera frame, clock and slip of the grasp all stay
 through a recording; taken as exact, they end up in the moduli (1 mm of the gripper's pose: over
@@ -34,13 +34,13 @@ at moduli that were five times too high with narrow intervals."""
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One error that stays through a recording.
+    """One error that is constant during a recording.
 
     Attributes:
-        name: In words, such as "gripper place x".
+        name: In words, such as "gripper position x".
         unit: "m", "rad", "N", "N m", "s" or "" (relative).
-        sigma: Its standard deviation beforehand, in that unit.
-        pull: Whose it is; None: of the cell, alike in all pulls of the same calibration.
+        sigma: Its prior standard deviation, in that unit.
+        pull: The pull that has it. None: the cell has it in all pulls of one calibration.
     """
 
     name: str
@@ -68,12 +68,12 @@ class ErrorSlopes:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What a fit says of the errors, for given values of its free vector.
+    """Estimated errors for given values of the free vector.
 
     Attributes:
         values: In units of their deviations, shape [k].
-        covariance: Of these, the free vector held, shape [k, k].
-        gain: How they follow the free vector, shape [k, p]; None without derivatives.
+        covariance: Of these for a fixed free vector, shape [k, k].
+        gain: Their derivative to the free vector, shape [k, p]; None without derivatives.
     """
 
     values: np.ndarray
@@ -81,7 +81,7 @@ class Eliminated:
     gain: np.ndarray | None
 
     def total_covariance(self, free: np.ndarray) -> np.ndarray:
-        """With the covariance of the free vector, shape [p, p], in it."""
+        """Covariance that includes that of the free vector, shape [p, p]."""
         if self.gain is None:
             return self.covariance
         return self.covariance + self.gain @ free @ self.gain.T
@@ -89,7 +89,7 @@ class Eliminated:
 
 def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray | None, Eliminated]:
-    """Take out of residuals what k errors of unit deviation would explain.
+    """Eliminate k errors of unit standard deviation from the residuals.
 
     Args:
         residual: Standardised, shape [r].
@@ -97,8 +97,7 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
         columns: To the errors, shape [r, k].
 
     Returns:
-        Residual [r + k] and Jacobian [r + k, p] with the rows of what was known beforehand, and
-        the errors.
+        Residual [r + k] and Jacobian [r + k, p] with the rows of the priors, and the errors.
     """
     count = columns.shape[1]
     basis, triangle = np.linalg.qr(np.vstack([columns, np.eye(count)]))
@@ -139,12 +138,12 @@ class _Pull:
 
     @property
     def grip_axis(self) -> np.ndarray:
-        """Direction of the branch at the grasp, shape [f, 3]; of a pull whose path is watched."""
+        """Direction of the branch at the grasp, shape [f, 3]; only if the path is observed."""
         return present(self.tangent, "direction of the branch at the grasp")
 
     @property
     def share(self) -> np.ndarray:
-        """Part of the recording's time, shape [f]."""
+        """Elapsed fraction of the recording's duration, shape [f]."""
         since = self.frames.times - self.frames.times[0]
         return since / max(float(since[-1]), 1e-12)
 
@@ -266,7 +265,7 @@ def _late(pull: _Pull) -> dict[str, np.ndarray]:
 
 
 def told(nuisances: Sequence[Nuisance], found: Eliminated, free: np.ndarray) -> list[dict]:
-    """Each error with its value, 95 % interval and deviation beforehand, in its own unit.
+    """Return each error with its value, 95 % interval and prior deviation, in its own unit.
 
     Args:
         nuisances: As eliminated.
@@ -286,14 +285,14 @@ def told(nuisances: Sequence[Nuisance], found: Eliminated, free: np.ndarray) -> 
 
 
 def in_words(listed: Sequence[dict]) -> list[str]:
-    """A sentence for each error that explains what would be a misfit, largest first."""
+    """Return a sentence for each error without which the fit would be poor, largest first."""
     named = sorted((each for each in listed if each["explains_misfit"]),
                    key=lambda each: -abs(each["value"] / each["prior_sigma"]))
     return [_sentence(each) for each in named]
 
 
 def unlikely(listed: Sequence[dict]) -> str | None:
-    """Return in words the error that is far beyond what the cell states, if there is one."""
+    """Return a sentence on the error that far exceeds its stated deviation, or None."""
     def deviations(each: dict) -> float:
         return abs(each["value"]) / each["prior_sigma"]
 

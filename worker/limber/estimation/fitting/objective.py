@@ -1,4 +1,4 @@
-"""What an optimiser minimises: differences of simulated and measured, each over its deviation."""
+"""The objective: differences of simulation and measurement over their standard deviations."""
 
 import copy
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ SETTLED_FORCE_M = 5e-4
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All pulls under one free vector.
+    """All pulls simulated with one free vector.
 
     Attributes:
         free: Shape [p].
@@ -68,7 +68,7 @@ class Evaluation:
         """The Jacobian of an evaluation with derivatives, shape [r, p].
 
         Raises:
-            ValueError: it was made without them.
+            ValueError: the evaluation has no derivatives.
         """
         return present(self.jacobian, "derivative of this evaluation")
 
@@ -100,11 +100,11 @@ class RawSlopes:
 
 
 class Stopped(Cancelled):
-    """The optimiser was stopped; the evaluation log has the best so far."""
+    """The user stopped the optimiser. The evaluation log has the best result so far."""
 
 
 class Objective:
-    """Evaluates free vectors, counts forward simulations and keeps each in a log."""
+    """Evaluates free vectors, counts forward simulations and logs each one."""
 
     def __init__(self, forwards: list[Forward], space: ParameterSpace, *,
                  log: EvaluationLog | None = None, force_sigma: list[float] | None = None,
@@ -146,7 +146,7 @@ class Objective:
         self._last = None
 
     def evaluate(self, free: np.ndarray, *, jacobian: bool = False) -> Evaluation | None:
-        """Simulate all pulls; None where one finds no equilibrium.
+        """Simulate all pulls. Return None if one has no equilibrium.
 
         Raises:
             Stopped: by Ctrl-C or the progress' cancel.

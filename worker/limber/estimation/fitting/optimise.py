@@ -54,9 +54,9 @@ class Fit:
     """Where an optimiser ended.
 
     Attributes:
-        evaluation: The best one, with derivatives where they were asked for.
+        evaluation: The best one, with derivatives if they were requested.
         status: How it ended.
-        reason: Why, in words with numbers.
+        reason: Why it ended, as text with numbers.
     """
 
     evaluation: Evaluation
@@ -78,13 +78,13 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         start: Free vector.
         robust: Residuals beyond ``OUTLYING`` count linearly (``soft_l1``), so that an outlier
             cannot pull the fit.
-        evaluation_limit: At most so many forward simulations.
-        tolerance: Relative change of cost that ends it.
-        is_near: Whether the start is next to the solution already.
-        force_rounds: How often the course of a measured input force is linearised anew at most.
+        evaluation_limit: Largest number of forward simulations.
+        tolerance: Relative change of the cost at which the fit ends.
+        is_near: Whether the start is close to the solution.
+        force_rounds: Largest number of linearisations of a measured input force.
 
     Raises:
-        WorkError: no equilibrium at the start.
+        WorkError: the start has no equilibrium.
     """
     # Far from the solution all residuals are large, and a robust loss would only slow the way.
     phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]

@@ -1,4 +1,4 @@
-"""A fit on the reduced model that ends where the full model's would.
+"""Fit with the reduced model, corrected so that it ends at the full model's solution.
 
 A basis made for any grasp and any Young's modulus is good nowhere in particular: moduli found with
 it were off by up to 14 %. Here it is made for one branch and grasp, from the first pull's own poses
@@ -68,7 +68,7 @@ class Reduction:
         digest: Of what else a basis depends on, beside branch and grasp.
 
     Raises:
-        InputError: a pull is driven by force or dynamic.
+        InputError: a pull is force-driven or dynamic.
     """
 
     def __init__(self, forwards: list[Forward], cache: Path | None = None, digest: str = ""):

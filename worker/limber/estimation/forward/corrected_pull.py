@@ -1,4 +1,4 @@
-"""A slow pull on a reduced model, corrected by what the full model says of its error."""
+"""A slow pull on a reduced model, corrected by its error against the full model."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class _Correction:
 
 
 class CorrectedForward(Forward):
-    """A reduced forward plus what the full model said of its error."""
+    """A reduced forward simulation with a correction from the full model."""
 
     def __init__(self, full: QuasiStaticForward, reduced: ReducedForward):
         super().__init__(full.name, full.entry, full.frames, full.rest_points)
@@ -33,7 +33,7 @@ class CorrectedForward(Forward):
         self._correction: _Correction | None = None
 
     def correct(self, values: Values, extra: tuple[str, ...]) -> bool:
-        """Measure the reduced model's error at ``values``; whether both models have an answer."""
+        """Measure the reduced model's error at ``values``. Return whether both models converged."""
         rough = self.reduced.simulate(values, extra, True)
         if rough is None:
             return False

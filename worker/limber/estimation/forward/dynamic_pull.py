@@ -1,4 +1,4 @@
-"""A fast pull, simulated in time: inertia, damping and what swings on after the gripper stops."""
+"""A fast pull, simulated over time with inertia and damping."""
 
 from dataclasses import replace
 
@@ -25,8 +25,8 @@ from limber.recordings.synchronisation import Frames
 class DynamicForward(Forward):
     """Simulates one pull by Newmark steps.
 
-    Arguments as for :class:`limber.estimation.forward.quasi_static.QuasiStaticForward`. Every frame
-    counts, none is thinned: motion has no shortcuts.
+    Arguments as for :class:`limber.estimation.forward.quasi_static.QuasiStaticForward`. Every
+    frame is simulated.
     """
 
     is_dynamic = True
@@ -99,8 +99,8 @@ class DynamicForward(Forward):
     def until(self, count: int) -> "DynamicForward":
         """Return the first ``count`` frames, driven by force where that is known.
 
-        Led along a path, a branch of wrong moduli is stretched, and its force is thousandfold;
-        by a force it is merely moved too far.
+        With a prescribed path, wrong moduli stretch the branch and give a thousandfold force. With
+        a prescribed force, the branch merely moves too far.
         """
         name, model, weights, entry = self._arguments
         measured = np.isfinite(self.frames.wrenches[:, :3]).all()

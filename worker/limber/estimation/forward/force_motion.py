@@ -1,4 +1,4 @@
-"""What errors of a measured force do to a motion that it drives.
+"""Effect of errors of a measured force on the motion that it drives.
 
 The change of a motion by a small change of its force is that of a linear system. Its slowest
 modes carry nearly all of it, the others follow as if there were no inertia. The modes are those
@@ -20,7 +20,7 @@ ITERATIONS = 8
 
 def motion_response(model: BranchModel, loads: np.ndarray, observed: object, times: np.ndarray,
                     ) -> np.ndarray:
-    """Change of observed points along a motion by the force at each frame.
+    """Return the change of observed points during a motion by the force at each frame.
 
     Args:
         model: The branch, with its damping.

@@ -1,4 +1,4 @@
-"""What every forward simulation of a pull has, whatever model it runs on."""
+"""Interface of all forward simulations of a pull."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -42,8 +42,8 @@ class Simulated:
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
     """Return the model with the weight that acted in a pull.
 
-    As a rule the branch hung as it was scanned, and ``model`` does so already. A shape that was
-    drawn, not scanned, is bent by the pull's own gravity; a simulated pull may have had none.
+    Usually the scanned shape is prestressed by gravity, as in ``model``. The gravity of the pull
+    bends a shape that was drawn. A simulated pull may have no gravity.
     """
     if entry.gravity_m_s2 is not None:
         return model.with_parameters(gravity=entry.gravity_m_s2)
@@ -80,22 +80,22 @@ class Forward(ABC):
     @abstractmethod
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        """Return the pull under ``values``; None where it finds no equilibrium or motion.
+        """Return the pull under ``values``. None: it finds no equilibrium or motion.
 
         Args:
             values: The physical parameters.
-            extra: Which parameters beside Young's modulus derivatives are wanted to.
-            sensitivities: Whether derivatives are wanted at all.
+            extra: Parameters of the derivatives beside Young's modulus.
+            sensitivities: Whether to compute derivatives.
         """
 
     @property
     def drive(self) -> str:
-        """What leads the simulation: ``pose`` or ``force``."""
+        """What is prescribed: ``pose`` or ``force``."""
         return self.entry.drive
 
     @property
     def watches_pose(self) -> bool:
-        """Whether the gripper's recorded path is an observation, and the force an unknown."""
+        """Whether the gripper's recorded path is observed and the force is an unknown."""
         return False
 
     @property
@@ -105,7 +105,7 @@ class Forward(ABC):
 
     @property
     def pose_sigma(self) -> float:
-        """Of a recorded place of the gripper, beside what all of them have in common [m]."""
+        """Standard deviation of a recorded gripper position, without the common error [m]."""
         return calibration_of(self.entry).pose_noise_m
 
     @property
@@ -115,12 +115,12 @@ class Forward(ABC):
 
     @property
     def full(self) -> "Forward":
-        """The forward on the full model that this one stands for."""
+        """The corresponding forward simulation with the full model."""
         return self
 
     @property
     def has_force_unknowns(self) -> bool:
-        """Whether a measured force, with its errors, drives."""
+        """Whether a measured force with errors is prescribed."""
         return False
 
     @property
@@ -131,7 +131,7 @@ class Forward(ABC):
         return None
 
     def shift_force(self, change: np.ndarray) -> None:
-        """Move the force by what a fit says of it; linearise anew from there on.
+        """Change the force as a fit states, and linearise at the new force.
 
         Args:
             change: Of the unknowns, in the order of the response's columns, shape [L].
@@ -139,17 +139,17 @@ class Forward(ABC):
         raise NotImplementedError(f"{type(self).__name__} is not driven by a measured force.")
 
     def under_readings(self, simulated: Simulated) -> Simulated:
-        """Foretell a pull from its force's readings alone, without what its points say of it."""
+        """Predict a pull from its force readings alone, without its observed points."""
         return simulated
 
     def force_ratio(self, values: Values) -> float | None:
         """Measured force over the one that moves a branch of these ``values`` as far; None where
-        the pull does not tell it, or not by one solution.
+        the pull does not determine it, or not with one solution.
         """
         return None
 
     def thinning_error(self, values: Values) -> float:
-        """Largest distance [m] between what is simulated and what is interpolated in between."""
+        """Largest distance [m] between simulated and interpolated frames."""
         return 0.0
 
     def refine(self) -> None:
@@ -164,7 +164,7 @@ class Forward(ABC):
                                   "poses.")
 
     def until(self, count: int) -> "Forward":
-        """Return what a first fit is to see of a pull that is fitted part by part: the first
+        """Return the part of a pull that the first of several fits uses: the first
         ``count`` frames of a dynamic pull, all of a slow one.
         """
         return self

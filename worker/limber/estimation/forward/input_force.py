@@ -1,4 +1,4 @@
-"""The force that drives a simulation was measured, with errors: they are unknowns of the fit.
+"""Errors of the measured force that drives a simulation, as unknowns of the fit.
 
 Taken as exact, an error of the force becomes an error of all points of its frame at once, many
 times their own noise and all in one direction: a fit then bends the moduli to follow it. Here the
@@ -32,7 +32,7 @@ CLIPPED = 4.0
 
 @dataclass(frozen=True)
 class Response:
-    """How a simulated pull answers to its L unknowns of force, at the place of linearisation.
+    """Response of a simulated pull to its L force unknowns, at the point of linearisation.
 
     Attributes:
         points: Of the observed points [m per N], shape [f, m, 3, L].
@@ -48,13 +48,13 @@ class Response:
 
 @dataclass(frozen=True)
 class Course:
-    """Force, and torque of a clamped grasp, over time.
+    """Force over time, and torque of a clamped grasp.
 
     Attributes:
         keys: Key frames, shape [k].
         spread: Values at all frames from those at the key frames, shape [f, k].
         values: At the key frames [N, N m], shape [k, c].
-        exact: Whether it is a stated load, not a reading: it has no unknowns.
+        exact: Whether it is a stated load, not a reading. It then has no unknowns.
     """
 
     keys: np.ndarray
@@ -64,15 +64,15 @@ class Course:
 
 
 def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
-    """Lay a smooth course through the readings of the force.
+    """Fit a smooth course to the readings of the force.
 
     A noisy force is not a path; time orders the frames. Where ``count`` key frames cannot follow
     the readings to within their noise, there are more.
 
     Args:
-        frames: With some readings missing, perhaps.
+        frames: Readings may be missing.
         sigma: Deviation of each reading [N, N m], shape [f, c].
-        count: Key frames wanted.
+        count: Requested number of key frames.
         components: c: 3 for the force, 6 with the torque.
     """
     readings = frames.wrenches[:, :components]

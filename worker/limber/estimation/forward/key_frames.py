@@ -1,4 +1,4 @@
-"""Simulate a few frames of a slow pull, know all of them.
+"""Simulate a few frames of a slow pull and interpolate the others.
 
 Without inertia a branch's state depends on the gripper's pose (or force) alone, and smoothly so.
 A few states along the path and a cubic spline through them give the others, at a small part of
@@ -30,11 +30,11 @@ def travel(poses: np.ndarray, step_m: float = 5e-4) -> np.ndarray:
 
 
 def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose frames to simulate, and how all frames follow from them.
+    """Choose the frames to simulate, and the interpolation of all frames.
 
     Args:
         along: A parameter that grows along the path, shape [n].
-        count: How many to simulate at most.
+        count: Largest number of frames to simulate.
 
     Returns:
         Indices of the key frames, shape [k], and S, shape [n, k]: values at all frames are
@@ -54,12 +54,12 @@ def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(times: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Noisy measurements at some instants, each by a quadratic through its neighbourhood.
+    """Return noisy measurements at some instants, each from a local quadratic fit.
 
     Args:
         times: [s], shape [n].
-        values: Shape [n, c]; rows with NaN are left out.
-        places: Instants wanted [s], shape [k].
+        values: Shape [n, c]; rows with NaN are discarded.
+        places: Requested instants [s], shape [k].
     """
     known = np.isfinite(values).all(axis=1)
     times, values = times[known], values[known]

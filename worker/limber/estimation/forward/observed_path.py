@@ -1,4 +1,4 @@
-"""A slow pull of a gripper whose recorded path has errors: its force drives, its path is watched.
+"""A slow pull with an uncertain gripper path: the force is prescribed, the path is observed.
 
 Held at poses that are a millimetre off, a slender branch is stretched: its force is wrong by its
 stiffness along the axis, thousandfold that of bending, and the moduli with it. The same pull can
@@ -99,13 +99,13 @@ class WatchedForward(QuasiStaticForward):
             self._drives, self._memory, self._hints = list(drives), list(memory), None
 
     def forget(self) -> None:
-        """Return to the force as it was read, and to no state."""
+        """Return to the force as measured, without a state."""
         self._good = self._drives_for = None
         self._memory = [None] * len(self.keys)
         self.set_key_count(self.key_count)
 
     def moved_by(self, change: np.ndarray) -> float:
-        """How far the gripper's place moves by a change of the force's unknowns, at most [m]."""
+        """Largest motion of the gripper position by a change of the force unknowns [m]."""
         response = present(self.response, "response of the pull to its force")
         moved = (response.grasps @ change).reshape(-1, 3)
         return float(np.linalg.norm(moved, axis=1).max())

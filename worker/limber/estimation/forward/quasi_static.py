@@ -132,7 +132,7 @@ class QuasiStaticForward(Forward):
 
     @property
     def iteration_limit(self) -> int:
-        """Iterations after which what is simulated leads nowhere."""
+        """Iterations after which a simulation counts as failed."""
         return int(SETTINGS.total_iterations) + ITERATIONS_A_KEY * len(self.keys)
 
     @property
@@ -141,7 +141,7 @@ class QuasiStaticForward(Forward):
 
     @property
     def model(self) -> BranchModel:
-        """The branch under its weight, with the values to start from."""
+        """The branch under its weight, with the initial values."""
         return self._model
 
     def model_with(self, values: Values) -> BranchModel:
@@ -262,7 +262,7 @@ class QuasiStaticForward(Forward):
                            self._model.mesh.nodes, 6 if self.uses_torque else 3)
 
     def load_at(self, key: int) -> np.ndarray:
-        """What a key frame is solved for: a pose [m, rad], or nodal forces [N]."""
+        """Return the load of a key frame: a pose [m, rad], or nodal forces [N]."""
         drive = self._drives[key]
         return drive if self.drive == "pose" else np.tensordot(drive, self._loads[key], axes=1)
 
@@ -290,7 +290,7 @@ class QuasiStaticForward(Forward):
         return other
 
     def with_longer_grip(self, length: float) -> "QuasiStaticForward":
-        """Return the same pull where a clamping gripper holds ``length`` [m] more to both sides."""
+        """Return the same pull with a clamped grasp longer by ``length`` [m] on both sides."""
         other = copy.copy(self)
         if self.grasp.held is not None:
             held = self.entry.grasp
@@ -299,7 +299,7 @@ class QuasiStaticForward(Forward):
         return other
 
     def place(self, displacement: np.ndarray) -> np.ndarray:
-        """Where the recorded grasp point is [m], shape [3]."""
+        """Position of the recorded grasp point [m], shape [3]."""
         arm = np.array(self.entry.grasp.point_m) - self.grasp.centre
         pose = self.grasp.pose_of(self.mesh.nodes, displacement)
         turn = rotation_matrix(pose[3:]) if self.grasp.mode == "clamped" else np.eye(3)

@@ -1,1 +1,1 @@
-"""Estimates while a pull is going on."""
+"""Online estimates during a pull."""

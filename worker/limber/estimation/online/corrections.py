@@ -1,4 +1,4 @@
-"""What the reduced model gets wrong at a few frames of a pull, and between them."""
+"""Errors of the reduced model at some frames of a pull, and their interpolation."""
 
 from dataclasses import dataclass
 
@@ -48,11 +48,11 @@ class Corrections:
 
     @property
     def is_checked(self) -> bool:
-        """Whether it is known how far off the reduced model is."""
+        """Whether the error of the reduced model is known."""
         return len(self._surprises) >= 3
 
     def forget(self) -> None:
-        """Drop them: they are of another basis."""
+        """Discard them, because they belong to another basis."""
         self._known.clear()
 
     def at(self, frame: OnlineFrame, log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +81,7 @@ class Corrections:
         self._known.append(new)
 
     def wanted(self, kept: list[Kept], log_young: np.ndarray) -> Kept | None:
-        """Return the frame that lies farthest from those that are known; None: none is far."""
+        """Return the frame farthest from the known ones. None: none is far."""
         poses = np.array([each.frame.pose[:3] for each in kept])
         far = np.full(len(poses), np.inf)
         for known in self._known:

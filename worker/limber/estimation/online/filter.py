@@ -1,4 +1,4 @@
-"""Young's modulus while a pull is going on: a recursive Gauss-Newton on the reduced model.
+"""Young's modulus during a pull: recursive Gauss-Newton with the reduced model.
 
 Each frame adds its linearised residuals to what is known. A linearisation made while the moduli
 were still wrong would stay wrong for ever; so a number of frames spread over the pull are kept,

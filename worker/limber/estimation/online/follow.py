@@ -130,7 +130,7 @@ def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[
 
 @dataclass(frozen=True)
 class Begun:
-    """What an online estimate starts with.
+    """Initial state of an online estimate.
 
     Attributes:
         reduced: The reduced model.
@@ -155,7 +155,7 @@ class Begun:
 
 def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Progress,
           training_count: int) -> Begun:
-    """Make the reduced model around what is known: an earlier estimate, or a rough fit.
+    """Build the reduced model around an earlier estimate or a rough fit.
 
     A basis knows moduli within its training's spread; around a uniform guess that spread would
     have to be so wide that the basis is good nowhere. Where nothing has moved yet there is no
@@ -213,7 +213,7 @@ def _size(folder: Path) -> int:
 
 
 def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame, float]]:
-    """Yield frames of a pull as they come, each with the share of what is there that is done."""
+    """Yield the frames of a pull as they arrive, each with the processed fraction."""
     sent, start, last_growth, size = -np.inf, None, time.monotonic(), None
     frames: list[OnlineFrame] = []
     while True:

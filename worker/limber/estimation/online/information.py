@@ -1,4 +1,4 @@
-"""What the frames of a pull say of the moduli: linearised, summed, and which are kept."""
+"""Information of the frames of a pull on the moduli: linearised and summed."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from limber.reduced.state import ReducedState
 
 @dataclass(frozen=True)
 class OnlineFrame:
-    """What was measured at one instant.
+    """Measurements at one instant.
 
     Attributes:
         time: [s].
@@ -48,7 +48,7 @@ class Information:
     Args:
         centre: Mean of the prior, shape [K].
         deviation: Its standard deviation.
-        kept_count: Frames that are kept at most, to be linearised again.
+        kept_count: Largest number of frames that are kept for another linearisation.
     """
 
     def __init__(self, centre: np.ndarray, deviation: float, kept_count: int):
@@ -74,7 +74,7 @@ class Information:
         self._gradient += gone.gradient - gone.normal @ gone.centre
 
     def replace(self, kept: list[Kept]) -> None:
-        """Put these in place of all that was kept and merged."""
+        """Replace all kept and merged frames by these."""
         self.kept, self.past = kept, []
         self._normal[:], self._gradient[:] = 0.0, 0.0
 

@@ -1,4 +1,4 @@
-"""What a pull can tell and what not, before anything is fitted to it."""
+"""What a pull can determine, computed before the fit."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ factor of two, chosen."""
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of the sensitivity matrix, and what follows from them.
+    """Singular values of the sensitivity matrix and the resulting standard deviations.
 
     Attributes:
         singular_values: Of the derivative of the standardised residuals to the free vector,
@@ -32,7 +32,7 @@ class Identifiability:
 
 
 def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiability:
-    """Judge the data at an evaluation with derivatives."""
+    """Compute the identifiability at an evaluation with derivatives."""
     jacobian = evaluation.slopes
     values = np.linalg.svd(jacobian, compute_uv=False)
     together = np.r_[np.ones(space.group_count), np.zeros(space.size - space.group_count)]
@@ -43,7 +43,7 @@ def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiab
 
 
 def require_scale(found: Identifiability) -> None:
-    """Refuse data that leave the overall scale of Young's modulus open.
+    """Reject data that do not determine the overall scale of Young's modulus.
 
     Raises:
         InputError: with the reason.
@@ -62,10 +62,10 @@ def require_scale(found: Identifiability) -> None:
 
 def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
                     ) -> tuple[ParameterSpace, list[str]]:
-    """Link control points that the data leave open to a neighbour, as neighbours on branches are.
+    """Link control points that the data do not determine to a neighbour.
 
-    A link is no equality: the two may differ by a factor of ten, and the interval says so. With
-    an equality the modulus of the neighbour would be wrong as well, and both be thought sure.
+    A link is not an equality: the two may differ by a factor of ten, and the interval includes
+    that. With an equality both moduli would be wrong, with intervals that are too narrow.
     The worst-determined modulus is linked to the neighbour that is known better, until all others
     are resolved. Returns the space, with a sentence for each link.
 

@@ -1,4 +1,4 @@
-"""What the gripper's frame leaves open where its path leads a fit, carried to Young's modulus.
+"""Uncertainty of Young's modulus from the gripper's frame where its path is prescribed.
 
 Where the force leads, the gripper's frame is an unknown of the fit
 (:mod:`limber.estimation.fitting.nuisances`). Where the recorded path leads (no force, or of a
@@ -24,7 +24,7 @@ WIDEST = 35.0
 
 
 def led_by_path(forwards: Sequence[Forward]) -> list[Forward]:
-    """The pulls whose path leads and whose gripper frame may be off."""
+    """Return the pulls with a prescribed path and an uncertain gripper frame."""
     return [forward for forward in forwards if forward.drive == "pose" and (
         calibration_of(forward.entry).pose_sigma_m > 0
         or calibration_of(forward.entry).pose_sigma_rad > 0)]
@@ -41,7 +41,7 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
         objective: What was minimised.
 
     Returns:
-        None where a simulation finds no equilibrium.
+        None if a simulation finds no equilibrium.
     """
     known = {calibration_of(forward.entry): np.array(forward.entry.grasp.point_m)
              for forward in reversed(led_by_path(objective.forwards))}

@@ -1,4 +1,4 @@
-"""Intervals of moduli that are told badly: by the likelihood itself, not by its curvature.
+"""Intervals of poorly determined moduli, from the profile likelihood, not from its curvature.
 
 A pull measures the compliance of a soft piece: the stiffer that is thought to be, the less the data
 see of it. Its modulus may then be several times the likeliest, where the curvature at the best
@@ -30,7 +30,7 @@ NEAR = 0.1
 
 def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
              progress: Progress = SILENT) -> Uncertainty:
-    """Return what an estimate is sure of with the limits of its wide intervals looked for.
+    """Return the uncertainty with the limits of wide intervals from the profile likelihood.
 
     The covariance stays: it is of what depends on the moduli as the measurements do, and that,
     linear in the compliance as they are, changes by as much as the covariance says while the
@@ -38,7 +38,7 @@ def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
 
     Args:
         evaluation: At the fit's end, with derivatives.
-        objective: What was minimised; it is left as it is.
+        objective: What was minimised. It is not changed.
     """
     space = objective.space
     found = _Profile(sure, evaluation, objective, progress)

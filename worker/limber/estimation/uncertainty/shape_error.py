@@ -1,4 +1,4 @@
-"""What a scan leaves open of shape and hung mass, carried to Young's modulus through the pulls.
+"""Uncertainty of Young's modulus from the shape of the scan and the mass of twigs.
 
 Branches as likely as the fitted one (:mod:`limber.geometry.shape_samples`) are pulled as the branch
 was, with the moduli found. By how much their points and forces differ, to first order, the fit

@@ -1,4 +1,4 @@
-"""How a slow pull changes with what the fit took as known, to first order, and the moduli with it.
+"""First-order effect of shape and mass, which the fit takes as known, on pulls and moduli.
 
 All nodes X of the mesh go a way w aside, to another shape of the same tree; or what hangs on the
 branch is heavier. At a state u in balance the internal force f, the loads p and what holds the

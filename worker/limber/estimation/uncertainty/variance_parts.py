@@ -1,4 +1,4 @@
-"""Where the uncertainty of a modulus comes from, in parts that add up to its variance.
+"""Causes of the uncertainty of a modulus, as parts that add up to its variance.
 
 With the information of all that was measured or known beforehand in rows J, the covariance is
 C = (J^T J)^-1, and C = sum over groups of rows of C J_g^T J_g C: each group's part is what its
@@ -57,7 +57,7 @@ class _Rows:
 
 def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 1.0,
                    ) -> dict[str, np.ndarray]:
-    """Part of each cause in the variance of log E at the control points, each of shape [K].
+    """Return the part of each cause in the variance of log E at the control points, [K] each.
 
     Args:
         evaluation: At the fit's end, with derivatives.
@@ -78,7 +78,7 @@ def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 
 
 
 class Cause(TypedDict):
-    """What makes up part of the moduli's variance; see :func:`largest`."""
+    """One cause of the moduli's variance; see :func:`largest`."""
 
     cause: str
     share: float
@@ -87,10 +87,10 @@ class Cause(TypedDict):
 
 
 def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
-    """The causes that make up most of the variance over all moduli, with what would shrink each.
+    """Return the causes of most of the variance over all moduli, with a remedy for each.
 
-    Each with ``cause``, ``share`` of the variance (mean over the moduli), ``deviation`` (largest
-    standard deviation of a log E by it) and ``advice``.
+    Each has ``cause``, ``share`` (its fraction of the variance, mean over the moduli),
+    ``deviation`` (largest standard deviation of a log E from it) and ``advice``.
     """
     total = np.sum(list(parts.values()), axis=0)
     share = {cause: float(np.mean(part / np.maximum(total, 1e-300)))
@@ -102,7 +102,7 @@ def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
 
 
 def cause_of(name: str) -> str:
-    """The cause that an unknown belongs to, by its name."""
+    """Return the cause to which an unknown of this name belongs."""
     return next(cause for start, cause in _GROUPS if name.startswith(start))
 
 

@@ -1,4 +1,4 @@
-"""Young's modulus and damping of a branch that is let go and swings: no robot, no force.
+"""Young's modulus and damping from the free swing of a released branch, without a robot.
 
 The branch is held in its shape at rest until its weight and a hung load act all at once, or a load
 bends it until it is gone. Simulated in time from there, it is laid over the marker tracks. Free are
@@ -43,7 +43,7 @@ _MARGIN = 0.1
 
 @dataclass(frozen=True)
 class SwingSeen:
-    """What was seen of a swing.
+    """Observations of a swing.
 
     Attributes:
         times: [s], shape [n].
@@ -70,7 +70,7 @@ class SwingSeen:
 
 @dataclass(frozen=True)
 class SwingFit:
-    """What a swing tells. Intervals are of 95 %.
+    """Result of a swing. Intervals are 95 % intervals.
 
     Attributes:
         factor: On the start's Young's modulus, the mesh's own stiffness taken out;
@@ -121,7 +121,7 @@ def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: flo
         density_sigma: Relative standard deviation of the branch's density.
 
     Raises:
-        InputError: no swing is to be seen. WorkError: the simulation does not follow.
+        InputError: the recording shows no swing. WorkError: the simulation fails.
     """
     swing = _Swing(model, grasp, seen, density_sigma)
     released, period = first_guess(seen)
@@ -138,7 +138,7 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
     """Return when a branch was released and its period [s], from the tracks alone.
 
     Raises:
-        InputError: nothing moves, or it does not swing.
+        InputError: nothing moves, or the branch does not oscillate.
     """
     way = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
     # Of the marker that goes farthest: others are jostled while the branch is still held.

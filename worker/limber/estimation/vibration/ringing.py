@@ -1,4 +1,4 @@
-"""Frequencies and damping of a branch that rings, from tracks, accelerometers or strain gauges.
+"""Frequencies and damping of free vibration from tracks, accelerometers or strain gauges.
 
 A free decay is a few vibrations, each a frequency and a damping that all channels share, with an
 amplitude and a phase in each channel. They are fitted together by least squares, the linear part
@@ -62,7 +62,7 @@ class Ringing:
 def read_record(path: Path) -> Stream:
     """Read a record: a table of times and readings in any unit, or a C3D file's marker tracks.
 
-    Columns with gaps, as of a marker that was out of sight, are left out.
+    Columns with gaps, such as those of a hidden marker, are discarded.
 
     Raises:
         InputError: it cannot be read, has no times or no readings, or its times do not ascend in
@@ -95,10 +95,10 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     Args:
         times: [s], ascending, shape [n].
         channels: Displacements, accelerations or strains, shape [n, c].
-        start: When it is left to itself [s]; by default where it moves most.
+        start: Start of the free decay [s]. Default: the time of the largest motion.
 
     Raises:
-        InputError: too short, nothing rings, or it is too fast for its readings.
+        InputError: the record is too short, shows no free vibration, or is sampled too slowly.
     """
     step = float(np.median(np.diff(times)))
     channels = channels / np.maximum(channels.std(axis=0), 1e-300)
