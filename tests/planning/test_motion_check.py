@@ -102,7 +102,7 @@ def test_a_plan_that_inertia_breaks_is_refused(planned_branch, tmp_path, monkeyp
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     known = read_plan(folder / "plans/there.json")
     there, most = known.plan, 1.5 * float(known.motion.force_sizes.max())
-    words = "force in motion [N] 99 where 60 is allowed, at (0.1, 0.2, 0.3) m"
+    words = "force in motion [N] 99 exceeds the limit 60 at (0.1, 0.2, 0.3) m"
     monkeypatch.setattr(plan_module, "check_motion", lambda *_, **__: MotionCheck(
         Pace(0.001, 0.001), [words], {"force": 99.0}, {"force": 10.0}, 4, {"force": 1.65}, 9, 0.1))
     with pytest.raises(NoPathError, match="force in motion") as refused:

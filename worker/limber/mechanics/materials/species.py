@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SOURCE = ("Wood Handbook 2010, tables 5-3a and 4-1: green stem wood. Branches are often softer: "
-          "estimate")
+SOURCE = ("Wood Handbook 2010, tables 5-3a and 4-1: green stem wood. Branches are often softer, "
+          "so estimate Young's modulus")
 
 STRENGTH_OVER_YOUNG = 0.006
 """Modulus of rupture over Young's modulus of green wood where no strength is known. Table 5-3 has
