@@ -115,7 +115,7 @@ def _means(model: BranchModel, displacement: np.ndarray, tets: np.ndarray | slic
 
 
 def strain_of(model: BranchModel, stress: np.ndarray, tets: np.ndarray | slice = ALL) -> np.ndarray:
-    """Return the small strain that a stress [Pa] makes in ``tets``, both [tet_count, q, 3, 3]."""
+    """Return the small strain that a stress [Pa] causes in ``tets``, both [tet_count, q, 3, 3]."""
     young, poisson = (values[tets, None, None, None] for values in (model.young, model.poisson))
     trace = np.trace(stress, axis1=2, axis2=3)[..., None, None]
     return ((1 + poisson) * stress - poisson * trace * np.eye(3)) / young

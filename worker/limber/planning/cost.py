@@ -1,4 +1,4 @@
-"""What a path costs, and how two paths are compared.
+"""The cost of a path, and the comparison of two paths.
 
 The paper's edge cost (its eq. 5) adds deformation and distance. Summing the energy over waypoints,
 as a literal reading has it, depends on their spacing and lets a planner win by long edges; so
@@ -60,7 +60,7 @@ class CostWeights:
 
 @dataclass(frozen=True)
 class PathMeasures:
-    """What a path asks of the branch; the same measure for every path.
+    """The measures of a path; the same for every path.
 
     Attributes:
         length_m: Length of the grasp's path [m].

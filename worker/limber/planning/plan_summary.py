@@ -1,4 +1,4 @@
-"""What is said of a plan: its measures beside the shortest path's, its bound, and doubts."""
+"""The summary of a plan: its measures and the shortest path's, its bound, and warnings."""
 
 from dataclasses import asdict
 from typing import Any
@@ -93,7 +93,7 @@ def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
 
 
 def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
-    """Return warnings about a plan, with a field that may be off by ``field_error`` [%]."""
+    """Return warnings about a plan on a field with an allowed error of ``field_error`` [%]."""
     if summary["plan"]["length_m"] <= _STILL:
         return ["The start already lies in the goal. The path has no length, and there is no "
                 "energy to save."]

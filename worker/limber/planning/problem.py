@@ -67,7 +67,7 @@ class GentleProblem:
         return float(path_cost(fine, self.limits, self.weights._replace(step=_FINE)))
 
     def limits_in_words(self) -> str:
-        """Return the limits that there are, or an empty string."""
+        """Describe the limits that are set, or return an empty string."""
         return _in_words(self, self.limits)
 
     def goal_excess(self, point: np.ndarray) -> float:
@@ -82,7 +82,7 @@ def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:
 
 
 def no_way(problem: GentleProblem, proof: str) -> NoWayError:
-    """Return what is said where no path exists, and how that is proven."""
+    """Return the error for a goal to which no path exists, with the ``proof``."""
     counted = _in_words(problem, problem.sure_limits)
     if counted:
         proof += (" The proof includes the largest cross-validation error of the energy field: no "
@@ -95,7 +95,7 @@ def no_way(problem: GentleProblem, proof: str) -> NoWayError:
 
 
 def not_found(problem: GentleProblem, why: str) -> NoWayError:
-    """Return what is said where no path was found, and ``why`` that proves nothing."""
+    """Return the error for a path that was not found, with ``why`` that proves nothing."""
     return NoWayError(
         f"No path to the goal with{problem.limits_in_words() or ' known poses'} was found, "
         f"{UNPROVEN}.", why,

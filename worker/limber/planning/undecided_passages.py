@@ -1,4 +1,4 @@
-"""Poses sampled where the field's error keeps a path and the proof that there is none apart."""
+"""Poses sampled where the field's error leaves it undecided whether a path exists."""
 
 from dataclasses import dataclass
 
@@ -64,7 +64,7 @@ def _told(solved: ResolvedPath, limits: Limits) -> str:
 
 
 def said_after(none: NoWayError, asked: int, told: str) -> NoWayError:
-    """Return the error with what was asked of the full model before it was said."""
+    """Return the error, stating which poses were solved on the full model before."""
     times = "once" if asked == 1 else f"{asked} times"
     return NoWayError(none.seen, f"{none.why} The field's error made this uncertain, so poses "
                       f"were added {times}: {told}.", none.fix)

@@ -1,4 +1,4 @@
-"""How a reduced model is made: full solutions at training grasps, and what they span."""
+"""Construction of a reduced model: full solutions at training grasps, and their span."""
 
 import numpy as np
 

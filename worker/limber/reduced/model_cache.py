@@ -1,4 +1,4 @@
-"""Reduced models that were learnt once, kept for whoever needs the same one again.
+"""A cache of trained reduced models.
 
 A model takes minutes to learn and depends on nothing but the branch, its material and weight, the
 patch that is held and what it was asked to learn: a digest of these names its file. One file holds
@@ -83,7 +83,7 @@ class ReducedCache:
         return self.folder / f"{key}.npz"
 
     def load(self, key: str) -> tuple[ReducedModel, Snapshots] | None:
-        """Return a model and what it was made of, None where there is none.
+        """Return a model and its full solutions; None if there is none.
 
         A damaged file is removed, and said.
         """
@@ -119,7 +119,7 @@ class ReducedCache:
         return path
 
     def learning(self, key: str) -> FileLock:
-        """Return the lock of whoever learns this model, so that nobody learns it beside."""
+        """Return the lock held while this model is trained, so that no other process trains it."""
         return FileLock(self.folder / f"{key}.lock")
 
     def _make_room(self, newest: Path) -> None:
@@ -142,7 +142,7 @@ class ReducedCache:
 
 @dataclass(frozen=True)
 class LearntModel:
-    """A reduced model and the full solutions that it was made of.
+    """A reduced model and the full solutions that it was trained on.
 
     Attributes:
         was_known: It came from the cache.
@@ -156,7 +156,7 @@ class LearntModel:
 def learnt_model(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                  control_young: np.ndarray, settings: ReducedSettings, *,
                  cache: ReducedCache | None, progress: Progress = SILENT) -> LearntModel:
-    """Return the reduced model of a branch, from the cache or learnt now and kept there.
+    """Return the reduced model of a branch, from the cache or trained now and stored there.
 
     Where another process is learning the same one, this waits for it. Arguments as for
     :func:`limber.reduced.reduced_model.build_reduced`; without a ``cache`` nothing is kept.

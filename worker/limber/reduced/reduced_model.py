@@ -289,7 +289,7 @@ class ReducedModel:
         return np.argsort(distance)[:count]
 
     def doubt(self, pose: np.ndarray, novelty: float, limit: float) -> str:
-        """Return why a state lies outside of what the basis knows, or an empty string."""
+        """Return why a state lies outside the range of the basis, or an empty string."""
         distance = self._table.distance(pose).min()
         if distance > 3 * self._spacing:
             return f"the pose is {distance:.3g} m from the nearest training grasp"

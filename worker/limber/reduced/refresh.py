@@ -1,4 +1,4 @@
-"""How far a reduced model is off the full one, and what to do where it is too far.
+"""The error of a reduced model against the full one, and its refresh where that is too large.
 
 A few Newton corrections of the full model at a reduced state tell the error, for the price of as
 many factorisations. A :class:`RefreshingModel` makes it where asked, answers with the
@@ -37,7 +37,7 @@ doubted.
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """What a correction by the full model says of a reduced state.
+    """The error of a reduced state, measured by a correction with the full model.
 
     Attributes:
         position: Largest node displacement of the correction, relative to the branch's extent.
@@ -174,7 +174,7 @@ class Answer:
 
 
 class RefreshingModel:
-    """A reduced model beside its full one, refreshed where it does not know enough.
+    """A reduced model and its full one; refreshed where its basis is not sufficient.
 
     Args:
         model, grasp, weights, control_young, settings: As for ``build_reduced``.
@@ -207,7 +207,7 @@ class RefreshingModel:
 
     @property
     def pending(self) -> int:
-        """Full solutions that the basis does not have yet."""
+        """Full solutions that the basis does not contain yet."""
         return len(self._new)
 
     def solve(self, pose: np.ndarray, young: np.ndarray | None = None, *,
@@ -258,7 +258,7 @@ class RefreshingModel:
         return result
 
     def refresh(self) -> None:
-        """Make the basis anew with the full solutions found since."""
+        """Make the basis again with the full solutions found since."""
         if not self._new:
             return
         poses, young, displacements = (np.array(column)

@@ -1,4 +1,4 @@
-"""What goes into a reduced model and its solves, and what comes out of them."""
+"""Settings and results of a reduced model and its solves."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from limber.reduced.training import TrainingSettings
 
 @dataclass(frozen=True)
 class ReducedSettings:
-    """What a reduced model is made of.
+    """Settings of a reduced model.
 
     Attributes:
         size: Coordinates, those of the grasp and of the vibrations included.
@@ -28,7 +28,7 @@ class ReducedSettings:
 
 @dataclass(frozen=True)
 class ReducedStaticSettings:
-    """How a reduced equilibrium is sought.
+    """Settings of the search for a reduced equilibrium.
 
     Attributes:
         tolerance: Energy that a Newton step would still gain, relative to the strain energy.

@@ -1,4 +1,4 @@
-"""Full solutions that a reduced model learns from: sampled poses and moduli, states, tangents.
+"""Full solutions that train a reduced model: sampled poses and moduli, states, tangents.
 
 Beside each state its derivatives to the pose and to the log of Young's modulus at each control
 point are taken from the factorised tangent: ten linear solves instead of ten equilibria, and the
@@ -32,7 +32,7 @@ _SWING_COUNT = 3
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Which grasps a reduced model is made from.
+    """Settings of the training grasps of a reduced model.
 
     Attributes:
         grasp_count: Number of full solutions.

@@ -1,4 +1,4 @@
-"""How far a pose is from those that a reduced model was made from."""
+"""The distance of a pose from the training poses of a reduced model."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from limber.mechanics.grasp import RADIAN
 
 
 class TrainingPoses:
-    """Poses that distances are taken to."""
+    """Poses to which distances are measured."""
 
     def __init__(self, poses: np.ndarray, extent: float):
         self.positions = np.atleast_2d(poses)[:, :3]

@@ -1,4 +1,4 @@
-"""What goes into a static solve and comes out of it."""
+"""Settings and result of a static solve."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from limber.mechanics.status import Status
 
 @dataclass(frozen=True)
 class StaticSettings:
-    """How equilibrium is sought.
+    """Settings of the search for equilibrium.
 
     Attributes:
         tolerance: Residual force relative to the loads and reactions. The floor that round-off

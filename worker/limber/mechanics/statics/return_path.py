@@ -1,4 +1,4 @@
-"""Whether a branch that snapped on its way would come back: the same way, walked backwards.
+"""Whether a branch that snapped would return: the same path, followed backwards.
 
 A straight part that buckles straightens again. A bow that turned over stays turned over: the start
 and what it snapped to are two stable states of one and the same hold, and which one is real depends
@@ -17,7 +17,7 @@ _SAME = 1e-3
 
 
 def doubt_of(path: Path, result: StaticResult) -> str:
-    """Return why a converged result may not be the only state of its hold, or an empty string.
+    """Return why a converged result may not be the only state of its grasp, or an empty string.
 
     Costs nothing unless the branch snapped; else as much as the way there.
     """

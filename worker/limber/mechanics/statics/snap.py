@@ -34,7 +34,7 @@ _MODE_ITERATIONS = 30
 
 
 def settle(path: "Path", part: float) -> float | None:
-    """Let the branch snap to where it comes to rest at ``part`` of the way.
+    """Let the branch snap to its equilibrium at ``part`` of the path.
 
     Each creep is a step of implicit Euler on the gradient flow of the potential, so it only ever
     goes down. Return the length taken; None where the branch does not come to rest.

@@ -81,7 +81,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
 
 def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
             strain: np.ndarray | None = None) -> StaticResult:
-    """Return where a way leads, with what is doubtful about it."""
+    """Return the end of a path, with a warning where it is uncertain."""
     result = path.run(progress, guess, strain)
     asked = result.converged and path.settings.way_back
     doubt = doubt_of(path, result) if asked else ""

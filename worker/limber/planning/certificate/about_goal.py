@@ -1,4 +1,4 @@
-"""What the cells of a grid say of the goal: where it is, and what the way left to it costs."""
+"""What the cells of a grid know of the goal: its position and the cost of the path left to it."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _BEYOND = 1.2  # on the steepest measured growth of the goal's distance
 
 @dataclass(frozen=True)
 class AboutGoal:
-    """A signed cost of the way left, below 0 inside the goal, and where it is known.
+    """A signed cost of the path left, negative inside the goal, and where it is known.
 
     Every point of the goal lies in a cell that has all its coefficients among those ``known``;
     there the spline of the ``cost`` is at most ``slack``. ``inside`` are cells of the goal alone.

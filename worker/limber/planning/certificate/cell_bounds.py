@@ -1,4 +1,4 @@
-"""What a function is at least in a cell, by its values and slopes at the corners.
+"""Lower bounds of a function in a cell, from its values and slopes at the corners.
 
 A smooth function leaves the trilinear interpolation of its corners by at most
 

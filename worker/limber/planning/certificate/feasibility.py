@@ -1,4 +1,4 @@
-"""Whether a path exists, by cells along the shell that the samples follow.
+"""Whether a path exists, decided on cells along the low-energy surface.
 
 Off the shell a force grows a hundred times as fast as along it, so cells as long as they are wide
 must be tiny before they tell that a limit is broken in all of them. Here they are cut in the
@@ -64,7 +64,7 @@ class _Cells:
         return _Cells(self.problem, self.low, self.edges, self.numbers[which])
 
     def cut(self, parts: np.ndarray) -> "_Cells":
-        """Return the cells cut into so many ``parts`` [3] along each axis."""
+        """Return the cells cut into ``parts`` [3] along each axis."""
         inner = np.stack(np.meshgrid(*map(np.arange, parts), indexing="ij"), -1).reshape(-1, 3)
         return _Cells(self.problem, self.low, self.edges / parts,
                       (self.numbers[:, None] * parts + inner).reshape(-1, 3))
@@ -88,7 +88,7 @@ class _Cells:
         return (np.abs(self.numbers - number) <= 1).all(axis=1)
 
     def hanging(self, some: np.ndarray) -> np.ndarray:
-        """Return which cells hang together with any of ``some``, bool [n]."""
+        """Return which cells are connected to any of ``some``, bool [n]."""
         together = connected_components(self._neighbours(), directed=False)[1]
         return np.isin(together, together[some])
 
@@ -140,7 +140,7 @@ class Verdict:
 
 
 def judge(problem: GentleProblem) -> Verdict:
-    """Return a way on the field, or whether it is proven that the branch has none."""
+    """Return a path on the field, or whether it is proven that none exists."""
     on_field = _judged(problem, problem.limits, 0.0)
     if not on_field.proven:
         return on_field

@@ -124,7 +124,7 @@ class _Search:
     began: float = field(default_factory=perf_counter)
 
     def is_done_after(self, level: int) -> bool:
-        """Bound on the grid and refine it; return whether no finer one is worth its time."""
+        """Bound on the grid and refine it; return whether a finer grid is not worth its time."""
         try:
             found = _bound(self.problem, self.grid, self.cell)
         except NoPathError:

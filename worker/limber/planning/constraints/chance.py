@@ -1,4 +1,4 @@
-"""What an uncertain Young's modulus does to the limits of a plan.
+"""The effect of an uncertain Young's modulus on the limits of a plan.
 
 A pose of the gripper is kept whatever the modulus is; energy, force and stress there are not. The
 moduli are log-normal. Of what a limit is on, with its sign or its direction, a quadratic response
@@ -34,7 +34,7 @@ _DRAWS_LOG2 = 14  # quasi-random draws: the chance of 0.95 is off by some 0.0005
 
 @dataclass(frozen=True)
 class Risk:
-    """How limits fare under uncertain moduli.
+    """How well limits hold with uncertain moduli.
 
     Attributes:
         kept: Probability that all are kept along the motion, at least.
@@ -57,7 +57,7 @@ class Risk:
             for name, share in self.excess.items()})
 
     def told(self) -> list[str]:
-        """Return in words which limits are not kept with the confidence."""
+        """Describe the limits that do not hold at the confidence."""
         return [f"at the requested confidence, {name.replace('_', ' ')} may reach "
                 f"{100 * share:.0f} % of its limit"
                 for name, share in self.excess.items() if share > 1.0]
@@ -181,7 +181,7 @@ class YoungDoubt:
 
     def exposure(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
                  progress: Progress = SILENT) -> "Exposure":
-        """Return how what limits are on changes with the moduli along a motion.
+        """Return how the limited values change with the moduli along a motion.
 
         Raises:
             ConvergenceError: the branch with other moduli cannot be solved at a pose.

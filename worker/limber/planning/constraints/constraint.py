@@ -1,4 +1,4 @@
-"""What a plan may be forbidden besides the limits on energy, force and loads.
+"""Constraints on a plan in addition to the limits on energy, force and loads.
 
 A constraint says what it is on in a state of the full model. The energy field learns that at its
 samples (:func:`~limber.planning.field.energy_field.knowing`), and with it the gradient and the
@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Broken:
-    """A limit that a state of the full model does not keep.
+    """A limit that a state of the full model breaks.
 
     Attributes:
         name: Which, with its unit.
@@ -53,7 +53,7 @@ class Constraint(Protocol):
         ...
 
     def broken(self, grasps: np.ndarray, nodes: np.ndarray) -> str | None:
-        """Return in words where states break it most; None where they keep it."""
+        """Describe where states break it most; None where they keep it."""
         values = self.values(grasps, nodes)
         worst = int(values.argmax())
         return str(Broken(self.name.replace("_", " "), float(values[worst]), self.limit,

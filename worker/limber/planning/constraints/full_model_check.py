@@ -1,4 +1,4 @@
-"""Whether a planned motion holds on the full model, and what is learnt where it does not."""
+"""Check of a planned motion on the full model, and the samples gained where it fails."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ _SLACK = 1e-3  # share of the goal's tolerance that is round-off
 
 def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: np.ndarray,
                          ) -> list[str]:
-    """Return what is wrong with a motion, each with its place; nothing if it may be used.
+    """Return what is wrong with a motion, each with its position; empty if it is allowed.
 
     Every pose of approach and path must have an acceptable solution within the limits, keep the
     constraints, and its end must be in the goal region. The way back takes the same states.

@@ -31,7 +31,7 @@ CONSTRAINTS: list[Callable[[PlanSettings], Constraint | None]] = []
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits as asked; infinite where nothing was.
+    """The limits as requested; infinite where none is.
 
     Attributes:
         energy: Above the hanging state [J].
@@ -77,7 +77,7 @@ class Limits:
         return {each.name: each.values(grasps, nodes) for each in self.constraints}
 
     def met(self, grasps: np.ndarray, nodes: np.ndarray) -> list[str]:
-        """Return in words which constraints such states break."""
+        """Describe the constraints that such states break."""
         return [words for each in self.constraints if (words := each.broken(grasps, nodes))]
 
     @classmethod
