@@ -370,11 +370,11 @@ def test_what_cannot_use_it_refuses(mesh):
     with pytest.raises(InputError, match=r"mooney_rivlin.*cubic"):
         make_polynomial(mooney, None, None, None, None, None)
     tip = int(mesh.nodes[:, 2].argmax())
-    with pytest.raises(InputError, match=r"Abaqus.*no material 'mooney_rivlin'"):
+    with pytest.raises(InputError, match=r"Abaqus.*does not support the material 'mooney_rivlin'"):
         inp_text(mooney, "bar", tip)
-    with pytest.raises(InputError, match="PhysX has no material 'fibres'"):
+    with pytest.raises(InputError, match="PhysX does not support the material 'fibres'"):
         as_deformable(fibres, tip)
-    with pytest.raises(InputError, match="rod's spring has no material 'fibres'"):
+    with pytest.raises(InputError, match="rod's spring does not support the material 'fibres'"):
         from limber.results.exports.rigid_links import rod_tree
 
         rod_tree(fibres, None, 0.02)
