@@ -99,7 +99,7 @@ class Pull(Result):
         forces: Of the gripper on the branch [N], shape [n, 3]; NaN where not measured.
         torques: Likewise [N m], shape [n, 3].
         marker_times: [s], shape [k]; empty where there are no markers.
-        markers: Positions of the observed points [m], shape [k, points, 3]; NaN where not seen.
+        markers: Positions of the observed points [m], shape [k, points, 3]; NaN where not observed.
     """
 
     name: str
@@ -150,7 +150,7 @@ class Estimate(Result):
     Attributes:
         young: At the control points [Pa], shape [K].
         interval: Its 95 % interval [Pa], shape [K, 2]; NaN where an end is open.
-        fractions: Places of the control points on the main path, 0 base to 1 tip, shape [K].
+        fractions: Positions of the control points on the main path, 0 base to 1 tip, shape [K].
         control_points: [m], branch frame, shape [K, 3].
         poisson: Poisson's ratio.
         loss: The paper's loss J [m^2].

@@ -282,7 +282,7 @@ class Branch:
 
     def add_pull(self, source: PathLike, name: str, *, quiet: bool = False,
                  **settings: Any) -> Pull:
-        """Bring a recording of a pull into the branch folder.
+        """Import a recording of a pull into the branch folder.
 
         Args:
             source: A robot's log, a bag, a table of markers, or a folder of them.
@@ -320,7 +320,7 @@ class Branch:
                 ``limber.settings("estimate")`` lists.
 
         Raises:
-            InputError: there are no pulls, or they cannot tell Young's modulus.
+            InputError: there are no pulls, or they cannot determine Young's modulus.
             WorkError: the fit ends at no result.
         """
         if settings.get("follow"):
@@ -434,8 +434,8 @@ class Branch:
         """Write the branch for another program.
 
         Args:
-            output: The file; its suffix says what: .xml (MuJoCo), .urdf, .usd, .inp, .mat, .csv,
-                .mtg or .swc.
+            output: The file; its suffix is the format: .xml (MuJoCo), .urdf, .usd, .inp, .mat,
+                .csv, .mtg or .swc.
             quiet: Show no progress.
             settings: ``links``, ``columns`` and those that ``limber.settings("export")`` lists.
 

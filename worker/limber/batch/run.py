@@ -28,7 +28,7 @@ _MEMORY_MB_EACH = 1000.0
 def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
              workers: int | None = None, cluster: str | None = None,
              scheduler: str | None = None, progress: Progress = SILENT) -> None:
-    """Run what is not up to date; a failure ends its own branch alone.
+    """Run the tasks that are not up to date; a failure ends only its own branch.
 
     What has failed before, with the same settings, is run again only with ``retry_failed``. Each
     stage looks for itself whether the branch has its result already.
@@ -165,7 +165,7 @@ class _Course:
         self.running[future] = branch, number, time.monotonic()
 
     def require_place(self) -> None:
-        """Stop where the folder of results was lost: a new one would hide what is in it."""
+        """Stop if the folder of results was lost: a new one would hide its content."""
         try:
             is_there = _identity(self.jobs.out) == self.place
         except OSError:

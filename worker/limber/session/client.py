@@ -41,7 +41,7 @@ class InteractiveSession:
         start_seconds: How long the start may take.
 
     Attributes:
-        hello: What the session said of itself.
+        hello: The session's description of itself.
         faces: Triangles of the surface, shape [f, 3].
         events: Events so far, newest last (at most 1000 are kept).
 
@@ -134,7 +134,7 @@ class InteractiveSession:
     def set_outdoors(self, **loads: Any) -> dict[str, Any]:
         """Let wind (``wind_m_s``), ``snow_kg_m2`` and ``fruit`` act, and cut at ``cuts``.
 
-        They take the place of those before; see `limber.session.worker` for their form.
+        They replace the earlier ones; see `limber.session.worker` for their form.
         """
         return self.request("outdoors", **loads)
 
@@ -148,7 +148,7 @@ class InteractiveSession:
 
         Raises:
             InputError: there is nothing outdoors, or the branch finds no rest under it.
-            WorkError: it was not told within ``seconds``.
+            WorkError: there was no reply within ``seconds``.
         """
         record = question.get("gust_record")
         if isinstance(record, str | os.PathLike):
@@ -198,7 +198,7 @@ class InteractiveSession:
         return present(self._frames, "frame of the session").read()
 
     def wait(self, move_id: int, seconds: float = 10.0) -> Frame | None:
-        """Return the first frame seen that answers ``move_id`` or a later one; None if too late."""
+        """Return the first frame that answers ``move_id`` or a later one; None if too late."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             frame = self.latest()
@@ -280,7 +280,7 @@ class InteractiveSession:
 
 
 def other_protocol(hello: dict[str, Any]) -> str:
-    """Return what is wrong where a session speaks another protocol than this client, or nothing."""
+    """Return the error if a session uses another protocol than this client, else an empty text."""
     theirs = hello.get("protocol")
     if theirs == PROTOCOL:
         return ""

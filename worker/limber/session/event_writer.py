@@ -34,7 +34,7 @@ class Events:
             return  # nobody reads
 
     def close(self) -> None:
-        """Say that the session has ended, and write what waits, for a second at most."""
+        """Report the end of the session, and write waiting events for at most a second."""
         self.say(event="closed")
         try:
             self._lines.put(None, timeout=1.0)

@@ -18,7 +18,7 @@ offset   type                   what
 64       uint64                 bytes of a slot
 =======  =====================  ==========================================================
 
-Frame number s (1, 2, ...) stands in slot ``s % slot_count``, one after the other:
+Frame number s (1, 2, ...) is in slot ``s % slot_count``, one after the other:
 
 - number_count float64 (NUMBERS, in that order, the rest 0);
 - g rows of 13 float64: number of the grasp (0: an empty row), its pose [m, rad], force [N] and
@@ -97,7 +97,7 @@ class Frame:
         is_reduced: From the reduced model; else from the full one.
         is_trusted: The model is within what it knows, and at the wanted pose.
         is_converged: An equilibrium was found (in motion: the step was).
-        is_reached: The grasps are where they were asked to be; else on the way there.
+        is_reached: The grasps have reached the requested poses; else they are on the path to them.
         energy: Potential of strain and weight above the hanging branch [J]; its gradient to the
             pose is the gripper's force. kinetic_energy: [J].
         reaction_force, reaction_torque: Of the first gripper on the branch [N, Nm], shape [3].
@@ -138,7 +138,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where what stands; ``counts`` is vertices, faces, slots, numbers, grasps, targets."""
+    """The layout of the file; ``counts`` is vertices, faces, slots, numbers, grasps, targets."""
 
     counts: tuple[int, int, int, int, int, int]
     faces_at: int
@@ -163,7 +163,7 @@ class _Layout:
         return self.slots_at + self.counts[2] * self.slot_bytes
 
     def fits(self, size: int) -> bool:
-        """Whether a file of that many bytes can hold what the header says."""
+        """Whether a file of this many bytes can contain what the header states."""
         _, faces, slots, numbers, _, _ = self.counts
         return (slots >= 2 and numbers >= len(NUMBERS) and self.faces_at >= _HEADER
                 and self.faces_at % 4 == 0 and self.slots_at % 8 == 0 and self.slot_bytes % 8 == 0

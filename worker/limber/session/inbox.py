@@ -48,7 +48,7 @@ class Inbox:
         return True
 
     def close(self) -> None:
-        """Say that nothing more will come."""
+        """Report the end of the input."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
@@ -77,7 +77,7 @@ def read_commands(source: int, inbox: Inbox, refuse: Callable[[int, str], None])
     """Put the commands of a file descriptor into an inbox until it ends; then close that.
 
     Args:
-        refuse: Told of what is no command: its id (0 if it has none) and what is wrong.
+        refuse: Called for an invalid command with its id (0 if it has none) and the reason.
     """
     lines = Lines()
     try:

@@ -46,7 +46,7 @@ class Answering:
     Args:
         folder, settings: Of the session, for the trainer.
         held: The branch.
-        tell: Brings the trainer's word back to :meth:`hear`, from its thread.
+        tell: Passes the trainer's results to :meth:`hear`, from its thread.
         say: Writes an event.
     """
 
@@ -71,7 +71,7 @@ class Answering:
 
     @property
     def is_learning(self) -> bool:
-        """Whether a reduced model of what is held is on its way."""
+        """Whether a reduced model of the held branch is being learnt."""
         key, learning = self._key, self._learning
         return (key is not None and key not in self._known and learning is not None
                 and learning.key == key and not learning.has_failed)
@@ -85,7 +85,7 @@ class Answering:
         return Status.learning if self.is_learning else Status.full
 
     def rest(self) -> Answer:
-        """Return the branch as it hangs, solved for what is held."""
+        """Return the rest shape, solved for the held grasps."""
         return self.held.solve()
 
     def hold_marked(self, mode: Literal["clamped", "pinned"]) -> None:
@@ -94,7 +94,7 @@ class Answering:
             self.held.hold(self.held.loaded.marked_grasp(mode))
 
     def aim(self, number: int | None, pose: np.ndarray) -> None:
-        """Say where a grasp is wanted."""
+        """Set the wanted pose of a grasp."""
         self.held.aim(number, pose)
         self._is_due = self._is_new = True
 
@@ -157,7 +157,7 @@ class Answering:
             self._is_due = True
 
     def learn(self) -> None:
-        """See that a trainer works on what is held, if one model can answer for it."""
+        """Make a trainer work on the held branch, if one model can answer for it."""
         key = self._key
         if key is None or not self._settings.reduced:
             return

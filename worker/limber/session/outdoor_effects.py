@@ -59,12 +59,12 @@ class EffectsTeller:
         self._asked.add_done_callback(partial(self.tell, question))
 
     def close(self) -> None:
-        """Give up what is being answered."""
+        """Cancel the current request."""
         if self._pool is not None:
             self._pool.close()
 
     def tell(self, question: Effects, asked: Future) -> None:
-        """Tell what came of a question."""
+        """Report the result of a request."""
         about: dict[str, Any] = {"id": question.id, "command": question.command}
         try:
             told = asked.result()

@@ -1,8 +1,8 @@
 """The messages that a client may send to a session, checked before they take effect.
 
-One JSON object a line, UTF-8, at most ``LINE_LIMIT`` bytes. Every command may carry an ``id``, that
-its reply carries again. Whatever is wrong with a line is said in an ``error`` reply; nothing that a
-client sends ends the session but ``close`` and the end of the input.
+One JSON object a line, UTF-8, at most ``LINE_LIMIT`` bytes. Every command may carry an ``id``,
+which its reply repeats. An invalid line gets an ``error`` reply. Only ``close`` and the end of the
+input end the session.
 """
 
 from collections.abc import Iterator
@@ -74,7 +74,7 @@ class Release(_Command):
 
 
 class Move(_Command):
-    """Bring a grasp (the first, if not named) to a pose [m, rad]."""
+    """Move a grasp (the first, if not named) to a pose [m, rad]."""
 
     command: Literal["move"]
     pose: _Pose
@@ -116,7 +116,7 @@ class Loads(_Command):
 
 
 class Fruit(BaseModel):
-    """A mass [kg] that hangs at a place [m] of the branch as it was scanned."""
+    """A mass [kg] at a position [m] on the branch as it was scanned."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -145,7 +145,7 @@ class RecordedWind(BaseModel):
 
 
 class Effects(_Command):
-    """Ask what wind, snow, fruit and cuts do to the branch, as `limber load` tells it.
+    """Request the effects of wind, snow, fruit and cuts on the branch, as `limber load` does.
 
     With ``gust``, or a ``gust_record``, all of it is of the peak of the gusts; of a record the
     wind's direction counts alone.
@@ -185,7 +185,7 @@ _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discrimin
 
 
 class NotUnderstood(InputError):
-    """A line that is no command; ``reply_id`` is that of the command, where it can be told."""
+    """A line that is not a command; ``reply_id`` is that of the command, if it is known."""
 
     def __init__(self, seen: str, why: str = "", fix: str = "", *, reply_id: int = 0):
         super().__init__(seen, why, fix)
@@ -196,7 +196,7 @@ def parse_command(line: bytes) -> Command:
     """Return the command of one line.
 
     Raises:
-        NotUnderstood: it is none, with what is wrong and the names of the commands there are.
+        NotUnderstood: it is not a command; states the reason and the known commands.
     """
     try:
         return _COMMANDS.validate_json(line, strict=True)

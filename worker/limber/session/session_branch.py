@@ -33,7 +33,7 @@ class Answer:
 
     Attributes:
         displacement: Of all nodes from where the branch hangs [m], shape [node_count, 3].
-        grasps: What is held, with forces.
+        grasps: The held grasps, with forces.
         energy: Potential of strain and weight above the hanging branch [J].
         kinetic_energy: [J]. time: Of a motion [s].
         is_converged: An equilibrium was found, or the step was.
@@ -69,7 +69,7 @@ class HeldBranch:
     Args:
         loaded: The branch as it hangs, with its targets.
         skeleton: Its axes, for wind, snow and cuts.
-        young_deviation: Standard deviation of log E, where something has told it.
+        young_deviation: Standard deviation of log E, if known.
     """
 
     def __init__(self, loaded: LoadedBranch, skeleton: Skeleton | None = None,
@@ -145,7 +145,7 @@ class HeldBranch:
         return number
 
     def aim(self, number: int | None, pose: np.ndarray) -> None:
-        """Say where a grasp (the first, if not named) is wanted [m, rad]."""
+        """Set the wanted pose of a grasp (the first, if not named) [m, rad]."""
         number = self.number(number)
         held = self.grasps[number]
         if held.grasp.mode == "pinned":
@@ -180,7 +180,7 @@ class HeldBranch:
         """Hang dead loads on the branch, instead of those before.
 
         Raises:
-            InputError: a place is not on the branch.
+            InputError: a position is not on the branch.
         """
         forces = np.zeros_like(self.model.mesh.nodes)
         for load in loads:
@@ -189,12 +189,12 @@ class HeldBranch:
         self._hung = forces if loads else None
 
     def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
-        """Let wind, snow and fruit act, and cut off what lies beyond places, instead of before.
+        """Apply wind, snow, fruit and cuts; they replace the earlier ones.
 
-        What is cut off keeps its shape and hangs on without weight: only what is left counts.
+        A cut part keeps its shape and has no weight: only the rest counts.
 
         Raises:
-            InputError: a place is off the branch, or its axes are not known.
+            InputError: a position is not on the branch, or its axes are unknown.
         """
         if self._skeleton is None:
             raise InputError("The branch has no axes.", "Wind, snow and cuts need its axes.",
@@ -236,7 +236,7 @@ class HeldBranch:
         return sum(acting, np.zeros(3)) if acting else None
 
     def sag(self, answer: Answer) -> float:
-        """Return how far what moved most along gravity has come down [m], of what is left."""
+        """Return the largest displacement along gravity [m] of the part that is not cut off."""
         size = float(np.linalg.norm(self.model.gravity))
         down = self.model.gravity / size if size else np.array([0.0, 0.0, -1.0])
         left = np.unique(self.model.mesh.tets[~self._is_gone])
@@ -256,7 +256,7 @@ class HeldBranch:
         self.displacement = displacement
 
     def solve(self) -> Answer:
-        """Go towards the wanted poses with the full model, a short way at most.
+        """Move towards the wanted poses with the full model, by a short step at most.
 
         Where there is no equilibrium the branch stays where it was.
         """

@@ -26,7 +26,7 @@ _CHECK_INTERVAL = 1.0
 
 @dataclass(frozen=True)
 class Learnt:
-    """A reduced model that is ready, with what a frame needs of it; ``key`` says of what."""
+    """A reduced model that is ready, with the data that a frame needs; ``key`` states its grasp."""
 
     key: tuple[str, bytes]
     model: ReducedModel
@@ -44,7 +44,7 @@ class Checked:
 
 
 def key_of(grasp: Grasp) -> tuple[str, bytes]:
-    """Return what tells apart what a session learns: the patch, and how it is held."""
+    """Return the key of a learnt model: the patch, and how it is held."""
     return grasp.mode, grasp.nodes.tobytes() + grasp.weights.tobytes()
 
 

@@ -5,62 +5,62 @@ Start it with ``limber session NAME.branch`` or ``python -m limber.session.worke
 talk to it; nothing of Limber is needed on the other side.
 
 Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each may carry an ``id``
-(an integer from 0), which its ``reply``, its ``error`` and the frame that answers it carry again:
+(an integer from 0). Its ``reply``, its ``error`` and the frame that answers it repeat the id:
 
-- ``{"command": "hello", "protocol": 2}``: say which protocol the client speaks; an error if it is
-  not this one.
+- ``{"command": "hello", "protocol": 2}``: state the client's protocol. The reply is an
+  error if it is not this one.
 - ``{"command": "grasp", "vertex": 17, "mode": "pinned", "radius_m": 0.01}``: hold the branch there,
-  where it is now; ``"point": [x, y, z]`` instead of a vertex is a place on the branch as it was
-  scanned [m]. The reply says ``grasp`` (a number), its ``pose``, and its ``rest_pose`` on the
-  branch as it was scanned. Eight at once, at most.
+  where it is now; ``"point": [x, y, z]`` instead of a vertex is a position on the branch as it
+  was scanned [m]. The reply contains ``grasp`` (a number), its ``pose``, and its ``rest_pose``
+  on the branch as it was scanned. At most eight at once.
 - ``{"command": "release", "grasp": 2}``: let go; without ``grasp``, of all.
-- ``{"command": "move", "grasp": 2, "pose": [x, y, z, rx, ry, rz]}``: that grasp (the first, if not
-  named) to this pose [m, rad]. The newest pose wins: poses that come while one is being solved
-  replace each other. It has no reply but its frame.
-- ``{"command": "loads", "loads": [{"vertex": 17, "force_n": [0, 0, -1]}]}``: forces that hang on
-  the branch, instead of those before.
+- ``{"command": "move", "grasp": 2, "pose": [x, y, z, rx, ry, rz]}``: move that grasp (the first,
+  if not named) to this pose [m, rad]. The newest pose wins: poses that arrive while one
+  is being solved replace each other. It has no reply but its frame.
+- ``{"command": "loads", "loads": [{"vertex": 17, "force_n": [0, 0, -1]}]}``: forces on the
+  branch; they replace the earlier ones.
 - ``{"command": "outdoors", "wind_m_s": [4, 0, 0], "snow_kg_m2": 0, "drag": 1.1, "fruit": [{"point":
-  [x, y, z], "mass_kg": 0.2}], "cuts": [[x, y, z]]}``: wind, snow, fruit and cuts, instead of those
-  before; places are on the branch as it was scanned [m]. The reply says ``added_mass_kg``,
+  [x, y, z], "mass_kg": 0.2}], "cuts": [[x, y, z]]}``: wind, snow, fruit and cuts; they replace the
+  earlier ones. Positions are on the scanned branch [m]. The reply contains ``added_mass_kg``,
   ``cut_mass_kg``, ``wind_force_n`` and ``gone``, the vertices that are cut off.
-- ``{"command": "effects", "strain_limit": 0.01, "limit_load": true, "most": 50}``: what those do to
-  the branch that nothing holds. The reply comes seconds later, between others, and says what
-  `limber load` does: ``sag_m``, ``greatest_strain``, ``strain_over_limit``, ``along``,
-  ``frequencies_hz``, ``bears_times`` and ``held_by``, with intervals where an estimate has left
-  them. With ``"gust": 0.3`` (turbulence; ``gust_length_m``, ``gust_time_s``) or ``"gust_record":
-  {"time_s": [...], "speed_m_s": [...]}`` it is of the peak of the gusts, and ``gusts`` says how
-  that came.
-- ``{"command": "gravity", "on": false}``: let the branch bear its weight, or not. It hangs where it
-  was scanned; without weight it rises from there.
+- ``{"command": "effects", "strain_limit": 0.01, "limit_load": true, "most": 50}``: their
+  effects on the branch without grasps. The reply comes seconds later, between others, with the
+  keys of `limber load`: ``sag_m``, ``greatest_strain``, ``strain_over_limit``, ``along``,
+  ``frequencies_hz``, ``bears_times`` and ``held_by``, with intervals if there is an
+  estimate. With ``"gust": 0.3`` (turbulence; ``gust_length_m``, ``gust_time_s``) or
+  ``"gust_record": {"time_s": [...], "speed_m_s": [...]}`` the result is for the peak of the
+  gusts, and ``gusts`` contains its parts.
+- ``{"command": "gravity", "on": false}``: switch the weight of the branch on or off. With weight
+  it has the scanned shape; without weight it rises from there.
 - ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points; the
-  branch hangs as it was scanned.
-- ``{"command": "dynamics", "on": true}``: let the branch move in time (about 60 steps a second, one
-  as soon as a pose comes) instead of answering with equilibria. Needs the reduced model. The grasp
-  follows at two lengths of the branch a second at most.
-- ``{"command": "status"}``: the reply says what is held and who answers.
+  rest shape remains the scanned one.
+- ``{"command": "dynamics", "on": true}``: compute motion over time (about 60 steps a second, one
+  as soon as a pose arrives) instead of equilibria. This needs the reduced model. The grasp
+  follows at no more than two branch lengths a second.
+- ``{"command": "status"}``: the reply states the grasps and the model that answers.
 - ``{"command": "close"}``, or the end of the input: end.
 
 Events, one JSON object a line on standard output; a client may leave them unread:
 
 - ``{"event": "hello", "protocol": 2, "limber", "positions": PATH, "vertex_count", "control_count",
   "targets", "grasps", "rest_pose", "young_pa", "gravity_on", "extent_m"}``: frames are in the file
-  PATH (limber.session.frame_buffer); the first shows the branch as it hangs.
-- ``{"event": "compiling"}``: before ``hello``, where what is fast later has to be compiled first:
-  once after an installation, for up to a minute.
+  PATH (limber.session.frame_buffer); the first shows the rest shape.
+- ``{"event": "compiling"}``: before ``hello``, if code has to be compiled first: once after an
+  installation, for up to a minute.
 - ``{"event": "reply", "id", "command", ...}`` and ``{"event": "error", "id", "command",
-  "message"}``: of a command. What is no command gets an error too, and nothing else happens.
-- ``{"event": "progress", "progress", "message"}``: a reduced model of what is held is being made.
-  Meanwhile the full model answers, a few times a second, on the way to the wanted pose.
+  "message"}``: the answer to a command. An invalid command also gets an error and has no effect.
+- ``{"event": "progress", "progress", "message"}``: a reduced model of the held branch is being
+  learnt. Until then the full model answers, a few times a second, on the path to the wanted pose.
 - ``{"event": "model", "size", "seconds", "snapshots", "refreshes", "from_cache"}``: a reduced model
-  took over. There is one where one grasp holds; where none or several do, under loads and
-  without weight, the full model answers.
+  now answers. It needs exactly one grasp; with none or several, under loads and without weight,
+  the full model answers.
 - ``{"event": "check", "position_error", "energy_error", "good", "learned"}``: the reduced model was
-  compared with the full one at a pose that was asked; where it was off it has learned.
+  compared with the full one at a requested pose. If its error was too large, it has learned.
 - ``{"event": "warning", "message"}``, ``{"event": "failed", "message"}`` (it did not start),
   ``{"event": "closed"}``.
 
-The session ends when its client goes (its input ends, or nobody can read its output), within
-seconds, whatever it is computing; its trainer (limber.session.trainer) ends with it.
+The session ends within seconds after its client (its input ends, or its output cannot be read),
+also during a computation. Its trainer (limber.session.trainer) ends with it.
 """
 
 import argparse

@@ -230,7 +230,7 @@ class Branch:
         self._check(self.manifest.files)
 
     def damages(self) -> list[Damage]:
-        """Return what is wrong with the folder's files; empty where all is as it was written."""
+        """Return the damage of the folder's files; empty if all are as written."""
         return self._checker.damages(self.manifest, sorted(self.manifest.files))
 
     def _check(self, names: Iterable[str]) -> None:
@@ -261,7 +261,7 @@ class Branch:
             purpose: What another program's user reads that finds the folder taken.
 
         Raises:
-            BranchFolderError: another program holds it; says who and since when.
+            BranchFolderError: another program has it locked; states which and since when.
             WorkError: the disk is full or nearly so, or the folder is lost, now or until the end.
         """
         require_there(self.folder)

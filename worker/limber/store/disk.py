@@ -18,7 +18,7 @@ LEAST_FREE_BYTES = 200e6
 
 @contextmanager
 def in_words(folder: Path) -> Iterator[None]:
-    """Say what a full disk or a lost folder does to a stage as the user can read it."""
+    """Report a full disk or a lost folder to the user of a stage."""
     try:
         yield
     except OSError as error:

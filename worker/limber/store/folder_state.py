@@ -49,7 +49,7 @@ def begin(folder: Path, manifest: Manifest) -> None:
 def settled_manifest(folder: Path) -> Manifest:
     """Return the manifest of a branch folder, once what a killed program left is finished.
 
-    For those who carry a folder elsewhere and read nothing of it.
+    For callers that copy a folder without reading it.
 
     Raises:
         BranchFolderError: as :func:`~limber.store.manifest.read_manifest`; or it has links.
@@ -61,7 +61,7 @@ def settled_manifest(folder: Path) -> Manifest:
 
 @contextmanager
 def opening(folder: Path) -> Iterator[None]:
-    """Refuse a folder that is not there or has links; say what a lost disk does meanwhile."""
+    """Refuse a folder that does not exist or has links; report a lost disk."""
     with in_words(folder):
         if not folder.is_dir():
             raise BranchFolderError(

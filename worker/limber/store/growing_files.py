@@ -82,7 +82,7 @@ class Stream:
             self._waiting.append(line.encode("utf-8") + b"\n")
 
     def close(self) -> None:
-        """Bring all that was appended to the disk.
+        """Write all appended lines to the disk.
 
         Raises:
             WorkError: that could not be done.
@@ -127,7 +127,7 @@ class Stream:
 
 
 def stream_lines(path: Path) -> Iterator[str]:
-    """Read a stream's whole lines, also while it grows; a torn last one is left out."""
+    """Read a stream's complete lines, also while it grows; an incomplete last line is omitted."""
     with open(path, "rb") as stream:
         for line in stream:
             if not line.endswith(b"\n"):

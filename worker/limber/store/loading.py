@@ -68,7 +68,7 @@ def load_mesh(branch: Branch) -> TetMesh:
 
 
 def load_skeleton(branch: Branch) -> Skeleton:
-    """Return the branch's axes, with what is known of how sure they are.
+    """Return the branch's axes, with their known uncertainty.
 
     Raises:
         BranchFolderError: there is no skeleton.
@@ -93,7 +93,7 @@ def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skel
 
 
 def load_masses(branch: Branch) -> list[dict[str, Any]]:
-    """Return what reconstruct found beside the mesh: twigs left out of it, and leaves."""
+    """Return the results of reconstruct outside the mesh: pruned twigs and leaves."""
     if not branch.has("point_masses.json"):
         return []
     found = read_json_as(branch.path("point_masses.json"), list[_Mass], "a list of masses")
@@ -118,7 +118,7 @@ def _hung(mass: dict[str, Any]) -> PointMass:
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
-    """Return the named places on the branch, as `limber target` has written them.
+    """Return the named positions on the branch that `limber target` has written.
 
     Raises:
         InputError: the file is of a newer program.
@@ -133,7 +133,7 @@ def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
 
 
 def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
-    """Return the place of the grasp that the mesh marks [m], None where it is not known."""
+    """Return the position of the grasp that the mesh marks [m], None if unknown."""
     fraction = branch.made.settings.get("grasp_fraction") if branch.made else None
     if fraction is None or not branch.has("skeleton.swc"):
         return None
@@ -150,7 +150,7 @@ class ModelOptions(TypedDict, total=False):
 
 
 class Overrides(ModelOptions, total=False):
-    """What of a branch's model may be asked for instead of what its folder says."""
+    """Parts of a branch's model that may replace those in its folder."""
 
     young: float | np.ndarray | None
     poisson: float | np.ndarray | None
@@ -176,7 +176,7 @@ def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SI
 
 
 def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDamping:
-    """Return the damping that the last swing told, else what simulations take, with a warning."""
+    """Return the damping from the last swing, else that of simulations, with a warning."""
     swings = [branch.manifest.stages[key] for key in ("swing", "vibration")
               if key in branch.manifest.stages]
     known = max(swings, key=lambda entry: entry.finished).result if swings else {}
@@ -318,7 +318,7 @@ def pulls_digest(branch: Branch, names: list[str]) -> str:
 
 def load_pulls(branch: Branch, names: list[str], subject: Subject, settings: EstimateSettings,
                progress: Progress = SILENT) -> list[Pull]:
-    """Read and clean pulls; find control points in their images where there are no markers."""
+    """Read and clean pulls; find control points in their images if there are no markers."""
     pulls = []
     for number, name in enumerate(names):
         folder = branch.path(f"pulls/{name}")

@@ -40,7 +40,7 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
         Whether this program did not hold it yet.
 
     Raises:
-        BranchBusyError: another program has it; says who and since when.
+        BranchBusyError: another program has it locked; states which and since when.
     """
     # One lock object a folder in this program, however often it is asked for.
     lock = FileLock((folder / RUN_LOCK).resolve(), is_singleton=True, thread_local=False)

@@ -13,7 +13,7 @@ from limber.store.manifest import MANIFEST, FileEntry, Manifest, read_manifest
 
 @dataclass(frozen=True)
 class Damage:
-    """One file that is not as it was written: its name, what is wrong, which stage made it."""
+    """One damaged file: its name, its damage, and the stage that made it."""
 
     name: str
     trouble: str
@@ -28,7 +28,7 @@ class Checker:
         self._verified: dict[str, tuple[int, int, str]] = {}
 
     def trouble(self, name: str, entry: FileEntry) -> str:
-        """Say what is wrong with a file, or ""."""
+        """Return the damage of a file, or ""."""
         path = journal.current_path(self._folder, name)
         if not path.is_file():
             return "missing"
@@ -43,7 +43,7 @@ class Checker:
         return ""
 
     def damages(self, manifest: Manifest, names: Iterable[str]) -> list[Damage]:
-        """Return what is wrong with these files of the manifest."""
+        """Return the damage of these files of the manifest."""
         found = ((name, self.trouble(name, manifest.files[name])) for name in names)
         return [Damage(name, trouble, manifest.files[name].stage)
                 for name, trouble in found if trouble]

@@ -28,14 +28,14 @@ class StageTask:
 
     @property
     def fingerprint(self) -> str:
-        """What the task is, its options left out: the same text for the same task."""
+        """The task without its options: the same text for the same task."""
         told = json.dumps([self.stage, plain(self.inputs), plain(self.settings)], sort_keys=True)
         return hashlib.sha256(told.encode("utf-8")).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
 class BranchJob:
-    """What is run on one branch, in this order; ``sweep`` says which values are its own.
+    """The stages to run on one branch, in this order; ``sweep`` contains its own values.
 
     ``fetched`` has the addresses of its inputs and where those go here, ``home`` the address that
     the branch folder itself has, or nothing.
@@ -50,7 +50,7 @@ class BranchJob:
 
     @property
     def is_moved(self) -> bool:
-        """Whether it, or what it needs, is elsewhere."""
+        """Whether it, or an input of it, is remote."""
         return bool(self.fetched or self.home)
 
 

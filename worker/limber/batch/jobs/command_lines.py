@@ -10,7 +10,7 @@ from limber.stages.registry import stage_description
 
 
 def line_of_task(task: StageTask) -> list[str]:
-    """Return what is typed after ``limber`` to run the task."""
+    """Return the arguments after ``limber`` that run the task."""
     return [task.stage, *command_line(task.inputs, task.settings, task.options)]
 
 
@@ -19,7 +19,7 @@ def task_of_line(line: list[str]) -> StageTask:
 
     Raises:
         InputError: a value is refused.
-        click.UsageError: it is no command line of a stage.
+        click.UsageError: it is not the command line of a stage.
     """
     stage = stage_description(line[0])
 

@@ -21,7 +21,7 @@ class JobPaths:
         problems: Collects what is wrong with a path, and its position in the job file.
 
     Attributes:
-        out: Where results go, and what is fetched.
+        out: Folder of results and fetched files.
         home: The address of results; empty where they stay in ``out``.
     """
 
@@ -80,7 +80,7 @@ class JobPaths:
         return path
 
     def address_of(self, path: Path) -> str:
-        """Return the address of a path; nothing for what is here anyway."""
+        """Return the address of a path; an empty text for a local one."""
         return self._known.get(path, "")
 
     def fetched(self, paths: list[Path]) -> tuple[tuple[str, Path], ...]:

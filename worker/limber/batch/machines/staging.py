@@ -96,7 +96,7 @@ def put_out(jobs: JobFile, branch: BranchJob) -> None:
 
 
 def put_summary(jobs: JobFile) -> None:
-    """Put the table and the page beside the branches, where those are elsewhere."""
+    """Upload the table and the page if the branches are remote."""
     for path in (path_of_table(jobs), path_of_page(jobs)):
         if jobs.home and path.is_file():
             put(path, f"{jobs.home}/{path.name}")

@@ -16,13 +16,13 @@ def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
     """Return an MJCF model that is at rest as it stands.
 
     Each link but the held one has three hinges (both bending axes and torsion). Of Rayleigh
-    damping MJCF can express the part that goes with the stiffness; a share of the mass it cannot.
+    damping MJCF can express the part that goes with the stiffness; not that of the mass.
 
     Args:
         tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
         damping: Identified or assumed.
         name: Of the model.
-        sites: Places on the branch [m] that are followed, by name.
+        sites: Positions on the branch [m] to follow, by name.
     """
     root = ElementTree.Element("mujoco", model=name)
     root.append(ElementTree.Comment(

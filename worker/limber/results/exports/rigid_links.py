@@ -34,7 +34,7 @@ class RodTree:
 
     Attributes:
         parent: Shape [n]; -1 for link 0.
-        joint: Places of the springs [m], shape [n, 3]; that of link 0 is the root.
+        joint: Positions of the springs [m], shape [n, 3]; that of link 0 is the root.
         axes: Principal bending axes and the tangent, as rows, shape [n, 3, 3].
         stiffness: About these axes [N m/rad], shape [n, 3].
         mass: [kg], shape [n].

@@ -16,7 +16,7 @@ _WIDEST = 1.5
 def urdf_text(tree: RodTree, damping: RayleighDamping, name: str) -> str:
     """Return a URDF model of a branch; link ``link0`` is held by ``world``.
 
-    URDF knows no springs: stiffness and the angle at which each is slack stand in ``<gazebo>``
+    URDF knows no springs: stiffness and the angle at which each is slack are in ``<gazebo>``
     (springStiffness, springReference) and once more in ``<limber>``, for programs of one's own.
     A joint turns about one axis, so two links without size stand between neighbours.
 

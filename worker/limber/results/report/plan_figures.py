@@ -142,7 +142,7 @@ class _View:
                 + self.y[:, None, None] * up).reshape(-1, 3)
 
     def flat(self, points: np.ndarray) -> np.ndarray:
-        """Return points [n, 3] as seen onto the plane [m], [n, 2]."""
+        """Return points [n, 3] projected onto the plane [m], [n, 2]."""
         return (points - self.origin) @ self.axes.T
 
     def figure(self) -> tuple["Figure", "Axes"]:

@@ -5,7 +5,7 @@ here. One ``.npz`` file carries them to Blender's process: plain arrays (nothing
 ``info``, a JSON text. Vertices are those of the mesh's surface in the order of the PC2 frames:
 ``mesh.surface_faces()`` compacted by ``numpy.unique``.
 
-Arrays (m, s, J, Pa; what a folder does not have is left out):
+Arrays (m, s, J, Pa; missing parts of a folder are omitted):
 
 ==============================================  ====================================================
 ``vertices`` [v, 3], ``faces`` [f, 3]           the surface
@@ -89,7 +89,7 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     Args:
         plan: Which path; the newest by default.
         motion: Which frames; the plan's by default, else the newest.
-        targets: Named places on the branch.
+        targets: Named positions on the branch.
         strength: Stress that breaks the wood [Pa]; assumed where it is not given.
 
     Raises:

@@ -1,10 +1,10 @@
 """Graphs beside a branch: Young's modulus along it, energy along paths, the force of a pull.
 
-A graph is drawn by whoever shows it, in a frame of its own: all places are shares of the frame's
-width and height from its lower left corner, ticks are words. Lines are ``{"label", "color",
-"points", "is_dotted"}``, bands ``{"label", "color", "rows"}`` with rows ``[x, low, high]``; colours
-are sRGB. ``cursor`` has the place of each frame of the plan's or the pull's motion, where the graph
-is of one.
+The viewer draws a graph in a frame: all positions are fractions of the frame's width and height
+from its lower left corner, ticks are labels. Lines are ``{"label", "color", "points",
+"is_dotted"}``, bands ``{"label", "color", "rows"}`` with rows ``[x, low, high]``; colours
+are sRGB. ``cursor`` has the position of each frame of the plan's or the pull's motion, if the
+graph shows one.
 """
 
 import math

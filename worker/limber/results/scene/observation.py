@@ -17,13 +17,13 @@ RESIDUAL = "measured to simulated"
 def add_observation(data: SceneData, branch: Branch) -> None:
     """Add what was measured over time in the pull whose motion is shown, else in the newest.
 
-    ``observation`` [t, m, 3] m (the last place seen where ``observation_visible`` [t, m] is
+    ``observation`` [t, m, 3] m (the last observed position where ``observation_visible`` [t, m] is
     false), ``observation_times`` [t] s; ``observation_grasp`` [g, 3] m of the gripper, and
     ``observation_grasp_times`` [g] s, on the same clock. ``info["pulls"]`` names all recordings.
 
     Where the frames are those of this pull (``limber simulate --pull`` replays it under its name),
     ``observation_motion`` [frames, m, 3] is where each point was in each, ``observation_seen``
-    [frames, m] whether it was seen then, and scalar ``residual`` how far the simulation is off.
+    [frames, m] whether it was observed then; scalar ``residual`` is its distance to the simulation.
     """
     pulls = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
     data.info["pulls"] = pulls
