@@ -1,7 +1,7 @@
-"""What is drawn about a branch beside its marks: rods with values, the half ball of grasps, and
-what was measured in a pull.
+"""Draws additional data of a branch: rods with values, the half ball of grasps, and the points that
+were measured in a pull.
 
-All but the last are hidden at first: the panel's "Show" brings each into sight.
+All but the measured points are hidden at first. The panel's "Show" makes each of them visible.
 """
 
 import json
@@ -46,8 +46,8 @@ def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
 
 
 def add_measured(shown: ShownBranch, data: SceneData, speed: float) -> None:
-    """Add the points that were seen in the pull whose motion is shown: where they were in each
-    frame, gone where they were not seen."""
+    """Add the points that were observed in the shown pull, at their positions in each frame; hidden
+    in frames in which they were not observed."""
     if "observation_motion" not in data.arrays:
         return
     ball = meshes.new_sphere("Measured", 1.0)

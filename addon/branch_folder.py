@@ -1,6 +1,6 @@
-"""What a branch folder says of itself in ``branch.json``: stages, their results, its scan. No bpy.
+"""Reads ``branch.json`` of a branch folder: stages, their results, its scan. No bpy.
 
-The worker alone writes there. What cannot be read counts as not there: the worker says why.
+Only the worker writes it. An unreadable file counts as missing; the worker reports why.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ MANIFEST = "branch.json"
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What a branch folder knows of a stage that has run."""
+    """What a branch folder records about a stage that has run."""
 
     settings: dict[str, Any]
     reads: dict[str, str]
@@ -28,7 +28,7 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class BranchRecord:
-    """What a branch folder holds: stages by key, its scan's sha256, and its own number.
+    """What a branch folder contains: stages by key, the sha256 of its scan, and its own identity.
 
     ``files`` has, by name, each file's sha256 and the key of the stage that wrote it.
     """
@@ -47,7 +47,7 @@ class BranchRecord:
         return record if record and set(record.settings) <= set(stage.fields) else None
 
     def is_stale(self, stage: Stage, record: StageRecord) -> bool:
-        """Whether something that the stage reads has been made anew since, by another stage."""
+        """Whether another stage has since rewritten an input of this stage."""
         for name, (digest, maker) in self.files.items():
             if not any(name == read or (read.endswith("/") and name.startswith(read))
                        for read in stage.reads):
@@ -63,7 +63,7 @@ class BranchRecord:
 
 
 def read_record(folder: Path) -> BranchRecord | None:
-    """Return what ``folder`` holds; None where it is no branch folder, or a damaged one."""
+    """Return the record of ``folder``; None if it is not a branch folder, or is damaged."""
     path = Path(folder) / MANIFEST
     try:
         about = path.stat()
@@ -90,7 +90,7 @@ def _read(path: Path, _changed: int, _size: int) -> BranchRecord | None:
 
 
 def file_sha256(path: Path) -> str:
-    """Return the sha256 of a file, worked out once for each state of it."""
+    """Return the sha256 of a file, computed once for each of its states."""
     about = path.stat()
     return _sha256(path, about.st_mtime_ns, about.st_size)
 
@@ -102,7 +102,7 @@ def _sha256(path: Path, _changed: int, _size: int) -> str:
 
 
 def folder_for(scan: Path) -> Path:
-    """Return the branch folder of a scan: the one beside it that is its own, or a new one."""
+    """Return the branch folder of a scan: the existing one beside it, or a new one."""
     digest = file_sha256(scan)
     for number in range(1, 1000):
         folder = scan.with_name(f"{scan.stem}{'' if number == 1 else f'-{number}'}.branch")

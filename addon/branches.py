@@ -1,4 +1,4 @@
-"""The branches of a scene: how their objects are known again, and which of them is meant."""
+"""The branches of a scene: identifies their objects and the current branch."""
 
 import json
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ class ShownBranch:
 
 
 def branches(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """Return the collections of the branches that are shown, that opened last at the end."""
+    """Return the collections of the shown branches, the one opened last at the end."""
     return [collection for collection in scene.collection.children_recursive
             if FOLDER_KEY in collection]
 
@@ -63,7 +63,7 @@ def surface_of(branch: bpy.types.Collection) -> bpy.types.Object | None:
 
 
 def info_of(surface: bpy.types.Object) -> dict[str, Any]:
-    """Return what the worker said of a branch; not to be changed."""
+    """Return what the worker reported about a branch; do not change it."""
     return _parsed(surface.get(INFO_KEY, "{}"))
 
 
@@ -168,7 +168,7 @@ def layer_of(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
 
 
 def in_branch(scene: bpy.types.Scene, place: Vector) -> Vector:
-    """Return a place of the world in the frame of the current branch [m].
+    """Return a position of the world in the frame of the current branch [m].
 
     They differ where branches stand side by side; without a branch they are one.
     """
@@ -185,7 +185,7 @@ def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 
 def put_skeleton_back(thing: bpy.types.Object) -> None:
-    """Give a skeleton its nodes as the worker gave them."""
+    """Reset a skeleton to the nodes that the worker gave."""
     before = thing.data
     if thing.mode == "EDIT":
         bpy.ops.object.mode_set(mode="OBJECT")

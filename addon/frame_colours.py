@@ -1,4 +1,4 @@
-"""Colours that change from frame to frame: the values of the frame in sight, on the branch."""
+"""Colours that change with the frame: the values of the current frame on the branch."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ _kept: dict[Path, FrameValues | None] = {}
 
 
 def keep(data: SceneData) -> str:
-    """Keep the values of a motion that was opened; returns why they are not in its folder."""
+    """Keep the values of an opened motion; return why they could not be written to its folder."""
     frames = data.info.get("frames")
     if not frames:
         return ""
@@ -32,7 +32,7 @@ def keep(data: SceneData) -> str:
 
 
 def changing(surface: bpy.types.Object) -> set[str]:
-    """Return the names of the values that are there for each frame of the branch's motion."""
+    """Return the names of the values that exist for each frame of the branch's motion."""
     values = _values_of(surface)
     frames = info_of(surface).get("frames") or {}
     return set() if values is None else (
@@ -41,7 +41,7 @@ def changing(surface: bpy.types.Object) -> set[str]:
 
 
 def show(surface: bpy.types.Object, name: str, frame: float) -> None:
-    """Colour ``surface`` by a value that changes; KeyError where there is none of that name."""
+    """Colour ``surface`` by a value that changes; KeyError if no value has that name."""
     if name not in changing(surface):
         raise KeyError(name)
     scale = info_of(surface)["frame_scalars"][name]

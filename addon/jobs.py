@@ -20,7 +20,7 @@ from .worker import worker_environment
 
 _GRACE_SECONDS = 8.0
 _SILENT_SECONDS = 20.0
-"""A worker says every two seconds that it is alive; so long without a word, and something is wrong.
+"""A worker reports every two seconds; after this long without a report, something is wrong.
 Starting takes a few seconds."""
 _IDLE_SECONDS = 30.0
 _LEAST_CPU_SECONDS = 0.05

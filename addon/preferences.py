@@ -15,7 +15,7 @@ _looked: dict[str, float | bool] = {}
 
 
 class LimberPreferences(bpy.types.AddonPreferences):
-    """Where the worker is."""
+    """Preferences: the Python that has the worker."""
 
     bl_idname = __package__
 

@@ -1,7 +1,7 @@
-"""Reads what the worker says is to be shown of a branch: one .npz file, nothing pickled.
+"""Reads the worker's data that show a branch: one .npz file, nothing pickled.
 
-The file comes from another process, perhaps of another version or cut short: no size, shape or
-index in it is believed before it is checked.
+The file comes from another process. It may have another version or be truncated, so every size,
+shape and index is checked before use.
 """
 
 import json
@@ -54,7 +54,7 @@ class SceneDataError(ValueError):
 
 @dataclass(frozen=True)
 class SceneData:
-    """Arrays by name, and what they are: limber.results.scene.contents names them all."""
+    """Arrays by name, and their description: limber.results.scene.contents lists them all."""
 
     arrays: dict[str, np.ndarray]
     info: dict[str, Any]
@@ -69,8 +69,8 @@ def read_scene_data(path: Path) -> SceneData:
     """Read the file that ``limber scene --data FILE`` wrote.
 
     Raises:
-        SceneDataError: not such a file, cut short, of another version of Limber, or one whose
-            arrays do not fit each other.
+        SceneDataError: the file is of another kind, truncated, of another version of Limber, or
+            its arrays do not match each other.
     """
     try:
         arrays = _arrays(Path(path))

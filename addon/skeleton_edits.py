@@ -13,7 +13,7 @@ import numpy as np
 
 
 class Mark(enum.IntEnum):
-    """What a node is marked for; what it then needs stands in the worker's help."""
+    """What a node is marked for; the worker's help describes what each edit needs."""
 
     NONE = 0
     BRIDGE = 1
@@ -27,7 +27,7 @@ class Mark(enum.IntEnum):
 
 
 class SkeletonEditError(ValueError):
-    """The nodes were changed in a way that the worker has no edit for; says what to do."""
+    """The worker has no edit for this change of the nodes; states what to do."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def edits_of(before: Skeleton, now: Nodes) -> list[dict[str, Any]]:
     """Return the edits, in the branch's frame [m], that make ``now`` of ``before``.
 
     Raises:
-        SkeletonEditError: nodes were added, edges drawn or cut, or nodes hang on nothing.
+        SkeletonEditError: nodes were added, edges drawn or cut, or nodes are detached.
     """
     _require_known(before, now)
     place = {int(number): now.places[k] for k, number in enumerate(now.number)}

@@ -20,7 +20,7 @@ _FILE = Path(os.environ.get("LIMBER_STAGES") or Path(__file__).with_name("stages
 
 
 class SettingError(ValueError):
-    """A value that the worker would not take; says which and what to give."""
+    """A value that the worker would reject; states which one and what to give."""
 
 
 @dataclass(frozen=True)

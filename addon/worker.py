@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 class WorkerNotFound(Exception):
-    """There is no Python with Limber's worker; says how to bring one."""
+    """There is no Python with Limber's worker; states how to install one."""
 
     def __init__(self, seen: str):
         super().__init__(

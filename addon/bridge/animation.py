@@ -1,7 +1,7 @@
 """Motion from files: a PC2 cache on a mesh, and objects along points.
 
-Blender shows the rest shape without a word when a cache is missing or belongs to another mesh,
-so the file is looked at here first.
+Blender silently shows the rest shape when a cache is missing or belongs to another mesh, so the
+file is checked here first.
 """
 
 import struct
@@ -22,19 +22,19 @@ _STEPPED, _STRAIGHT = 0, 1
 
 
 class CacheError(ValueError):
-    """A PC2 file that cannot move the mesh; says what was seen and what to do."""
+    """A PC2 file that cannot move the mesh; states what was seen and what to do."""
 
 
 @dataclass(frozen=True)
 class CacheHeader:
-    """What the head of a PC2 file says."""
+    """The header of a PC2 file."""
 
     vertex_count: int
     frame_count: int
 
 
 def read_header(path: Path) -> CacheHeader:
-    """Return the header of a PC2 file; CacheError if it is missing, cut short or none at all."""
+    """Return the header of a PC2 file; CacheError if it is missing, truncated or not a PC2 file."""
     try:
         with open(path, "rb") as stream:
             head = stream.read(_HEADER.size)
@@ -60,7 +60,7 @@ def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1, *,
     The path is kept relative to the .blend where that is saved, so that both can move together.
 
     Raises:
-        CacheError: the file is not whole, or has another number of vertices.
+        CacheError: the file is truncated, or has another number of vertices.
     """
     header = read_header(path)
     if header.vertex_count != len(target.data.vertices):
@@ -78,7 +78,7 @@ def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1, *,
 
 
 def cache_trouble(target: bpy.types.Object) -> str:
-    """Return why the cache of ``target`` does not play, or nothing if it does."""
+    """Return why the cache of ``target`` does not play, or an empty text if it does."""
     modifier = target.modifiers.get(MODIFIER)
     if modifier is None:
         return "The branch has no motion yet. Plan a path first."

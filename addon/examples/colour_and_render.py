@@ -1,4 +1,4 @@
-"""A picture of a branch in the colours of a quantity, without a window.
+"""Renders a branch in the colours of a quantity, without a window.
 
     blender -b --python colour_and_render.py -- FOLDER.branch PICTURE.png --colour strain
 
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
 
 
 def check(picture: Path) -> None:
-    """Raise RuntimeError unless the picture has a branch: opaque, with nothing around it."""
+    """Raise RuntimeError unless the picture shows a branch: opaque, with nothing around it."""
     if not picture.is_file():
         raise RuntimeError(f"Blender rendered no {picture}.")
     image = bpy.data.images.load(str(picture))

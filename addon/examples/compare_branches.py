@@ -1,4 +1,4 @@
-"""Several branches side by side in one scene, and a table of their numbers, without a window.
+"""Puts branches side by side in one scene and makes a table of their results, without a window.
 
     blender -b --python compare_branches.py -- FOLDER.branch FOLDER.branch ... -o SCENE.blend
 
@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> None:
 
 
 def numbers(folder: Path) -> list:
-    """Return what a branch folder's branch.json says, in the order of the columns."""
+    """Return the results in a folder's branch.json, in the order of the columns."""
     manifest = json.loads((folder / "branch.json").read_text(encoding="utf-8"))
     results = {key: entry["result"] for key, entry in manifest["stages"].items()}
     made = results.get("reconstruct") or results.get("mesh") or {}

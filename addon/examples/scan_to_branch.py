@@ -1,8 +1,8 @@
-"""From a scan to a branch that bends, without a window.
+"""Makes a branch that bends from a scan, without a window.
 
     blender -b --python scan_to_branch.py -- SCAN.ply SCENE.blend
 
-Reconstructs the scan (the branch folder lies beside it), hangs a fruit on it and saves the scene.
+Reconstructs the scan into a branch folder beside it, adds a fruit and saves the scene.
 """
 
 import argparse

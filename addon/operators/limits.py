@@ -18,7 +18,7 @@ _OVER_LINEAR = (0.80, 0.02, 0.02)
 _FAR, _NEAR, _OVER = (0.35, 0.85, 0.40), (1.0, 0.80, 0.20), (1.0, 0.20, 0.15)
 _NEAR_SHARE = 0.7
 _TIMES = 10.0
-"""From here on a share is told as so many times the limit."""
+"""From this fraction on, it is shown as a multiple of the limit."""
 _RING_PIXELS, _RING_CORNERS = 11.0, 24
 
 
@@ -48,7 +48,7 @@ def reached(scene: bpy.types.Scene, frame: HeldFrame) -> list[Reached]:
 
 
 def colour_of(share: float) -> tuple[float, float, float, float]:
-    """Return the colour of a share: green, yellow from 70 % on, red from the limit on."""
+    """Return the colour of a fraction: green, yellow from 70 % on, red from the limit on."""
     if share >= 1.0:
         return (*_OVER, 1.0)
     part = min(max(share, 0.0) / _NEAR_SHARE, 1.0)
@@ -56,7 +56,7 @@ def colour_of(share: float) -> tuple[float, float, float, float]:
 
 
 class Tint:
-    """Shows a branch all in red while it is over a limit; its own colours come back."""
+    """Shows the whole branch in red while it exceeds a limit, and then restores its colours."""
 
     def __init__(self, surface: bpy.types.Object):
         self._surface = surface

@@ -104,7 +104,7 @@ class Arm(Protocol):
         Args:
             frames: Frames of the flange, shape [..., 4, 4].
             near: Angles [..., n] near which the answer is wanted. The one nearest to them is among
-                those returned; others may be left out.
+                those returned; others may be omitted.
 
         Returns:
             One configuration a row, shape [..., k, n] with any k; rows that do not exist are NaN.
@@ -188,7 +188,7 @@ class ArmControl(Protocol):
         something comes ``beside``.
 
         Raises:
-            ConnectionError: the robot is gone.
+            ConnectionError: the connection to the robot was lost.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Which arms there are: those of Universal Robots, any URDF file, and what is registered."""
+"""The known arms: those of Universal Robots, any URDF file, and registered arms."""
 
 import functools
 from importlib.metadata import entry_points
@@ -29,8 +29,8 @@ def arm_named(name: str) -> Arm:
     """Return the arm called ``name``, in any case and with or without a hyphen, or a URDF file's.
 
     Raises:
-        InputError: it is none of the known ones, the file describes no arm, or an installed
-            package of arms is not whole.
+        InputError: the arm is unknown, the file does not describe an arm, or an installed package
+            of arms is incomplete.
     """
     if name.lower().endswith(ENDING):
         return arm_of_file(name)
@@ -51,7 +51,7 @@ def _plain(name: str) -> str:
 
 @functools.cache
 def _import_packages() -> None:
-    """Import what installed packages name as arms.
+    """Import the arms that installed packages register.
 
     Raises:
         InputError: one cannot be imported.

@@ -318,7 +318,7 @@ def read_cell(path: str | Path) -> Cell:
 
 
 def write_cell(path: str | Path, cell: Cell) -> None:
-    """Write a cell file; entries that are None are left out."""
+    """Write a cell file; entries that are None are omitted."""
     content = _without_none(plain(cell))
     for name in ("robot", "second_arm"):
         model = Path(content.get(name, {}).get("model", ""))

@@ -11,7 +11,7 @@ _SAME_M, _SAME_RAD = 1e-3, 5e-3
 
 
 def require_payload(cell: Cell) -> None:
-    """Refuse to move an arm that is not told what it carries.
+    """Refuse to move an arm whose payload is not stated.
 
     Raises:
         InputError: the cell does not state the gripper's mass.
@@ -27,10 +27,10 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
     """Return a warning where a plan was made in no robot's cell.
 
     Args:
-        made_for: What the plan's file says of its robot.
+        made_for: What the plan's file states about its robot.
 
     Raises:
-        InputError: it was made for another robot, another branch or another place of the base.
+        InputError: it was made for another robot, another branch or another pose of the base.
     """
     if not made_for:
         return ("The plan was made without a cell (`limber plan --cell`), so obstacles and the "

@@ -1,4 +1,4 @@
-"""Which controllers can be driven: one function that opens each kind."""
+"""The registry of drivers: one function that opens each kind of controller."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ _JOINTS = 6  # of which samples and recordings have columns
 
 
 def _virtual(cell: Cell) -> ArmControl:
-    """The virtual robot, which speaks as a controller of Universal Robots does."""
+    """Open the virtual robot, which uses the protocol of Universal Robots."""
     if not cell.robot.address.startswith("127."):
         raise InputError(f"{cell.arm.name} has no driver for the controller at robot.address "
                          f"{cell.robot.address}.", "Its URDF file describes the arm, but not the "
@@ -27,7 +27,7 @@ def register_control(kind: str, opened: Callable[[Cell], ArmControl]) -> None:
     """Let arms whose ``controller`` is ``kind`` be driven by what ``opened`` returns.
 
     Args:
-        opened: Takes the cell, finds its controller and refuses one that cannot be moved now.
+        opened: Takes the cell, connects to its controller, and raises if the arm cannot move now.
     """
     _CONTROLS[kind] = opened
 
@@ -36,9 +36,9 @@ def control_of(cell: Cell) -> ArmControl:
     """Open the controller of a cell's arm; nothing moves yet.
 
     Raises:
-        InputError: no driver of this kind of controller is there, or the arm has more joints than
-            samples have columns.
-        LimberError: it does not answer, or is not in a state to be moved.
+        InputError: no driver is registered for this kind of controller, or the number of joints
+            is not that of the columns of samples.
+        LimberError: the controller does not answer, or the arm cannot be moved in its state.
     """
     opened = _CONTROLS.get(cell.arm.controller)
     if opened is None:

@@ -57,7 +57,7 @@ class ForceTorqueSensor(Protocol):
         """Return the newest reading at the time of a sample of the robot.
 
         Raises:
-            ConnectionError: the sensor is gone.
+            ConnectionError: the connection to the sensor was lost.
         """
         ...
 

@@ -115,7 +115,7 @@ class RobotLink:
         That is ``reached``, ``stopped`` or ``paused``, with its reason.
 
         Raises:
-            SafetyStop: it was refused. WorkError: the driver is gone.
+            SafetyStop: it was refused. WorkError: the driver has ended.
         """
         self.start(trajectory)
         return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
@@ -128,7 +128,7 @@ class RobotLink:
             does not fall on the way.
 
         Raises:
-            SafetyStop: there is no way back, or the arm left it. WorkError: the driver is gone.
+            SafetyStop: there is no path back, or the arm left it. WorkError: the driver has ended.
         """
         # Until the arm stands, and the smoothed force is that of where it stands.
         time.sleep(_STANDS_SECONDS)

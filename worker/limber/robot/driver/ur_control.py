@@ -43,7 +43,7 @@ class UrControl(SampleStream):
         import_module("rtde_control")
 
     def _identified(self) -> dict[str, Any]:
-        """What the controller says of itself, once it is the cell's."""
+        """What the controller reports about itself, after a check against the cell."""
         version = ".".join(map(str, self.version[:3]))
         arm, calibrated = self._cell.arm, self._cell.robot.version
         if self.rate != arm.rate:

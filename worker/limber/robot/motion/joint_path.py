@@ -30,7 +30,7 @@ class JointPath:
     limit_margin: float
 
     def speed_share(self, arm: Arm, times: np.ndarray) -> float:
-        """Return the greatest joint speed as a share of what the joint can do."""
+        """Return the greatest joint speed as a fraction of the joint's speed limit."""
         speeds = np.abs(np.diff(self.joints, axis=0)) / np.diff(times)[:, None]
         return float((speeds / np.asarray(arm.joint_speed)).max(initial=0.0))
 
@@ -84,7 +84,7 @@ def joint_path(arm: Arm, frames: np.ndarray, *, start: np.ndarray | None = None,
         margins, joint_limits: As :func:`follow` takes them.
 
     Raises:
-        NoPathError: no branch carries the whole path; says where and why.
+        NoPathError: no configuration follows the whole path; states where and why.
     """
     paths, refusals = follow(arm, frames, joint_limits=joint_limits, **margins)
     if not paths:

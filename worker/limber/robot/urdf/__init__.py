@@ -1,1 +1,1 @@
-"""Arms that a URDF file describes: any chain of six or more turning joints."""
+"""Arms that a URDF file describes: any chain of six or more revolute joints."""

@@ -24,9 +24,9 @@ _DRAWN = 0.05  # the same of drawn links
 
 @dataclass(frozen=True, eq=False)
 class UrdfArm:
-    """A chain of turning joints; see :class:`limber.robot.interface.Arm`.
+    """A chain of revolute joints; see :class:`limber.robot.interface.Arm`.
 
-    A URDF says nothing of the controller: it is moved on the virtual robot alone, until a driver
+    A URDF does not describe the controller: only the virtual robot can move the arm until a driver
     is registered with an arm of its own. It states no payload either: none is refused.
     """
 

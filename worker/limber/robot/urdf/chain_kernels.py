@@ -1,4 +1,4 @@
-"""Kernels of the kinematics of a chain of turning joints.
+"""Kernels of the kinematics of a chain of revolute joints.
 
 ``origins`` [n + 1, 4, 4] are the joints' frames at angle 0, each in that of the joint before, and
 the flange's in the last one's; ``axes`` [n, 3] are those that they turn about.

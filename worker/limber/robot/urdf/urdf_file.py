@@ -1,4 +1,4 @@
-"""URDF files: the chain of turning joints from an arm's base to its flange, and its links' shapes.
+"""URDF files: the chain of revolute joints from an arm's base to its flange, and its links' shapes.
 
 Read with the standard library: of a URDF only links, joints and simple shapes count here, and
 Limber needs no parser of robots for that. A document type is refused, and with it every entity.
@@ -80,7 +80,7 @@ def read_chain(path: Path) -> Chain:
     only chain with six or more joints.
 
     Raises:
-        InputError: the file cannot be read, or is no arm of six or more turning joints.
+        InputError: the file cannot be read, or is not an arm of six or more revolute joints.
     """
     try:
         root = ElementTree.XML(read_text(path, "the description of an arm (URDF)"),
@@ -94,7 +94,7 @@ def read_chain(path: Path) -> Chain:
 
 
 class _Robot:
-    """The tree of a URDF file. Its methods raise ValueError where it makes no arm."""
+    """The tree of a URDF file. Its methods raise ValueError if it does not describe an arm."""
 
     def __init__(self, root: Element):
         if root.tag != "robot":
@@ -179,7 +179,7 @@ def _joint(element: Element, origin: np.ndarray) -> Joint:
 
 
 def _rods(link: Element, name: str, frame: np.ndarray, joint: int) -> list[Rod]:
-    """The simple shapes of a link, each within a rod; meshes are left out."""
+    """The simple shapes of a link, each enclosed in a rod; meshes are omitted."""
     found = []
     for collision in link.findall("collision"):
         shape = _part(_part(collision, "geometry"), "*")

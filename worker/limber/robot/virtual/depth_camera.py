@@ -42,7 +42,7 @@ class VirtualCamera:
         """Return what a camera sees: depth [m], 0 where nothing is, shape [height, width].
 
         Raises:
-            WorkError: the robot is gone.
+            WorkError: the virtual robot has ended.
         """
         try:
             self._socket.sendall(camera.model_dump_json().encode() + b"\n")
@@ -75,7 +75,7 @@ def views_around(middle: np.ndarray, distance: float, count: int,
 
 
 def scanned(address: str, cameras: list[Camera]) -> np.ndarray:
-    """Return the points [m, 3] that cameras see together, silhouettes left out.
+    """Return the points [m, 3] that cameras see together, without silhouettes.
 
     Raises:
         WorkError: there is no camera, or none of them sees anything.

@@ -80,7 +80,7 @@ class VirtualRobot:
 
     @property
     def state(self) -> dict[str, Any]:
-        """What the controller says of itself."""
+        """What the controller reports about itself."""
         return self.ask("state")
 
     def kill(self) -> None:
