@@ -28,7 +28,7 @@ def read_points(path: Path) -> np.ndarray:
     """Return the points of a PLY, XYZ, TXT or CSV file in its own unit, shape [n, 3].
 
     Raises:
-        ValueError: not readable as points; says what to do.
+        ValueError: the file is not readable as points; states what to do.
     """
     try:
         points = _read_ply(path) if path.suffix.lower() == ".ply" else _read_text(path)

@@ -1,7 +1,7 @@
-"""What a branch is coloured by in each frame of its motion: kept beside it in its folder. No bpy.
+"""The values that colour a branch in each frame of its motion, kept in its folder. No bpy.
 
-A .blend keeps the values of one frame alone; those of all stand in ``.viewport/MOTION.npz`` of the
-branch folder, so that a file that was closed and moved still plays in colours.
+A .blend keeps the values of only one frame. Those of all frames are in ``.viewport/MOTION.npz`` of
+the branch folder, so that a file that was closed and moved still plays in colours.
 """
 
 import errno
@@ -49,7 +49,7 @@ class FrameValues:
 
 
 def values_of(data: SceneData) -> FrameValues:
-    """Return what the worker said of each frame."""
+    """Return the values that the worker gave for each frame."""
     parts = {kind: {name.partition(":")[2]: array for name, array in data.arrays.items()
                     if name.startswith(f"{kind}:")}
              for kind in ("frame_scalar", "frame_level", "palette")}
@@ -57,7 +57,7 @@ def values_of(data: SceneData) -> FrameValues:
 
 
 def path_of(folder: Path, motion: str) -> Path:
-    """Return where the values of a motion stand in a branch folder."""
+    """Return the path of a motion's values in a branch folder."""
     return folder / _FOLDER / f"{motion}.npz"
 
 

@@ -63,9 +63,9 @@ class Job:
     Attributes:
         title: What the user reads.
         folder: The branch folder that it works in or makes, if it is about one.
-        fraction: Share done, 0 to 1.
-        message: What the worker is at.
-        numbers: What it said beside that, by name.
+        fraction: Fraction done, 0 to 1.
+        message: The current work of the worker.
+        numbers: Further progress values, by name.
         result: Its last JSON object, once it has ended.
         error: Why it failed, for the user; empty otherwise.
         log: The last lines of its standard error.
@@ -109,7 +109,7 @@ class Job:
         return self._process.pid
 
     def poll(self) -> JobState:
-        """Take in what the worker has said since the last call; returns the state."""
+        """Read the worker's output since the last call; return the state."""
         if self.state is JobState.WAITING:
             _advance()
         if self.state is not JobState.RUNNING:
@@ -164,7 +164,7 @@ class Job:
             self._signal(kill=False)
 
     def stop_now(self) -> None:
-        """End the worker at once: Blender is closing."""
+        """End the worker immediately because Blender is closing."""
         if self.state is JobState.WAITING:
             self._give_up("")
         elif self._process is not None and self._process.poll() is None:

@@ -33,8 +33,8 @@ class LiveForce:
 
 
 def read(folder: Path, now: float | None = None) -> LiveForce | None:
-    """Return what the robot at a branch feels; None while none moves, or what is there is no such
-    file."""
+    """Return the force that the robot at a branch measures; None while no robot moves, or if the
+    file is invalid."""
     try:
         told = json.loads((folder / FILE).read_text(encoding="utf-8"))
         if told["format"] != FORMAT or (time.time() if now is None else now) - told["at"] > (

@@ -50,7 +50,7 @@ def get(context: bpy.types.Context | None = None) -> LimberPreferences | None:
 
 
 def worker_command() -> list[str]:
-    """Return how to start the worker; WorkerNotFound says what to do when there is none."""
+    """Return how to start the worker; WorkerNotFound states what to do if there is none."""
     chosen = get()
     path = chosen.python_path if chosen else ""
     return worker.worker_command(path, bundled=worker.bundled_command())
@@ -69,7 +69,7 @@ def has_worker() -> bool:
 
 
 def worker_trouble() -> str:
-    """Return why there is no worker and what to do, or nothing."""
+    """Return why there is no worker and what to do, or an empty text."""
     try:
         worker_command()
     except worker.WorkerNotFound as error:

@@ -105,9 +105,9 @@ class Session:
     """One branch that is held; close it when done.
 
     Attributes:
-        hello: What the session said of itself once it had the branch; empty before.
+        hello: What the session reported about itself after loading the branch; empty before.
         error: Why it ended, for the user; empty while it runs.
-        message: What it is at: learning, with its share.
+        message: Its current work, with the fraction done.
     """
 
     def __init__(self, command: list[str], vertex_count: int):

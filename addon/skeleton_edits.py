@@ -1,4 +1,4 @@
-"""What a user did to the nodes of a skeleton, as the list of edits that the worker takes. No bpy.
+"""The user's changes of a skeleton's nodes, as the list of edits that the worker takes. No bpy.
 
 The worker applies edits one after the other (``limber skeleton --help``); here is only what has
 changed, in an order in which each finds its place: nodes first go to where they are now.
@@ -46,7 +46,7 @@ class Skeleton:
         return int(np.flatnonzero(self.parent < 0)[0])
 
     def outwards(self, node: int, stops: set[int] = frozenset()) -> set[int]:
-        """Return a node and all that hang on it, but not those of ``stops`` and beyond."""
+        """Return a node and all nodes that it carries, but not those of ``stops`` and beyond."""
         found = {node}
         for child in range(node + 1, len(self.parent)):
             if int(self.parent[child]) in found and child not in stops:

@@ -151,7 +151,7 @@ class Stage:
         return found
 
     def arguments(self, values: Mapping[str, Any]) -> list[str]:
-        """Return the command line that gives the stage these values; defaults are left out.
+        """Return the command line that gives the stage these values; defaults are omitted.
 
         Fields that ``values`` does not have keep the worker's default.
 

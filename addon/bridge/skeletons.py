@@ -1,7 +1,7 @@
 """The skeleton as a mesh of nodes that can be edited, to and from arrays.
 
-What a user marks stands in attributes of the vertices, not in properties of the object: undo in
-Edit Mode brings back the mesh alone.
+The user's marks are attributes of the vertices, not properties of the object, because undo in Edit
+Mode restores only the mesh.
 """
 
 from collections.abc import Iterator
@@ -117,7 +117,7 @@ def nodes_edited(thing: bpy.types.Object, *, is_changed: bool = True,
 
 def mark(builder: bmesh.types.BMesh, vertex: bmesh.types.BMVert, kind: Mark,
          target: int = -1) -> None:
-    """Mark a node; a mark that it had before is gone."""
+    """Mark a node; this replaces an earlier mark."""
     layers = builder.verts.layers.int
     turn = 1 + max(other[layers["mark_turn"]] for other in builder.verts)
     for name, value in (("mark", int(kind)), ("mark_target", target), ("mark_turn", turn)):

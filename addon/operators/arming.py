@@ -99,19 +99,19 @@ def why_not_armed(context: bpy.types.Context) -> str:
     group = properties.group_of(context.scene, stage)
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("status") != "done":
-        return "Run the dry run with the robot first. It does not move the robot"
+        return "Run the dry run with the robot first: it does not move the robot"
     try:
         given = properties.arguments_of(context.scene, stage, str(folder))
     except ValueError as error:
         return str(error)
     if outcome.get("arguments") != given:
-        return "The settings have changed since the dry run. Repeat the dry run with the robot"
+        return "The settings have changed since the dry run: repeat it with the robot"
     record = branch_folder.read_record(folder)
     preview = record.stages.get(f"execute-preview:{group.name}") if record else None
     plan = f"plans/{group.name}.csv"
     if preview is None or plan not in record.files or (
             preview.reads.get(plan) != record.files[plan][0]):
-        return "The plan has changed since the dry run. Repeat the dry run with the robot"
+        return "The plan has changed since the dry run: repeat it with the robot"
     return ""
 
 

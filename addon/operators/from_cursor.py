@@ -1,4 +1,4 @@
-"""Take a place from the 3D cursor, or a region from an object."""
+"""Take a position from the 3D cursor, or a region from an object."""
 
 from typing import ClassVar
 

@@ -85,7 +85,7 @@ class Tint:
 
 
 def draw_ring(place: tuple[float, float], share: float | None, size: float) -> None:
-    """Draw a ring about a place of the view [pixels], in the colour of a share; white without."""
+    """Draw a ring about a position in the view [pixels], coloured by a fraction; white without."""
     turns = np.linspace(0.0, 2 * np.pi, _RING_CORNERS + 1)
     corners = np.column_stack([np.cos(turns), np.sin(turns)]) * _RING_PIXELS * size + place
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")

@@ -1,4 +1,4 @@
-"""Wind, snow, fruit, cuts and weight on a branch that a session holds, as the sliders say.
+"""Wind, snow, fruit, cuts and weight on a branch that a session holds, as set by the sliders.
 
 The settings are those of the worker's stage `load`: what was tried by hand can then be run there.
 """
@@ -20,7 +20,7 @@ lines: list[str] = []
 
 
 class LiveLoads:
-    """Brings what the sliders say to a session, one wish at a time.
+    """Sends the sliders' settings to a session, one request at a time.
 
     Args:
         scene: Whose settings they are.
@@ -76,7 +76,7 @@ class LiveLoads:
         return True
 
     def add(self, name: str, place) -> None:
-        """Hang a fruit at a place [m] of the branch as scanned, or cut there."""
+        """Add a fruit at a position [m] of the branch as scanned, or cut there."""
         rest = (self._scene.limber.fruit_mass,) if name == "fruit" else PLACES[name]
         row = stages()["load"].fields[name].shown([[*map(float, place), *rest]])
         given = getattr(self._group, name)

@@ -8,14 +8,14 @@ from .. import branch_folder, branches, jobs
 
 
 def is_open(operator: type, thing: bpy.types.Object | None) -> bool:
-    """Return whether the scene has ``thing``; where not, the button says what to do."""
+    """Return whether the scene has ``thing``; if not, the button states what to do."""
     if thing is None:
         operator.poll_message_set("Open a result first")
     return thing is not None
 
 
 def needed_folder(scene: bpy.types.Scene) -> Path:
-    """Return the folder of the current branch; ValueError where there is none to work in.
+    """Return the folder of the current branch; ValueError if there is none.
 
     One that a job is about to make will do.
     """

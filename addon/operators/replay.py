@@ -1,4 +1,4 @@
-"""Move the branch as a recording says, and show what was measured over it."""
+"""Move the branch as in a recording, and show the measured points over it."""
 
 from pathlib import Path
 from typing import ClassVar

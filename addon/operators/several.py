@@ -1,4 +1,4 @@
-"""Several branches in a scene: which is meant, where each stands, and where its folder is."""
+"""Several branches in a scene: the current one, their positions, and their folders."""
 
 from pathlib import Path
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""The first minutes: open the example that comes along, and a workspace of one's own."""
+"""The first minutes: open the included example, and a workspace for Limber."""
 
 import shutil
 from pathlib import Path

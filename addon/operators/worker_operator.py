@@ -1,4 +1,4 @@
-"""What operators share that run a command of the worker: as a job with progress, or waiting."""
+"""The base of operators that run a command of the worker, as a job with progress or waiting."""
 
 import bpy
 
@@ -30,7 +30,7 @@ class WorkerOperator:
         return True
 
     def arguments(self, context: bpy.types.Context) -> list[str]:
-        """Return the command and its arguments, without --json; ValueError says what is missing."""
+        """Return the command and its arguments, without --json; ValueError if one is missing."""
         raise NotImplementedError
 
     def folder(self, context: bpy.types.Context) -> str:
@@ -38,7 +38,7 @@ class WorkerOperator:
         return ""
 
     def finish(self, context: bpy.types.Context, result: dict) -> None:
-        """Use the worker's result; ValueError says why it cannot be used."""
+        """Use the worker's result; ValueError states why it cannot be used."""
         raise NotImplementedError
 
     def execute(self, context):

@@ -16,7 +16,7 @@ EDITED, DOUBTFUL = 128, 32 | 64
 """Bits of the worker's flags: edits applied; a radius not resolved, a gap bridged."""
 COLORS = {"root": (0.25, 0.9, 0.3, 1.0), "edited": (1.0, 0.5, 0.1, 1.0),
           "doubtful": (1.0, 0.9, 0.2, 1.0), "pending": (0.95, 0.3, 1.0, 1.0)}
-WORDS = {"root": "green: root", "edited": "orange: edited", "doubtful": "yellow: doubtful",
+WORDS = {"root": "green: root", "edited": "orange: edited", "doubtful": "yellow: uncertain",
          "pending": "violet: not yet applied"}
 
 

@@ -83,7 +83,7 @@ def _span(seconds: float) -> str:
 
 
 def number_lines(numbers: dict) -> list[str]:
-    """Return what a worker says beside its progress, in words: the loss and E of a fit."""
+    """Return further progress values of a worker as text: the loss and E of a fit."""
     lines = []
     if isinstance(numbers.get("best_m2"), int | float):
         lines.append(f"Lowest loss {numbers['best_m2']:.3g} m²")

@@ -1,4 +1,4 @@
-"""What the panels of the sidebar share."""
+"""The base of all panels in the sidebar."""
 
 
 class SidebarPanel:

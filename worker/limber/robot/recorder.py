@@ -147,7 +147,7 @@ class MarkerStream:
         """Return the frames that have come: time [s], points [n, 3] in the branch's frame.
 
         Raises:
-            WorkError: the tracker is gone.
+            WorkError: the tracker has closed its connection.
         """
         while select.select([self._socket], [], [], timeout)[0]:
             chunk = self._socket.recv(65536)

@@ -80,7 +80,7 @@ class GuardSettings:
         filter_time: Time constant of the force that is compared with the predicted one [s]. The
             hard limits look at every reading as it comes.
         off_path: Distance from where the robot was sent [m].
-        lost_share: Share of its force that a held branch loses when it slips or breaks.
+        lost_share: Fraction of its force that a held branch loses when it slips or breaks.
         loss_time: Time in which such a loss counts as sudden [s].
         least_force: Force below which a loss is not told from noise [N].
         largest_torque_error: Of the torque against the predicted one [N m].
@@ -230,7 +230,7 @@ class Guard:
         return _GO
 
     def event(self, reason: str) -> Decision:
-        """Something that no sample shows: a lost connection, a parent that is gone."""
+        """An event that no sample shows: a lost connection, a parent that has ended."""
         return self._stop(reason)
 
     def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,

@@ -1,4 +1,4 @@
-"""What a driver tells its parent, without ever waiting for it."""
+"""The events that a driver reports to its parent, without ever waiting for it."""
 
 import json
 import queue
@@ -9,7 +9,7 @@ from limber.robot.driver.real_time import claim_real_time
 
 
 class Words:
-    """What the driver says, written by a thread of its own.
+    """The events of the driver, written by a separate thread.
 
     A program that is slow to read fills its pipe within a third of a second; a loop that waited
     for it would starve the controller's watchdog.
@@ -25,11 +25,11 @@ class Words:
         self._thread.start()
 
     def tell(self, **content: Any) -> None:
-        """Send an event; returns at once."""
+        """Send an event; returns immediately."""
         self._lines.put(json.dumps(content))
 
     def close(self, seconds: float = 2.0) -> None:
-        """Wait until all is said, at most so long."""
+        """Wait until all events are sent, at most this long."""
         self._lines.put(None)
         self._thread.join(seconds)
 

@@ -35,7 +35,7 @@ class UnderWay:
     Args:
         control: Moves the arm.
         guard: Decides.
-        tell: Says what happened.
+        tell: Reports what happened.
 
     Attributes:
         following: None where nothing is followed.
@@ -114,7 +114,7 @@ class UnderWay:
                        f"controller's watchdog ends its program in {self._control.silence:.2f} s")
 
     def lose(self, reason: str) -> None:
-        """The data connection is gone: nothing is known, so everything that stops is used."""
+        """The data connection was lost: nothing is known, so every means to stop is used."""
         moving = self.following is not None
         decision = self._guard.event(reason)
         self._stop_at_once("the data connection was lost")

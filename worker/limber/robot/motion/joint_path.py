@@ -146,7 +146,7 @@ def _margins(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:
 
 
 def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
-    """Return the error that says how far the best of refused branches came along ``frames``
+    """Return the error that states how far the best rejected configuration followed ``frames``
     [n, 4, 4]."""
     farthest = max(refusals, key=lambda refusal: refusal.index)
     place = ", ".join(f"{value:.3f}" for value in frames[farthest.index, :3, 3])

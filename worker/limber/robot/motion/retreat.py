@@ -55,7 +55,7 @@ class WayBack:
         self._joints.append(sample.joints.copy())
 
     def from_here(self, sample: Sample, acceleration: float) -> Trajectory:
-        """Return the way from ``sample`` back to where it began, half as fast as it came.
+        """Return the path from ``sample`` back to its start, at half the speed of the way there.
 
         What lies between the first and the last time that the arm was here is left out: a pull
         that was stopped on its own way back is not pulled out again.
@@ -64,7 +64,7 @@ class WayBack:
             acceleration: [m/s^2].
 
         Raises:
-            SafetyStop: there is no way back, the arm left it, or stands otherwise than on it.
+            SafetyStop: there is no path back, the arm left it, or is in another configuration.
         """
         if not self._poses:
             raise SafetyStop("There is no path to return along.", "The robot has not followed any "

@@ -1,4 +1,4 @@
-"""Whether an arm stands where a motion begins, in the configuration that it was checked for.
+"""Checks that an arm is at the start of a motion, in the configuration that was checked.
 
 Several joint poses bring the gripper to the same place, and each of them again with joints a
 whole turn on. Reach, limits, singularities and obstacles were checked for one of them, so every
@@ -22,7 +22,7 @@ JOINT_RAD = 0.05
 
 def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
                   start_joints: np.ndarray | None, names: Sequence[str]) -> None:
-    """Refuse a motion that begins elsewhere than the arm stands, or in another configuration.
+    """Refuse a motion that starts away from the arm's pose, or in another configuration.
 
     Args:
         pose: Measured, base frame [m, rad], shape [6].

@@ -33,7 +33,7 @@ class SampleStream:
         timeout: Longest wait for an answer while connecting [s].
 
     Raises:
-        WorkError: nothing answers there, or what answers is no RTDE server.
+        WorkError: nothing answers at the address, or it is not an RTDE server.
     """
 
     def __init__(self, address: str, timeout: float = 2.0):
@@ -104,7 +104,7 @@ class SampleStream:
             beside: Other connections: what comes there ends the wait as well, without samples.
 
         Raises:
-            ConnectionError: the robot is gone.
+            ConnectionError: the connection to the robot was lost.
         """
         if not self._queue:
             ready = select.select([self._socket, *beside], [], [], timeout)[0]

@@ -68,7 +68,7 @@ class UrdfArm:
 
     @cached_property
     def reach(self) -> float:
-        """At most: with all links in a row, the last joint's place from the shoulder."""
+        """Upper bound: the distance of the last joint from the shoulder with all links in line."""
         places = self.link_frames(np.zeros(len(self.chain.joints)))[1:-1, :3, 3]
         return float(np.linalg.norm(places[0] - self.shoulder)
                      + np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
@@ -120,7 +120,7 @@ class UrdfArm:
 
     def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
         """Return the least singular value of the Jacobian in its greatest, lengths in reaches of
-        the arm, as a share of what it is in the arm's best pose, shape [..., 1]."""
+        the arm, as a fraction of its value in the arm's best pose, shape [..., 1]."""
         return self._conditions(joints) / self._best_condition
 
     def _conditions(self, joints: np.ndarray) -> np.ndarray:
@@ -194,7 +194,7 @@ def arm_of_file(name: str) -> UrdfArm:
     """Return the arm of a URDF file; its name is the file's.
 
     Raises:
-        InputError: there is none, or it describes no arm that Limber knows to move.
+        InputError: the file cannot be read, or does not describe a supported arm.
     """
     path = Path(name)
     try:

@@ -226,7 +226,7 @@ def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarra
     """Return the joint angles nearest to ``near`` that bring the tool to ``pose``.
 
     Raises:
-        Unreachable: there are none.
+        Unreachable: no joint angles reach it.
     """
     solutions = arm.inverse(matrices(pose) @ inverted(tool), near)
     solutions = solutions[np.isfinite(solutions).all(axis=1)]

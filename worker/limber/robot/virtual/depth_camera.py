@@ -59,8 +59,8 @@ class VirtualCamera:
 
 def views_around(middle: np.ndarray, distance: float, count: int,
                  camera: Camera = D455) -> list[Camera]:
-    """Return cameras all around a place [3], ``distance`` [m] from it, by turns a little above and
-    below.
+    """Return cameras all around a position [3], ``distance`` [m] from it, alternately a little
+    above and below.
     """
     if count < 1 or not distance > 0:
         raise InputError(f"{count} views from a distance of {distance:g} m were "

@@ -84,7 +84,7 @@ class VirtualRobot:
         return self.ask("state")
 
     def kill(self) -> None:
-        """End the process at once, as a power failure would."""
+        """End the process immediately, as a power failure would."""
         self.process.kill()
         self.process.wait()
 
