@@ -126,7 +126,7 @@ def test_no_pull_within_the_strain_is_said(subject, monkeypatch):
                         1.0)
     found = iter([made, *([None] * 20)])
     monkeypatch.setattr(next_pull, "_tried", lambda *_: next(found))
-    with pytest.raises(WorkError, match=r"of 8, 7 cannot be made and the gentlest .* 5 %"):
+    with pytest.raises(WorkError, match=r"7 of 8 are impossible, and the gentlest .* 5 %"):
         suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01,
                 workers=1)
 

@@ -75,7 +75,8 @@ def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
     if round_share < 0.15 and away > _STOUT * extent:
         raise InputError(
             f"Only {100 * round_share:.0f} % of the points lie on round axes. The points have a "
-            f"median distance of {away:.3g} m from their axes.", "The cloud does not have the shape of a branch.", _FIX)
+            f"median distance of {away:.3g} m from their axes.",
+            "The cloud does not have the shape of a branch.", _FIX)
 
 
 def check_no_sheet(points: np.ndarray) -> None:
