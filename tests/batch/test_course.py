@@ -13,10 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from limber.batch.batch_summary import write_page
 from limber.batch.jobs.job_file import read_jobs
 from limber.batch.records import Records, numbers_of, path_of_page
 from limber.batch.run import run_jobs
-from limber.batch.summary import write_page
 from limber.cli import main
 from limber.core.errors import BranchFolderError
 from limber.stages.shape.target import TargetSettings, set_target

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.planning.field import between
-from limber.planning.field.between import ask_between, disagreeing, jump
+from limber.planning.field import disagreeing_neighbours
 from limber.planning.field.chart import Chart
+from limber.planning.field.disagreeing_neighbours import ask_between, disagreeing, jump
 from limber.planning.field.solved import Solved
 from limber.planning.field.solver_pool import Crew
 
@@ -68,8 +68,8 @@ class Bow:
 @pytest.fixture
 def bow(monkeypatch):
     model = Bow(0.02)
-    monkeypatch.setattr(between, "taken", lambda branch, result: branch.solved(result))
-    return model
+    monkeypatch.setattr(disagreeing_neighbours, "taken",
+                        lambda branch, result: branch.solved(result))
 
 
 def places(count=60):
@@ -105,7 +105,7 @@ def test_what_many_poses_lie_near_is_asked_first(bow):
         pairs = disagreeing(known, PLAIN, USUAL[crowd], LENGTH)
         first = np.mean([positions[[a, b], 1].mean() for a, b, _ in pairs[:8]])
         assert first * USUAL[crowd, 1].mean() > 0.0
-        chosen = between._apart(pairs, known, np.empty((0, 3)), PLAIN)
+        chosen = disagreeing_neighbours._apart(pairs, known, np.empty((0, 3)), PLAIN)
         about = np.concatenate([pairs[k][2] for k in range(len(pairs))
                                 if any(known[pairs[k][0]] is pair[0] and known[pairs[k][1]] is
                                        pair[1] for pair, _ in chosen)])

@@ -12,15 +12,15 @@ from limber.planning.certificate.lower_bound import certify
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import knowing
 from limber.planning.field.trust import TrustRegion
-from limber.planning.goals.grasp import GraspGoal
+from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
-from limber.planning.goals.target import TargetGoal
+from limber.planning.goals.target_goal import TargetGoal
+from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import Limited, refine
 from limber.planning.planners.smoothing import smooth_cost
-from limber.planning.problem import GentleProblem
 from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import plan_pair
 

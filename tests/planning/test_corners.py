@@ -12,10 +12,10 @@ from limber.planning.cost import CostWeights
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.goals.allowed_poses import allowed_points
-from limber.planning.goals.grasp import GraspGoal
+from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
-from limber.planning.problem import GentleProblem
 
 RADIUS = 0.25  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 3e4  # [N/m] along the shell and across it

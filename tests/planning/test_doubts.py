@@ -13,10 +13,10 @@ from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals.grasp import GraspGoal
+from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
-from limber.planning.goals.target import TargetGoal
-from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
+from limber.planning.goals.target_goal import TargetGoal
+from limber.planning.path_problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
 
 START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)

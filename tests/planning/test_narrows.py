@@ -12,12 +12,12 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_field
-from limber.planning.goals.chosen import default_goal
-from limber.planning.goals.grasp import GraspGoal
+from limber.planning.goals.chosen_pose import default_goal
+from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.path_problem import GentleProblem, NoWayError
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
-from limber.planning.problem import GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import plan_within
 from limber.planning.undecided_passages import asked_in_doubt

@@ -13,7 +13,7 @@ from limber.cli.main import call
 from limber.core.errors import InputError, NoPathError
 from limber.core.settings import Groups
 from limber.planning.goals.goal import GoalKind
-from limber.planning.goals.kinds import KINDS
+from limber.planning.goals.goal_kinds import KINDS
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
 from limber.results.scene.paths import _goal as drawn

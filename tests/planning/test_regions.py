@@ -10,9 +10,9 @@ from limber.planning.field.energy_field import fit_field
 from limber.planning.goals.allowed_poses import goal_points
 from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import GoalRequest
-from limber.planning.goals.kinds import goal_of
+from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.regions import Ball, BoxRegion
-from limber.planning.goals.target import TargetGoal
+from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import plan_pair
 

@@ -10,10 +10,10 @@ from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
 from limber.planning.cost import CostWeights, measure_path
 from limber.planning.goals.allowed_poses import goal_points
-from limber.planning.goals.chosen import default_goal
-from limber.planning.goals.grasp import GraspGoal
+from limber.planning.goals.chosen_pose import default_goal
+from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
-from limber.planning.goals.target import TargetGoal
+from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.planners.ompl_engine import OmplRrtStar
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import plan_path

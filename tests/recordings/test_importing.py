@@ -12,8 +12,8 @@ from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, read_camera, write_camera
 from limber.perception.observe import list_frames, read_depth, write_depth
-from limber.recordings.importing.formats import RECORDINGS
 from limber.recordings.importing.import_request import ImportRequest
+from limber.recordings.importing.recording_formats import RECORDINGS
 from limber.recordings.masks import read_mask
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.settings import ImportSettings

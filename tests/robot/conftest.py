@@ -11,7 +11,7 @@ import pytest
 from benchmarks.held_up import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
-from limber.mechanics.status import Status
+from limber.mechanics.solve_status import Status
 from limber.robot.virtual.controller import Controller
 from limber.store import Branch
 from limber.store.loading import load_grasp_model, load_skeleton

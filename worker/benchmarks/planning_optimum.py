@@ -6,7 +6,7 @@ It shares with the planner the field alone: no polyline, no penalty rounds, no g
 import numpy as np
 from scipy.optimize import minimize
 
-from limber.planning.problem import GentleProblem
+from limber.planning.path_problem import GentleProblem
 
 _MODES = 7
 _POINTS = 121  # of the quadrature; Simpson's rule

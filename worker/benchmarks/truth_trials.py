@@ -27,6 +27,7 @@ from benchmarks.truth_branch import (
 )
 from limber.core.errors import Cancelled, LimberError
 from limber.core.json_values import plain
+from limber.estimation.estimate_summary import details, summary
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
 from limber.estimation.fitting.evaluations import EvaluationLog
@@ -36,7 +37,6 @@ from limber.estimation.judgement import Estimate, judge_model, require_result
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.summary import details, summary
 from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.model_error import total_interval
 from limber.geometry.skeleton.control_points import control_points

@@ -101,7 +101,7 @@ def _masses(branch: Branch) -> Any:
 def _planned(branch: Branch) -> Any:
     """A plan's JSON and tables as scene and report show them."""
     from limber.planning.plan_file import read_plan
-    from limber.results.report.tables import comparison_rows
+    from limber.results.report.report_tables import comparison_rows
 
     plan = read_plan(branch.path("plans/to-goal.json"))
     comparison_rows(plan.summary)
@@ -118,7 +118,12 @@ def _sampled(branch: Branch) -> Any:
 def _estimated(branch: Branch) -> Any:
     """An estimate as the report tells it, and as `limber predict` takes it up to its solve."""
     from limber.estimation.estimate_file import read_estimate
-    from limber.results.report.tables import cause_rows, deviation_rows, held_out_rows, modulus_rows
+    from limber.results.report.report_tables import (
+        cause_rows,
+        deviation_rows,
+        held_out_rows,
+        modulus_rows,
+    )
 
     known = read_estimate(branch.path("estimate.json"))
     modulus_rows(known, None), cause_rows(known), deviation_rows(known), held_out_rows(known)

@@ -22,7 +22,7 @@ from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.planning.problem import UNPROVEN
+from limber.planning.path_problem import UNPROVEN
 from limber.robot.cell.base_calibration import fit_base
 from limber.robot.cell.cell import Cell
 from limber.robot.known_arms import arm_named

@@ -9,7 +9,7 @@ from tests.subjects.processes import left_alive
 
 from limber.core.errors import WorkError
 from limber.core.processes.child_module import run_module
-from limber.core.processes.limits import Limits
+from limber.core.processes.process_limits import Limits
 
 CHILD = """
 import subprocess, sys, time

@@ -31,7 +31,7 @@ from limber.mechanics import (
 )
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.materials import law as law_module
-from limber.mechanics.materials import registry
+from limber.mechanics.materials import material_registry
 from limber.mechanics.materials.law import contracted, determinant, right_cauchy_green
 from limber.mechanics.pull_simulation import SimulateSettings
 from limber.mechanics.strain import peak_load, strain_state
@@ -95,7 +95,7 @@ NAMES = [law.name for law in LAWS]
 @pytest.fixture(autouse=True)
 def known(monkeypatch):
     """These laws, registered for one test."""
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(material_registry, "_registered", {})
     for law in LAWS:
         register_material(law)
 
@@ -386,7 +386,7 @@ def test_another_process_gets_it(mesh):
     """A model goes to the processes of a pool with its law; what they compute is the same."""
     model = make_model(mesh, "mooney_rivlin")
     moved = 0.02 * mesh.nodes
-    registry._registered.clear()
+    material_registry._registered.clear()
     again = pickle.loads(pickle.dumps(model))
     assert np.array_equal(again.internal(moved).force, model.internal(moved).force)
     with pytest.raises(InputError, match="no material 'mooney_rivlin'"):
@@ -425,4 +425,4 @@ def test_a_wrong_law_is_refused(trouble):
     """Each for its own reason, when it is registered."""
     with pytest.raises(InputError, match=trouble):
         register_material(_law(**WRONG[trouble]))
-    assert register_material(_law()).name in registry.material_names()
+    assert register_material(_law()).name in material_registry.material_names()

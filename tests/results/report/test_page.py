@@ -13,7 +13,7 @@ from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.results.report import swing_section
 from limber.results.report.estimate_figures import young_along_branch
 from limber.results.report.page import draw_page
-from limber.results.report.tables import (
+from limber.results.report.report_tables import (
     cause_rows,
     comparison_rows,
     deviation_rows,

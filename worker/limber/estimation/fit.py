@@ -1,7 +1,7 @@
 """Fit Young's modulus along a branch to its pulls: initial values and fit.
 
 :mod:`limber.estimation.judgement` holds the result and its uncertainty.
-:mod:`limber.estimation.summary` selects what is written.
+:mod:`limber.estimation.estimate_summary` selects what is written.
 """
 
 from collections.abc import Callable

@@ -34,7 +34,7 @@ _PLACES = {
     "solve_static": "statics.solve",
     "static_sensitivities": "sensitivities",
     "unloaded_rest_shape": "statics.rest_shape",
-    "register_material": "materials.registry",
+    "register_material": "materials.material_registry",
     "young_weights": "materials.young_field",
 }
 

@@ -27,6 +27,7 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.grip import stiffening
 from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials.law import MaterialLaw, hooke_strain, hooke_stress
+from limber.mechanics.materials.material_registry import material_named
 from limber.mechanics.materials.materials import (
     RayleighDamping,
     check_poisson,
@@ -34,7 +35,6 @@ from limber.mechanics.materials.materials import (
     lame,
     per_tet,
 )
-from limber.mechanics.materials.registry import material_named
 from limber.mechanics.mesh_data import MeshData
 from limber.mechanics.prestress import Hanging, carried
 

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from limber.core.settings import Groups, OneOf, Settings
-from limber.mechanics.materials.registry import material_names
+from limber.mechanics.materials.material_registry import material_names
 
 Point = tuple[float, float, float]
 PointLoad = tuple[float, float, float, float, float, float]

@@ -24,14 +24,14 @@ from limber.planning.field.energy_field import EnergyField, knowing, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import displacements_at
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
-from limber.planning.goals.kinds import goal_of
+from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_side
+from limber.planning.path_problem import NoWayError
+from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
 from limber.planning.planners.tree_search import SearchTree
-from limber.planning.problem import NoWayError
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
-from limber.planning.start import start_of
 from limber.planning.timing import DEFAULT_PACE, Pace
 from limber.planning.two_paths import PathPair, plan_within
 from limber.planning.undecided_passages import Narrows, asked_in_doubt, said_after

@@ -9,7 +9,7 @@ from limber.planning.constraints.full_model_check import field_error
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.goal import Goal
-from limber.planning.goals.kinds import asked_kinds
+from limber.planning.goals.goal_kinds import asked_kinds
 from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.planners.trees import chosen_engine
 from limber.planning.settings import PlanSettings

@@ -11,22 +11,22 @@ from limber.planning.certificate.lower_bound import Certificate
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.field.limited import UNITS
+from limber.planning.field.limited_quantities import UNITS
 from limber.planning.goals.allowed_poses import (
     GoalOverLimitsError,
     allowed_points,
     goal_points,
 )
 from limber.planning.goals.goal import Goal
-from limber.planning.goals.grasp import near
+from limber.planning.goals.grasp_goal import near
+from limber.planning.path_problem import UNPROVEN, GentleProblem, NoWayError
+from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.refine import refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
-from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
-from limber.planning.start import check_start
 
 _SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
 _AT_START = 1e-4  # [m] the approach ends that near

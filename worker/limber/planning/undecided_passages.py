@@ -10,12 +10,12 @@ from limber.planning.constraints.limits import Limits, sizes
 from limber.planning.cost import STEP, resample
 from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.limited import UNITS
+from limber.planning.field.limited_quantities import UNITS
 from limber.planning.goals.goal import Goal
-from limber.planning.goals.grasp import near
+from limber.planning.goals.grasp_goal import near
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path
+from limber.planning.path_problem import NoWayError
 from limber.planning.planners.easiest import easiest_way
-from limber.planning.problem import NoWayError
 
 
 @dataclass(frozen=True)

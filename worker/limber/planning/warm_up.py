@@ -4,7 +4,7 @@ import numpy as np
 
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.energy_field import GraspSamples, fit_field
-from limber.planning.goals.grasp import GraspGoal
+from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.two_paths import PlanSettings, plan_pair
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from limber.core.settings import Groups, OneOf, Settings
-from limber.recordings.importing.formats import kind_names
+from limber.recordings.importing.recording_formats import kind_names
 
 
 class ImportSettings(Settings):

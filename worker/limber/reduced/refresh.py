@@ -15,9 +15,9 @@ from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics.problem import StaticProblem, make_result
+from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult
-from limber.mechanics.status import Status
+from limber.mechanics.statics.static_problem import StaticProblem, make_result
 from limber.reduced.building import build_reduced, reduce_snapshots
 from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.state import ReducedSettings, ReducedState

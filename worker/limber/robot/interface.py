@@ -166,7 +166,7 @@ class Sample:
 
 
 class ArmControl(Protocol):
-    """An open controller, as the loop of :mod:`limber.robot.driver.loop` moves its arm.
+    """An open controller, as the loop of :mod:`limber.robot.driver.control_loop` moves its arm.
 
     Whoever opens one has seen that it is the cell's and may be moved. Forces, tare and every limit
     are the loop's own: a control only reads and sends.

@@ -66,7 +66,7 @@ def compared(truth: TrueBranch, moved: np.ndarray, told: Told, executed: dict[st
 
 def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     """Return titles and tables of what a loop found, for a terminal."""
-    from limber.results.report.tables import modulus_rows
+    from limber.results.report.report_tables import modulus_rows
 
     force = [["force along the path", ""],
              ["predicted peak", f"{result['predicted_peak_force_n']:.2f} N"],

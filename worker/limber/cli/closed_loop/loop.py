@@ -36,7 +36,7 @@ from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, true_branch
 from limber.geometry.generated import read_truth
 from limber.geometry.io.skeletons import read_swc
-from limber.planning.problem import UNPROVEN
+from limber.planning.path_problem import UNPROVEN
 from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.known_arms import arm_named
 from limber.robot.virtual.branch_solver import BranchSetting

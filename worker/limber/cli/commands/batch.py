@@ -54,11 +54,11 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     runs. Run it again after a stop, or after inputs have changed: what is up to date is kept.
     The results stand in OUT/JOBS.csv, one row a branch, and OUT/JOBS.html.
     """
+    from limber.batch.batch_summary import counts, failures, write_page, write_table
     from limber.batch.jobs.job_file import read_jobs
     from limber.batch.machines.staging import put_summary
     from limber.batch.records import Records, path_of_page, path_of_table
     from limber.batch.run import plan_of, run_jobs
-    from limber.batch.summary import counts, failures, write_page, write_table
     from limber.core.errors import InputError, WorkError
 
     if cluster is not None and scheduler is not None:

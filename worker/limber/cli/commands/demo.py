@@ -215,7 +215,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _show_tables(demo: _Demo) -> None:
-    from limber.results.report.tables import comparison_rows, held_sentence, modulus_rows
+    from limber.results.report.report_tables import comparison_rows, held_sentence, modulus_rows
 
     if "estimate" in demo.results:
         estimate, pull = demo.results["estimate"], demo.results["virtual-pull"]

@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from limber.core.processes.family import kill_tree
-from limber.core.processes.limits import Limits, LimitWatch
+from limber.core.processes.process_limits import Limits, LimitWatch
+from limber.core.processes.process_tree import kill_tree
 
 _TICK_SECONDS, _MEMORY_SECONDS = 0.05, 0.1
 

@@ -19,7 +19,6 @@ from typing import Any
 
 from limber.core.errors import Cancelled, DamagedCacheWarning, WorkError
 from limber.core.processes.budget import core_budget, worker_count
-from limber.core.processes.limits import UNLIMITED, Limits
 from limber.core.processes.pool_process import (
     Began,
     CacheDamaged,
@@ -29,6 +28,7 @@ from limber.core.processes.pool_process import (
     Task,
 )
 from limber.core.processes.pool_worker import Job, Worker
+from limber.core.processes.process_limits import UNLIMITED, Limits
 from limber.core.progress import SILENT, Progress
 
 _TICK_SECONDS = 0.1

@@ -7,9 +7,9 @@ from typing import Any
 
 from limber.core.errors import Cancelled, WorkError
 from limber.core.present import present
-from limber.core.processes.family import kill_tree
-from limber.core.processes.limits import Limits, LimitWatch
 from limber.core.processes.pool_process import Reported, Task, serve
+from limber.core.processes.process_limits import Limits, LimitWatch
+from limber.core.processes.process_tree import kill_tree
 from limber.core.progress import Progress
 
 

@@ -14,8 +14,8 @@ from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, W
 from limber.core.json_lines import json_object
 from limber.core.processes.budget import CORES
 from limber.core.processes.ending import PARENT_PIPE
-from limber.core.processes.family import kill_tree
-from limber.core.processes.limits import UNLIMITED, Limits, LimitWatch
+from limber.core.processes.process_limits import UNLIMITED, Limits, LimitWatch
+from limber.core.processes.process_tree import kill_tree
 from limber.core.progress import SILENT, Progress
 
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop, 130: Cancelled}

@@ -16,8 +16,8 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.present import present
-from limber.recordings.importing.formats import RECORDINGS
 from limber.recordings.importing.import_request import ImportRequest
+from limber.recordings.importing.recording_formats import RECORDINGS
 from limber.recordings.tables import read_table, split_title, time_stream
 from limber.recordings.time_series import Stream
 

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.flat_sheets import find_sheet
 from limber.geometry.cloud.ground import find_ground
 from limber.geometry.cloud.scan_lines import scan_line_view
-from limber.geometry.cloud.sheets import find_sheet
 from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels
 from limber.geometry.settings import PreparationSettings
 

@@ -16,7 +16,7 @@ from limber.core.files.reading import read_arrays
 from limber.core.lazy import loaded
 from limber.core.processes.child_module import run_module
 from limber.core.processes.ending import end_by_kernel
-from limber.core.processes.limits import Limits
+from limber.core.processes.process_limits import Limits
 
 _LEAST_SECONDS, _SECONDS_PER_MB = 8.0, 2.0
 _LEAST_MB, _MB_PER_MB = 1500.0, 60.0

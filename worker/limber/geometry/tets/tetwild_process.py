@@ -15,7 +15,7 @@ import numpy as np
 from limber.core.errors import MeshingError, MissingDependencyError, WorkError
 from limber.core.processes.child_module import run_module
 from limber.core.processes.ending import end_by_kernel
-from limber.core.processes.limits import Limits
+from limber.core.processes.process_limits import Limits
 from limber.core.progress import SILENT, Progress
 
 

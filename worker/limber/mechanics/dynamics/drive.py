@@ -11,9 +11,9 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Equations
 from limber.mechanics.model import BranchModel
 from limber.mechanics.motion_state import MotionState
-from limber.mechanics.statics.problem import checked_forces
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
+from limber.mechanics.statics.static_problem import checked_forces
 
 
 class Drive:

@@ -24,7 +24,7 @@ from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.materials.law import contracted, hooke_strain
 from limber.mechanics.motion_state import MotionState
-from limber.mechanics.status import Status
+from limber.mechanics.solve_status import Status
 
 _STRAIN_CHANGE = 1e-6
 """Under this change of the strain in a step its cube, which Gonzalez' part is of, is round-off."""

@@ -32,9 +32,9 @@ from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.model import BranchModel
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.sensitivities import ParameterSet, reactions
-from limber.mechanics.statics.problem import base_forces, checked_forces, strain_warnings
+from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import StaticResult
-from limber.mechanics.status import Status
+from limber.mechanics.statics.static_problem import base_forces, checked_forces, strain_warnings
 from limber.mechanics.strain import principal_stretch
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.core.errors import ConvergenceError, InputError
 from limber.mechanics.motion_state import MotionState
-from limber.mechanics.status import Status
+from limber.mechanics.solve_status import Status
 
 
 @dataclass(frozen=True)

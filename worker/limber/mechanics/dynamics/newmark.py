@@ -10,7 +10,7 @@ from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.motion_state import MotionState
-from limber.mechanics.status import Status
+from limber.mechanics.solve_status import Status
 
 _GOOD_TANGENT = 1e-3
 """Part of the residual that a tangent's own solve may leave for the next step to begin with it:

@@ -9,7 +9,7 @@ from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.motion_state import MotionState
-from limber.mechanics.status import Status
+from limber.mechanics.solve_status import Status
 
 
 class Stepper(ABC):

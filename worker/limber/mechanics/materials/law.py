@@ -10,7 +10,7 @@ A law is a subclass of :class:`MaterialLaw` with a name and an energy density:
 ...         squares = (strain**2 @ [1.0, 1, 1, 2, 2, 2])
 ...         return 0.5 * lame_lambda * (trace**2 + trace**3) + lame_mu * squares
 
-:func:`~limber.mechanics.materials.registry.register_material` makes it known by its name.
+:func:`~limber.mechanics.materials.material_registry.register_material` makes it known by its name.
 Tensors are written in one row, 00 11 22 01 02 12.
 """
 

@@ -9,10 +9,15 @@ from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import Progress
 from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import InternalState
-from limber.mechanics.statics.problem import StaticProblem, Target, make_result, strain_warnings
+from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.snap import settle
-from limber.mechanics.status import Status
+from limber.mechanics.statics.static_problem import (
+    StaticProblem,
+    Target,
+    make_result,
+    strain_warnings,
+)
 from limber.mechanics.strain import principal_stretch
 
 _SOFT_DET_F = 0.75

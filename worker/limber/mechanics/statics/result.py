@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from limber.core.errors import ConvergenceError
-from limber.mechanics.status import Status
+from limber.mechanics.solve_status import Status
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 
 from limber.core.progress import SILENT
 from limber.mechanics.statics.path import Path
-from limber.mechanics.statics.problem import Target
 from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.statics.static_problem import Target
 
 _SAME = 1e-3
 """How near to the start, as part of the branch's extent, is the start."""

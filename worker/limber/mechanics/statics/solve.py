@@ -15,11 +15,11 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.path import Path
-from limber.mechanics.statics.problem import StaticProblem, Target
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.statics.return_path import doubt_of
-from limber.mechanics.status import Status
+from limber.mechanics.statics.static_problem import StaticProblem, Target
 
 
 def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = None,

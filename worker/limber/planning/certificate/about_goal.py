@@ -8,7 +8,7 @@ import scipy
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR
 from limber.planning.certificate.grid import CUT, Grid, spread
 from limber.planning.certificate.subsolution import Terrain, corner_values, second_differences
-from limber.planning.problem import GentleProblem
+from limber.planning.path_problem import GentleProblem
 
 _BEYOND = 1.2  # on the steepest measured growth of the goal's distance
 

@@ -27,7 +27,7 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import FieldArrays
 from limber.planning.field.trust import nearest_of
 from limber.planning.goals.allowed_poses import allowed_points
-from limber.planning.problem import GentleProblem
+from limber.planning.path_problem import GentleProblem
 
 _ALONG, _ACROSS = 20, 40  # cells along the shell, each way, and off it
 _EVEN = 26  # each way where there is no shell

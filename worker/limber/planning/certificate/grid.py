@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.planning.certificate.subsolution import RIM
-from limber.planning.problem import GentleProblem
+from limber.planning.path_problem import GentleProblem
 
 _FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
 CUT = 3

@@ -33,7 +33,7 @@ from limber.planning.certificate.subsolution import (
     terrain,
     widened,
 )
-from limber.planning.problem import GentleProblem, NoWayError, no_way, not_found
+from limber.planning.path_problem import GentleProblem, NoWayError, no_way, not_found
 from limber.planning.search_files import CostToGo
 
 _MOST_CELLS = 800_000  # of any grid's tube; the next refinement is left away

@@ -15,7 +15,7 @@ from limber.mechanics.materials.species import strain_limit
 from limber.planning.constraints.constraint import Broken, Constraint
 from limber.planning.constraints.obstacles import Obstacle, Obstacles
 from limber.planning.field.energy_field import EnergyField, FieldArrays, GraspSamples
-from limber.planning.field.limited import UNITS
+from limber.planning.field.limited_quantities import UNITS
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 

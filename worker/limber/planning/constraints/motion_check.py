@@ -20,7 +20,7 @@ from limber.planning.constraints.constraint import Broken
 from limber.planning.constraints.limits import Limits, sizes, with_unit
 from limber.planning.cost import STEP
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.limited import UNITS
+from limber.planning.field.limited_quantities import UNITS
 from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.timing import Pace, poses_at, time_law
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.between import neighbours
+from limber.planning.field.disagreeing_neighbours import neighbours
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import Sampled

@@ -17,8 +17,8 @@ import scipy
 
 from limber.core.errors import ConvergenceError, WorkError
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.between import ask_between
 from limber.planning.field.chart import Chart
+from limber.planning.field.disagreeing_neighbours import ask_between
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach
 from limber.planning.field.guess import guess_of
@@ -66,7 +66,7 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
                  progress: Progress = SILENT) -> Sampled:
     """Solve the branch at ``settings.samples`` poses: two thirds of them spread over where its
     grasp may be taken, the others between neighbours that do not agree
-    (:mod:`limber.planning.field.between`).
+    (:mod:`limber.planning.field.disagreeing_neighbours`).
 
     Raises:
         WorkError: the grasp has hardly any room. ConvergenceError: the branch has no rest state.

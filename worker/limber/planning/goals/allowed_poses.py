@@ -5,7 +5,7 @@ import numpy as np
 from limber.core.errors import NoPathError
 from limber.core.numerics.compiled import compiled
 from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
-from limber.planning.field.limited import limited
+from limber.planning.field.limited_quantities import limited
 from limber.planning.goals.goal import Goal
 
 _MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off

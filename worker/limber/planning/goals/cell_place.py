@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from limber.core.errors import InputError
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.goal import CellPlace, GoalKind, GoalRequest
-from limber.planning.goals.target import TargetGoal, target_of
+from limber.planning.goals.target_goal import TargetGoal, target_of
 from limber.planning.path_on_full_model import SolvedPoses
 
 

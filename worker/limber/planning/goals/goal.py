@@ -1,6 +1,7 @@
 """What a goal of a plan is, and what a kind of goal says of itself.
 
-A kind stands in a file of its own beside this one; :mod:`limber.planning.goals.kinds` has the list.
+A kind stands in a file of its own beside this one; :mod:`limber.planning.goals.goal_kinds` has the
+list.
 """
 
 from collections.abc import Callable, Mapping

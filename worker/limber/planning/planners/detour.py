@@ -20,9 +20,9 @@ import scipy
 from limber.core.errors import NoPathError
 from limber.core.progress import SILENT, Progress
 from limber.planning.cost import arc_lengths, resample
+from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.refine import refine
-from limber.planning.problem import GentleProblem
 
 _RANGE = (1e-2, 1e3)  # of the weight of a metre, times that which was given
 _STEPS = 8  # of the search for the weight

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.field.limited import limited
+from limber.planning.field.limited_quantities import limited
 from limber.planning.goals.goal import Goal
 
 _ALONG, _ACROSS = 64, 48  # points of the grid along the shell, each way, and off it

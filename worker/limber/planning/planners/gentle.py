@@ -14,9 +14,9 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
+from limber.planning.path_problem import GentleProblem, no_way, not_found
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.refine import refine
-from limber.planning.problem import GentleProblem, no_way, not_found
 
 
 @dataclass(frozen=True)

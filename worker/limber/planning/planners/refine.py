@@ -20,8 +20,8 @@ import scipy
 
 from limber.planning.cost import resample
 from limber.planning.field.trust import nearest_of
+from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.smoothing import smooth_cost
-from limber.planning.problem import GentleProblem
 
 _EDGES = 48  # of the polyline while it is moved; limits are asked half-way as well
 _FINE = 0.001  # [m] between points of what is returned: chords in space leave a valley

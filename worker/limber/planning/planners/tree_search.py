@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from limber.core.progress import Progress
-from limber.planning.problem import GentleProblem
+from limber.planning.path_problem import GentleProblem
 
 
 @dataclass(frozen=True, kw_only=True)

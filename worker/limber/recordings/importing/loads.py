@@ -10,12 +10,12 @@ from limber.core.errors import InputError
 from limber.core.present import present
 from limber.recordings.cell_errors import WITHOUT_GRIPPER
 from limber.recordings.hung_load import settled, swung
-from limber.recordings.importing.formats import RecordingFormat
 from limber.recordings.importing.import_request import (
     ImportRequest,
     require_near,
     require_on_branch,
 )
+from limber.recordings.importing.recording_formats import RecordingFormat
 from limber.recordings.recording import Observations, Pull, SwingEntry, write_pull
 from limber.recordings.time_series import Stream
 

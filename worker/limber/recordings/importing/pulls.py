@@ -8,7 +8,6 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope
-from limber.recordings.importing.formats import RECORDINGS, RecordingFormat, recording_format
 from limber.recordings.importing.import_request import (
     ImportRequest,
     of_known_robot,
@@ -16,6 +15,11 @@ from limber.recordings.importing.import_request import (
 )
 from limber.recordings.importing.loads import import_load, require_loadable
 from limber.recordings.importing.readers import read_robot
+from limber.recordings.importing.recording_formats import (
+    RECORDINGS,
+    RecordingFormat,
+    recording_format,
+)
 from limber.recordings.recording import Observations, Pull, PullEntry, write_entry, write_pull
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import estimate_offset

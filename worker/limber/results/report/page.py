@@ -17,20 +17,20 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.motion_files import read_frames_file
 from limber.results.report import figures, loads_section, swing_section
 from limber.results.report.path_sections import energy_section, execution_section, plan_section
-from limber.results.report.ringing_section import vibration_rows
-from limber.results.report.section import Section, inline_png, read_png
-from limber.results.report.shape_sections import (
-    cylinders_section,
-    mesh_section,
-    scan_section,
-)
-from limber.results.report.tables import (
+from limber.results.report.report_tables import (
     ASSUMED,
     cause_rows,
     deviation_rows,
     held_out_rows,
     is_assumed,
     modulus_rows,
+)
+from limber.results.report.ringing_section import vibration_rows
+from limber.results.report.section import Section, inline_png, read_png
+from limber.results.report.shape_sections import (
+    cylinders_section,
+    mesh_section,
+    scan_section,
 )
 from limber.store import Branch
 from limber.version import VERSION

@@ -5,8 +5,8 @@ from limber.core.files.reading import read_arrays
 from limber.planning.field.energy_field import EnergyField
 from limber.results.report import execution_section as execution
 from limber.results.report import figures
+from limber.results.report.report_tables import comparison_rows
 from limber.results.report.section import Section
-from limber.results.report.tables import comparison_rows
 from limber.store import Branch
 
 

@@ -9,14 +9,14 @@ from limber.geometry.skeleton import qsm_tables
 from limber.geometry.skeleton.doubtful_parts import Doubt, doubtful_parts
 from limber.geometry.skeleton.qsm_tables import Caliper
 from limber.results.report import figures
-from limber.results.report.section import Section
-from limber.results.report.tables import (
+from limber.results.report.report_tables import (
     caliper_rows,
     diameter_rows,
     doubt_rows,
     order_rows,
     share_rows,
 )
+from limber.results.report.section import Section
 from limber.store import Branch
 from limber.store.loading import load_skeleton, load_targets
 

@@ -16,8 +16,8 @@ import time
 
 from limber.core.errors import LimberError
 from limber.robot.cell.cell import Cell
+from limber.robot.driver.control_loop import Driver, Orders
 from limber.robot.driver.deadline import clear_deadline
-from limber.robot.driver.loop import Driver, Orders
 from limber.robot.driver.messages import Words
 
 _LAST_SECONDS = 10.0  # from when nobody gives orders any more; a stop takes one at most

@@ -18,7 +18,7 @@ from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
 from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
 from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
-from limber.robot.virtual.load import Load, Nothing
+from limber.robot.virtual.payload import Load, Nothing
 from limber.robot.virtual.program import ControlProgram
 from limber.robot.virtual.step_kernels import tool_state
 

@@ -84,10 +84,10 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 
 def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
               progress: Progress) -> dict[str, Any]:
+    from limber.estimation.estimate_summary import details, summary
     from limber.estimation.fit import fit_branch
     from limber.estimation.fitting.evaluations import EvaluationLog
     from limber.estimation.judgement import judge_model, require_result
-    from limber.estimation.summary import details, summary
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
 
     names = pull_names(branch, settings)
@@ -258,7 +258,7 @@ def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: Estim
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.tables import cause_rows, held_out_rows, modulus_rows
+    from limber.results.report.report_tables import cause_rows, held_out_rows, modulus_rows
 
     tables = [("Young's modulus", modulus_rows(result, None))]
     if causes := cause_rows(result):

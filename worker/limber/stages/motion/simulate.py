@@ -64,7 +64,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
             frames up to there are written.
     """
     from limber.mechanics.materials.law import law_digest
-    from limber.mechanics.materials.registry import material_named
+    from limber.mechanics.materials.material_registry import material_named
     from limber.mechanics.pull_simulation import (
         load_case_of,
         motion_of,

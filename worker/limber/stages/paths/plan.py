@@ -186,7 +186,7 @@ class _InCell:
     def check_goal(self, settings: PlanSettings) -> None:
         """Raise NoPathError where the goal that is given lies inside an obstacle."""
         from limber.planning.constraints.obstacles import closest
-        from limber.planning.goals.kinds import asked_kinds
+        from limber.planning.goals.goal_kinds import asked_kinds
 
         places = [getattr(settings, kind.name) for kind in asked_kinds(settings) if kind.is_place]
         for place in places:
@@ -300,7 +300,7 @@ def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | N
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.tables import comparison_rows
+    from limber.results.report.report_tables import comparison_rows
 
     return [("Both paths, on the full model", comparison_rows(result))]
 

@@ -14,7 +14,7 @@ from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.geometry.io.formats import listed
-from limber.recordings.importing.formats import RECORDINGS, recording_format
+from limber.recordings.importing.recording_formats import RECORDINGS, recording_format
 from limber.recordings.settings import ImportSettings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, required
 from limber.stages.registry import StageDescription

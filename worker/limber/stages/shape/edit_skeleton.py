@@ -228,7 +228,7 @@ def _told(doubt: Doubt, alignment: Alignment) -> dict[str, Any]:
 
 def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
     """Return the doubtful parts as a table."""
-    from limber.results.report.tables import doubt_rows
+    from limber.results.report.report_tables import doubt_rows
 
     doubtful = result["doubtful"]
     if not doubtful:

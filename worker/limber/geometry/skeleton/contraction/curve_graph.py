@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.joining.join_pieces import join_pieces
 from limber.geometry.skeleton.joining.pieces import Joined, edge_matrix, specks
-from limber.geometry.skeleton.repair.ties import untied
+from limber.geometry.skeleton.repair.false_connections import untied
 
 _Z = np.array([0.0, 0.0, 1.0])
 

@@ -6,7 +6,7 @@ from limber.core.errors import NoPathError
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.goal import GoalKind, GoalRequest
-from limber.planning.goals.grasp import GraspGoal, near
+from limber.planning.goals.grasp_goal import GraspGoal, near
 from limber.planning.goals.regions import ball
 
 

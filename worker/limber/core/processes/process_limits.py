@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 
 from limber.core.errors import WorkError
-from limber.core.processes.family import memory_mb
+from limber.core.processes.process_tree import memory_mb
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,14 @@ from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import control_of
+from limber.robot.driver.current_motion import Following, UnderWay
 from limber.robot.driver.deadline import CONNECT_SECONDS, RenewedDeadline, set_deadline
+from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain, open_sensor
 from limber.robot.driver.guard import PLAYING, Guard, GuardSettings, State
-from limber.robot.driver.hold_ups import HoldUps
+from limber.robot.driver.judged_samples import Senses
 from limber.robot.driver.messages import Words
 from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
-from limber.robot.driver.senses import Senses
-from limber.robot.driver.under_way import Following, UnderWay
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.retreat import WayBack

@@ -10,8 +10,8 @@ from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.linear.equations import Equations
 from limber.mechanics.model import BranchModel, InternalState
+from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import StaticResult, StaticSettings
-from limber.mechanics.status import Status
 from limber.mechanics.strain import Place
 
 

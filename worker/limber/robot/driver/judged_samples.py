@@ -8,10 +8,10 @@ import numpy as np
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
 from limber.robot.cell.cell import Cell
+from limber.robot.driver.current_motion import UnderWay
+from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain
 from limber.robot.driver.guard import Guard, Verdict
-from limber.robot.driver.hold_ups import HoldUps
-from limber.robot.driver.under_way import UnderWay
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.retreat import WayBack
 from limber.robot.motion.trajectory import Trajectory

@@ -2,10 +2,10 @@
 
 from limber.core.errors import InputError
 from limber.planning.goals.cell_place import IN_VIEW, SECOND_ARM
-from limber.planning.goals.chosen import DRAWN, default_goal
+from limber.planning.goals.chosen_pose import DRAWN, default_goal
 from limber.planning.goals.goal import Goal, GoalKind, GoalRequest
-from limber.planning.goals.grasp import AT_PLACE
-from limber.planning.goals.target import IN_BALL, IN_BOX
+from limber.planning.goals.grasp_goal import AT_PLACE
+from limber.planning.goals.target_goal import IN_BALL, IN_BOX
 from limber.planning.settings import PlanSettings
 
 KINDS = [AT_PLACE, IN_BALL, IN_BOX, IN_VIEW, SECOND_ARM, DRAWN]
