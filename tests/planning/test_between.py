@@ -70,6 +70,7 @@ def bow(monkeypatch):
     model = Bow(0.02)
     monkeypatch.setattr(disagreeing_neighbours, "taken",
                         lambda branch, result: branch.solved(result))
+    return model
 
 
 def places(count=60):

@@ -218,7 +218,7 @@ def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, re
             place = read_cell(path).arm.forward(np.array([0.1, -1.5, 1.4, -1.2, -1.5, 0.2]))
             assert np.allclose(pull.poses[0, :3], pose_vectors(place)[:3])
         else:
-            with pytest.raises(InputError, match=r"joints are named .*waist, shoulder_lift_joint"):
+            with pytest.raises(InputError, match=r"joints are named.*waist, shoulder_lift_joint"):
                 import_pull(bare_folder, tmp_path / "joints.mcap", "k", settings)
 
 
