@@ -1,4 +1,4 @@
-"""What a branch's mesh determines: operators, equations, masses; shared by its models."""
+"""Quantities that a branch's mesh determines: operators, equations, masses."""
 
 import copy
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from limber.mechanics.linear.equations import Equations
 
 
 class MeshData:
-    """What depends on the mesh alone; shared by all models of it."""
+    """Quantities that depend on the mesh only; shared by all its models."""
 
     def __init__(self, mesh: TetMesh, fixed: np.ndarray):
         self.fixed = fixed

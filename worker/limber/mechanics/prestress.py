@@ -1,4 +1,4 @@
-"""A branch that was scanned while it hung: how its weight acts from then on.
+"""A rest shape prestressed by gravity: how the weight acts in later states.
 
 The scanned shape x is an equilibrium: some stress S0 in it carries the weight,
 
@@ -43,7 +43,7 @@ _YOUNG, _POISSON = 1e9, 0.35
 
 @dataclass(frozen=True)
 class CarriedWeight:
-    """What carries a load in the scanned shape; linear in the load.
+    """The prestress that carries a load in the scanned shape; linear in the load.
 
     Attributes:
         stress: S0 [Pa] at the quadrature points, shape [tet_count, q, 6] (00 11 22 01 02 12).

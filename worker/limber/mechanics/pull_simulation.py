@@ -1,4 +1,4 @@
-"""A pull as settings describe it: the loaded branch, the grasp and where it goes."""
+"""A pull as settings describe it: the loaded branch, the grasp and its motion."""
 
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
 
 def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTable | None = None,
                  grasp_point: np.ndarray | Sequence[float] | None = None) -> LoadCase:
-    """Return the load case that settings ask for.
+    """Return the load case that settings request.
 
     Args:
         model: Of the scan, on which places are given.
@@ -86,12 +86,12 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
 
 
 def with_masses(model: BranchModel, settings: SimulateSettings) -> BranchModel:
-    """Return the model with what the settings hang on it."""
+    """Return the model with the added masses of the settings."""
     return model.with_point_masses([PointMass(place[:3], place[3]) for place in settings.mass_at])
 
 
 def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> None:
-    """Refuse more than one of a motion, a way and a force.
+    """Reject more than one of a motion, a path and a force.
 
     Raises:
         InputError: there are more.

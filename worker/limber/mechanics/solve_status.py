@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class Status(StrEnum):
-    """Each is its own text, for files and messages; a result that is not converged is none.
+    """Each is its own text, for files and messages; only a converged result is valid.
 
     converged: a stable equilibrium, or all frames of a motion, with no element inverted.
     stalled: step control gave up.

@@ -1,4 +1,4 @@
-"""Compiles all kernels once, so that no user waits for a compiler."""
+"""Compiles all kernels once, so that no user has to wait for the compiler."""
 
 import numpy as np
 

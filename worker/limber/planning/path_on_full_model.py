@@ -1,4 +1,4 @@
-"""A planned path on the full model: what the branch really does along it."""
+"""A planned path on the full model: the states of the branch along it."""
 
 from dataclasses import dataclass
 

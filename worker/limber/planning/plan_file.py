@@ -1,4 +1,4 @@
-"""The file ``plans/NAME.json``: what a plan asks of gripper and branch, pose by pose.
+"""The file ``plans/NAME.json``: the motion of gripper and branch, pose by pose.
 
 Format 2. Beside the summary (goal, scores of both paths, seeds) it has three ways, ``baseline`` and
 ``plan`` between start and goal, and ``motion``: the whole of what a gripper does, from the hanging
@@ -45,7 +45,7 @@ _COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "t
 
 @dataclass(frozen=True)
 class Way:
-    """States along a way; None where a file does not have them.
+    """States along a path; None where a file does not contain them.
 
     Attributes:
         poses: [m, rad], shape [n, 6].
@@ -109,7 +109,7 @@ class PlanBranchBound(_Told):
 
 
 class PlanCertificate(_Told):
-    """How far the path is from the best at most."""
+    """The largest possible gap between the path and the best one."""
 
     gap_percent: float | None = None
     full_model: PlanBranchBound | None = None

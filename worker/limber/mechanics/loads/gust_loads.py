@@ -1,4 +1,4 @@
-"""A wind with gusts on a branch: their spectrum or a record, and the load that their peak is."""
+"""A wind with gusts on a branch: their spectrum or a record, and the load at their peak."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -48,7 +48,7 @@ class Swaying:
 
 @dataclass(frozen=True)
 class GustResponse:
-    """What gusts make of a mean load.
+    """The effect of gusts on a mean load.
 
     Attributes:
         factor: The load that, at rest, bends the branch as far as the peak of its swaying does,
@@ -107,7 +107,7 @@ def wind_spectrum(frequency: np.ndarray, speed: float, length: float) -> np.ndar
 
 def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seconds: float,
               ) -> GustResponse:
-    """Return what turbulence of a spectrum does to a branch.
+    """Return the effect of turbulence with a spectrum on a branch.
 
     Args:
         sway: Of the displacement that is asked for.

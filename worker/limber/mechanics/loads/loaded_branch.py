@@ -47,7 +47,7 @@ class NamedTarget:
 
 
 def target_masses(targets: tuple[NamedTarget, ...]) -> tuple[PointMass, ...]:
-    """Return what targets weigh."""
+    """Return the masses of targets."""
     return tuple(PointMass(target.position, target.mass) for target in targets if target.mass > 0)
 
 

@@ -1,4 +1,4 @@
-"""What wind, snow, fruit and pruning do to a branch: forces, masses, and where it comes to rest."""
+"""Effects of wind, snow, fruit and pruning on a branch: forces, masses and equilibrium."""
 
 import copy
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ _REMAINS = 1e-3
 
 @dataclass(frozen=True)
 class Outdoors:
-    """What acts on a branch beside its weight as scanned.
+    """Loads on a branch in addition to its weight as scanned.
 
     Attributes:
         wind: Velocity of the air, even along the branch [m/s], shape [3].

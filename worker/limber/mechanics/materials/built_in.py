@@ -50,7 +50,7 @@ class Linear(StVenantKirchhoff):
 
 
 class StableNeoHookean(MaterialLaw):
-    """Smith, de Goes and Kim (2018) without the logarithmic barrier; bears strong compression.
+    """Smith, de Goes and Kim (2018) without the logarithmic barrier; withstands strong compression.
 
     Its energy is mu/2 (I_C - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2.
     """

@@ -1,4 +1,4 @@
-"""What a hyperelastic material law is: an energy, and what follows from it.
+"""A hyperelastic material law: an energy and its derivatives.
 
 A law is a subclass of :class:`MaterialLaw` with a name and an energy density:
 
@@ -160,7 +160,7 @@ def is_hookean_at_rest(law: MaterialLaw) -> bool:
 
 
 def law_digest(law: MaterialLaw) -> str:
-    """Return a digest of what a law gives at a few strains: one that was changed has another."""
+    """Return a digest of a law's values at a few strains; it changes with the law."""
     strain, lam, mu = _tried()
     values = [law.energy(strain, lam, mu), *law.stress(strain, lam, mu).T]
     return hashlib.sha256(" ".join(f"{value:.9e}" for value in np.ravel(values)).encode()

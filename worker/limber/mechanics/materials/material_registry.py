@@ -21,7 +21,7 @@ _registered: dict[str, "MaterialLaw"] = {}
 
 
 def register_material(law: "MaterialLaw") -> "MaterialLaw":
-    """Make a law known by its name, instead of one from outside that had that name; return it.
+    """Register a law under its name, in place of an earlier one from outside; return it.
 
     Raises:
         InputError: the name cannot be an option's value or is a built-in law's, the law says of

@@ -1,4 +1,4 @@
-"""Species presets: stiffness, strength and density of green wood, and what strain it may bear.
+"""Species presets: stiffness, strength, density and allowed strain of green wood.
 
 Wood Handbook, FPL-GTR-190 (Forest Products Laboratory, 2010): clear, straight-grained green stem
 wood in bending. Branches are often softer.
@@ -22,7 +22,7 @@ and younger wood."""
 
 @dataclass(frozen=True)
 class Species:
-    """What is known of a species.
+    """The properties of a species.
 
     Attributes:
         title: Its name in the handbook.

@@ -1,4 +1,4 @@
-"""The way from a state in balance to the wanted one, in steps of adapted length."""
+"""The path from an equilibrium to the wanted one, in steps of adapted length."""
 
 import time
 
@@ -37,7 +37,7 @@ six times as much and takes off more: chosen, not measured."""
 
 
 class Path:
-    """The way from a start to a target, in steps of adapted length."""
+    """The path from a start to a target, in steps of adapted length."""
 
     def __init__(self, problem: StaticProblem, begin: np.ndarray, goal: Target,
                  pose: np.ndarray | None):
@@ -343,7 +343,7 @@ class Path:
 
 
 def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:
-    """Return a warning if the branch left a saddle on the way, else nothing."""
+    """Return a warning if the branch left a saddle on the path, else nothing."""
     where = [f"{100 * part:.0f} %" for part, buckled in snaps if buckled]
     if not where:
         return []

@@ -1,4 +1,4 @@
-"""What a static solve is about: constraints, loads, where it leads, reactions at its end."""
+"""A static problem: constraints, loads, target, and the reactions at its end."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from limber.mechanics.strain import Place
 
 @dataclass(frozen=True)
 class Target:
-    """Where a solve leads: held nodes, means of pinned patches, loads.
+    """The target of a solve: held nodes, means of pinned patches, loads.
 
     Attributes:
         held: Displacement of held nodes [m] (others unused), shape [node_count, 3].
@@ -97,7 +97,7 @@ class StaticProblem:
 
 
 def strain_warnings(stretch: Place) -> list[str]:
-    """Return a warning if the largest stretch is beyond what wood does, else nothing."""
+    """Return a warning if the largest stretch exceeds what wood withstands, else nothing."""
     if stretch.value <= 1.5:
         return []
     return [f"The strain reaches {100 * (stretch.value - 1):.0f} % {stretch.at}, far more than "

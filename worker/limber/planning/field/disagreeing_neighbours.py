@@ -1,4 +1,4 @@
-"""Neighbouring samples that do not agree: what the branch does between them.
+"""Neighbouring samples that disagree, and the states of the branch between them.
 
 Pushed together below its rest, a branch goes aside one way or the other, within millimetres, and
 with its grasp in one place it may stand in either of two shapes; which one is a matter of the way
@@ -66,7 +66,7 @@ def ask_between(crew: Crew, known: Sequence[Solved], chart: Chart, usual: np.nda
 
 def disagreeing(known: Sequence[Solved], chart: Chart, usual: np.ndarray, length: float,
                 ) -> list[tuple[int, int, np.ndarray]]:
-    """Return the pairs of neighbours that do not agree, those first where it matters most.
+    """Return the pairs of neighbours that disagree, the most important first.
 
     As numbers in ``known``, with those of the tetrahedra [k] that share them. Between two it
     matters as much as their jump times how many of the ``usual`` places are in those.
@@ -95,7 +95,7 @@ def neighbours(flat: np.ndarray) -> np.ndarray:
 
 
 def jump(first: Solved, second: Solved) -> float:
-    """Return how far apart two neighbours foretell the tip, or a target, half-way [m].
+    """Return how far apart two neighbours predict the tip, or a target, half-way [m].
 
     By the slopes of each; where one has none, by the other's alone.
     """

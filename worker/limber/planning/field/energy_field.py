@@ -76,7 +76,7 @@ _CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the 
 
 @dataclass(frozen=True)
 class GraspSamples:
-    """What the branch model says of ``m`` accepted grasp poses, rest pose first.
+    """Results of the branch model at ``m`` accepted grasp poses, rest pose first.
 
     Attributes:
         poses: Position [m] and the rotation vector [rad] that the grasped piece takes, [m, 6].
@@ -349,7 +349,7 @@ class EnergyField:
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
               *, progress: Progress = SILENT) -> EnergyField:
-    """Fit the field; of kernels and charts those with the least error on samples left out.
+    """Fit the field with the kernel and chart of least cross-validation error.
 
     Args:
         samples: What the branch model says.
@@ -512,7 +512,7 @@ def left_out_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face
 
 def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
                    ) -> dict[str, float]:
-    """Return how far predictions at ``truth``'s poses are off.
+    """Return the errors of predictions at ``truth``'s poses.
 
     Returns:
         ``energy_error`` and ``force_error``: root mean square error over root mean square of the

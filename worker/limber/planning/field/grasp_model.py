@@ -1,4 +1,4 @@
-"""The branch model as planning asks it: put the grasp there, and what does the branch say?
+"""The branch model as planning uses it: the state of the branch for a grasp position.
 
 The grasp is pinned: its position is imposed and the branch turns freely in it. Energy is then a
 field over three coordinates that a hundred solutions describe well, where six would take
@@ -212,7 +212,7 @@ class GraspModel:
 
 
 def refusal(result: StaticResult) -> Status | None:
-    """Return why a solution cannot be believed, or None."""
+    """Return why a solution is not acceptable, or None."""
     if not result.converged:
         return result.status
     return None if result.min_det_f > 0.0 else Status.inverted

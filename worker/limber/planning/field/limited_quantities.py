@@ -1,4 +1,4 @@
-"""What has a limit on the field, one by one."""
+"""The limited quantities of the field, one by one."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The shell on which a grasp moves by itself.
+"""The low-energy surface: the sphere on which a free grasp moves.
 
 A branch yields easily across and hardly along. Under forces across, its grasp stays within a tenth
 of a millimetre on a sphere about a pivot a fifth to a quarter of the way up (the pseudo-rigid body

@@ -1,4 +1,4 @@
-"""The branch model as planning asks it, answered by a reduced model that was learnt before.
+"""The branch model as planning uses it, answered by a trained reduced model.
 
 What the reduced model finds is corrected once by the full one, with the tangent at the strain that
 the reduced model assumes: its displacement alone has ten times the error in strain, all of it
@@ -39,7 +39,7 @@ class CorrectedResult(StaticResult):
 
 @dataclass(frozen=True)
 class LearntGraspModel(GraspModel):
-    """A branch of which a reduced model was learnt; picklable as well.
+    """A branch with a trained reduced model; also picklable.
 
     Attributes:
         reduced: Of this branch and this grasp.

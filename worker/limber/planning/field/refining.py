@@ -1,4 +1,4 @@
-"""Samples where the field is off most, until the error that was asked for holds."""
+"""Samples added where the field's error is largest, until the requested error is met."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ _SHARE_PLACES = 20
 def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked: float, most: int,
             *, workers: int | None = None, progress: Progress = SILENT,
             ) -> tuple[Sampled, EnergyField]:
-    """Return the field with samples added where it is off most.
+    """Return the field with samples added where its error is largest.
 
     Ends when its error on samples left out (``energy_error``) is at most ``asked``, a share, or
     there are ``most`` samples, or nothing is left to add.

@@ -45,7 +45,7 @@ TWO_SHAPES = "two shapes"
 
 @dataclass(frozen=True)
 class Sampled:
-    """What the branch model said.
+    """Results of the branch model.
 
     Attributes:
         samples: Those to fit to, the rest pose first.

@@ -1,4 +1,4 @@
-"""What is kept of the branch's state at one grasp position, and samples made of such states."""
+"""The stored state of the branch at one grasp position, and samples from such states."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

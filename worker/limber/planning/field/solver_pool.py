@@ -1,4 +1,4 @@
-"""Processes that each hold the branch, for all that is solved of one field.
+"""Processes that each hold the branch, for all solves of one field.
 
 A process takes about a second to start, and the branch's equations as long again: both once.
 """

@@ -1,4 +1,4 @@
-"""Where a field that was fitted to samples may be believed.
+"""The region in which a fitted field is trusted.
 
 Radial functions extrapolate freely, and wrongly. A point is trusted inside the convex hull of the
 accepted samples, unless a pose that the branch model refused lies nearer than any it accepted. The

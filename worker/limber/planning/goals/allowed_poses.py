@@ -1,4 +1,4 @@
-"""Poses of a goal that keep the limits; and what is said where there are none."""
+"""Poses of a goal that keep the limits, and the error where there are none."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ _MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is 
 
 
 class GoalOverLimitsError(NoPathError):
-    """None of the poses that were drawn in the goal region keeps the limits."""
+    """None of the poses drawn in the goal region keeps the limits."""
 
 
 def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: int = 200,
@@ -39,7 +39,7 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
 
 
 def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
-    """Return in words which limits none of ``points`` [n, 3] keeps, and by how much."""
+    """Describe which limits none of ``points`` [n, 3] keeps, and by how much."""
     outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
     told = [f"the {one.words} is at least {one.with_unit(least)}, its limit is "
             f"{one.with_unit(one.limit)}" for one in limited(field, limits)

@@ -1,4 +1,4 @@
-"""The view of a camera that stands still, and what hides a target in it."""
+"""The view of a fixed camera, and what hides a target in it."""
 
 from dataclasses import dataclass
 

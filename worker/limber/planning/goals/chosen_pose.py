@@ -1,4 +1,4 @@
-"""A grasp pose that is chosen: drawn from the paper's hemisphere, ``--goal-seed``, or a far one."""
+"""A chosen grasp pose: drawn from the paper's hemisphere (``--goal-seed``), or a distant one."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from limber.planning.goals.regions import ball
 
 
 def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
-    """Return a goal worth planning for: far from rest, and reached without force.
+    """Return a useful goal: far from rest, and reached without force.
 
     Of the samples deflected by over three quarters of the largest deflection, the one with the
     least energy, drawn a little towards the rest pose so that the region lies where the field is

@@ -1,4 +1,4 @@
-"""What a goal of a plan is, and what a kind of goal says of itself.
+"""Goals of a plan, and the description of a kind of goal.
 
 A kind stands in a file of its own beside this one; :mod:`limber.planning.goals.goal_kinds` has the
 list.
@@ -72,7 +72,7 @@ class Goal(Protocol):
 
 @dataclass(frozen=True)
 class CellPlace:
-    """A region that a robot's cell gives.
+    """A region given by a robot's cell.
 
     ``require`` raises NoPathError where it does not do for something, said in words, at a place [3]
     in it, while the branch's surface is where triangles [f, 3, 3] are.

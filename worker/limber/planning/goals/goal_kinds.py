@@ -1,4 +1,4 @@
-"""The kinds of goals, and the one that a plan's settings ask for."""
+"""The kinds of goals, and the one requested by a plan's settings."""
 
 from limber.core.errors import InputError
 from limber.planning.goals.cell_place import IN_VIEW, SECOND_ARM
@@ -13,12 +13,12 @@ KINDS = [AT_PLACE, IN_BALL, IN_BOX, IN_VIEW, SECOND_ARM, DRAWN]
 
 
 def asked_kinds(settings: PlanSettings) -> list[GoalKind]:
-    """Return the kinds of goals that settings ask for."""
+    """Return the kinds of goals that settings request."""
     return [kind for kind in KINDS if kind.is_asked(settings)]
 
 
 def goal_of(request: GoalRequest) -> Goal:
-    """Return the goal that is asked for; a far pose where none is.
+    """Return the requested goal, or a distant pose if there is none.
 
     Raises:
         InputError: two are asked for, or one that makes no sense.

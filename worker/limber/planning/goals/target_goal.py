@@ -105,7 +105,7 @@ def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 
 def target_of(asked: GoalRequest) -> tuple[int | None, str]:
-    """Return number and name of the target that is asked for.
+    """Return number and name of the requested target.
 
     Raises:
         InputError: the branch has none of that name.

@@ -1,4 +1,4 @@
-"""The way to the goal that goes least over the limits, where no path keeps them.
+"""The path to the goal that exceeds the limits least, where no path keeps them.
 
 The planners follow the cost, and know of limits only that they forbid. Here what counts is how far
 over its limit the worst pose of a way is: on a grid over the trusted region, along the shell that
