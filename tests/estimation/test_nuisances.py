@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks.paper_branches import measured
 from limber.core.errors import WorkError
 from limber.estimation.fit import fit_pulls
-from limber.estimation.fit_preparation import is_watched
+from limber.estimation.fit_preparation import is_path_observed
 from limber.estimation.fitting.initial_modulus import FALL, led_start, standing_start
 from limber.estimation.fitting.nuisances import eliminated, in_words, unlikely
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward import quasi_static
-from limber.estimation.forward.observed_path import WatchedForward
+from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.path_error import led_by_path, path_error
@@ -49,8 +49,15 @@ def bad_cell(small_pull):
 
 
 def objective_of(bench, pull, poisson=0.36):
-    forward = WatchedForward(pull.name, bench.model, bench.weights, pull.entry, frames_of(pull),
-                             np.array(pull.entry.rest_points_m), key_count=6)
+    forward = ObservedPathForward(
+        pull.name,
+        bench.model,
+        bench.weights,
+        pull.entry,
+        frames_of(pull),
+        np.array(pull.entry.rest_points_m),
+        key_count=6,
+    )
     space = ParameterSpace.separate(Values(np.full(4, 1e7), poisson, 900.0))
     return Objective([forward], space, force_sigma=[pull.entry.sensor.force_sigma_n])
 
@@ -138,12 +145,12 @@ def test_a_path_is_watched_where_its_frame_may_be_off(small_pull):
     """Not where it is known exactly, the force was not measured, or the user says what drives."""
     frames = frames_of(small_pull)
     entry = small_pull.entry
-    assert entry.calibration == EXACT and not is_watched(entry, frames, SETTINGS)
+    assert entry.calibration == EXACT and not is_path_observed(entry, frames, SETTINGS)
     entry = entry.model_copy(update={"calibration": None})
-    assert is_watched(entry, frames, SETTINGS)
-    assert not is_watched(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
+    assert is_path_observed(entry, frames, SETTINGS)
+    assert not is_path_observed(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
     blind = replace(frames, wrenches=np.full_like(frames.wrenches, np.nan))
-    assert not is_watched(entry, blind, SETTINGS)
+    assert not is_path_observed(entry, blind, SETTINGS)
 
 
 def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small_pull, monkeypatch):

@@ -10,7 +10,7 @@ from limber.core.progress import Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_preparation import forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.forward.observed_path import WatchedForward
+from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.interpolation_prior import open_field
 from limber.estimation.judgement import _tell_largest_part
 from limber.estimation.parameters import Values
@@ -35,7 +35,7 @@ def fitted(small, small_bench, small_pull):
 
 def _with(monkeypatch, fitted, skeletons):
     found, subject = fitted
-    monkeypatch.setattr(module, "likely_skeletons", lambda *_: skeletons)
+    monkeypatch.setattr(module, "sample_skeletons", lambda *_: skeletons)
     return shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)),
                        len(skeletons))
 
@@ -110,12 +110,12 @@ def test_a_watched_path_and_an_open_field_are_no_exception(monkeypatch, small, s
     start = Values(np.array(small.young), 0.36, 900.0)
     subject = Subject(bench.mesh, skeleton, bench.points, bench.weights, bench.model, start, field)
     forwards = forwards_of([pull], subject, SETTINGS)
-    assert isinstance(forwards[0], WatchedForward)
+    assert isinstance(forwards[0], ObservedPathForward)
     objective = Objective(forwards, parameter_space(subject, forwards, SETTINGS),
                           force_sigma=[pull.entry.sensor.force_sigma_n])
     evaluation = objective.evaluate(objective.space.pack(start), jacobian=True)
     shapes = [replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)]
-    monkeypatch.setattr(module, "likely_skeletons", lambda *_: shapes)
+    monkeypatch.setattr(module, "sample_skeletons", lambda *_: shapes)
     found = shape_error(evaluation, objective, subject, np.empty((0, 3)), len(shapes))
     assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
 

@@ -11,7 +11,7 @@ from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.fit_preparation import forwards_of
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.forward.observed_path import WatchedForward
+from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
@@ -46,8 +46,8 @@ def subject(scanned, **settings):
 
 @pytest.fixture(scope="module")
 def pull(scanned):
-    hanging = subject(scanned)
-    truth = TrueBranch(hanging.mesh, hanging.skeleton, hanging.control_points,
+    prestress = subject(scanned)
+    truth = TrueBranch(prestress.mesh, prestress.skeleton, prestress.control_points,
                        (0.2, 0.4, 0.6, 0.8), TRUTH, GRAVITY)
     settings = VirtualPullSettings(frames=6, reach=0.15, position_noise=0.0, force_noise=0.0,
                                    poisson=0.36, density=900.0, phase=0.4)
@@ -98,7 +98,7 @@ def test_where_the_force_leads_nowhere_the_path_leads(scanned, pull, monkeypatch
     start = replace(start, model=start.model.without_point_masses())
     known = CalibrationEntry(pose_sigma_m=1e-4, pose_sigma_rad=0.0)
     pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": known}))
-    monkeypatch.setattr(WatchedForward, "simulate", lambda *_, **__: None)
+    monkeypatch.setattr(ObservedPathForward, "simulate", lambda *_, **__: None)
     messages: list[str] = []
     found = fit_branch([pull], start, EstimateSettings(**SETTINGS), log=EvaluationLog(None, ""),
                        progress=Progress(on_warning=messages.append))

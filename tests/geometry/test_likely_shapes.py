@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.shape_samples import likely_skeletons, reshaped
+from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.normal_equations import fit_precision
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -31,7 +31,7 @@ def test_drawn_shapes_scatter_as_the_fit_says():
     """Of 300 shapes each radius has the deviation that the precision's inverse gives it."""
     points = _scan(np.random.default_rng(0))
     tube = fit_axes(_tube(), points).skeleton
-    drawn = likely_skeletons(tube, points, 300, np.random.default_rng(1))
+    drawn = sample_skeletons(tube, points, 300, np.random.default_rng(1))
     matrix, noise = fit_precision(tube, points)
     assert noise == pytest.approx(NOISE, rel=0.1)
     exact = noise * np.sqrt(np.diag(np.linalg.inv(matrix.toarray())).reshape(-1, 4)[:, 3])
@@ -57,13 +57,13 @@ def test_twigs_are_missing_as_often_as_they_are_doubted():
              for way in ways for side in (0.004, -0.004)]
     points = np.vstack([points, *rings])
     told = replace(tree, probability=np.array([1.0, 0.8, 0.4])[tree.branch])
-    drawn = likely_skeletons(told, points, 600, rng)
+    drawn = sample_skeletons(told, points, 600, rng)
     ends = [members[-1] for members in told.runs()]
     thin = np.array([[np.isclose(shape.radius[end], 0.5 * told.radius[end]) for end in ends]
                      for shape in drawn])
     assert thin.mean(axis=0) == pytest.approx([0.0, 0.2, 0.6], abs=0.06)
     assert thin[thin[:, 1], 2].all()
-    sure = likely_skeletons(tree, points, 20, rng)
+    sure = sample_skeletons(tree, points, 20, rng)
     assert min((shape.radius / tree.radius)[:51].min() for shape in sure) > 0.6
 
 
@@ -77,7 +77,7 @@ def test_new_scans_scatter_as_the_drawn_shapes_foretell():
     for arc in (2 * np.pi, np.pi):
         fits = [fit_axes(_tube(), _scan(rng, arc)).skeleton for _ in range(20)]
         points = _scan(rng, arc)
-        drawn = likely_skeletons(fit_axes(_tube(), points).skeleton, points, 200, rng)
+        drawn = sample_skeletons(fit_axes(_tube(), points).skeleton, points, 200, rng)
         found, foretold = (np.std([means(shape) for shape in shapes], axis=0)
                            for shapes in (fits, drawn))
         assert found == pytest.approx(foretold, rel=0.5)
@@ -90,7 +90,7 @@ def test_seen_from_one_side_thick_and_far_go_together():
     for arc in (2 * np.pi, 0.8 * np.pi):
         points = _scan(rng, arc)
         tube = fit_axes(_tube(), points).skeleton
-        drawn = likely_skeletons(tube, points, 200, rng)
+        drawn = sample_skeletons(tube, points, 200, rng)
         radius, axis = (np.array([values(shape) for shape in drawn]) for values in (
             lambda shape: shape.radius[25], lambda shape: shape.nodes[25, 0]))
         correlation.append(np.corrcoef(radius, axis)[0, 1])

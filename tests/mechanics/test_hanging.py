@@ -22,7 +22,7 @@ def mesh():
     return box_mesh((0.012, 0.012, LENGTH), (1, 1, 40))
 
 
-def hanging(mesh, gravity, young=1e8, **more) -> BranchModel:
+def prestress(mesh, gravity, young=1e8, **more) -> BranchModel:
     return BranchModel(mesh, young=young, poisson=0.35, density=900.0, gravity=gravity,
                        **more).as_scanned()
 
@@ -38,7 +38,7 @@ def pulled(grasp, *move) -> np.ndarray:
 @pytest.mark.parametrize("gravity", [SIDEWAYS, DOWN])
 def test_nothing_moves_by_itself(mesh, gravity):
     """The scanned shape is in balance, whatever Young's modulus; the base bears the weight."""
-    model = hanging(mesh, gravity, point_masses=[PointMass((0, 0, LENGTH), 0.01)])
+    model = prestress(mesh, gravity, point_masses=[PointMass((0, 0, LENGTH), 0.01)])
     for young in (1e8, np.linspace(5e7, 2e8, mesh.tet_count)):
         result = solve_static(model.with_young(young)).require()
         assert np.abs(result.displacement).max() == 0.0
@@ -51,7 +51,7 @@ def test_nothing_moves_by_itself(mesh, gravity):
 @pytest.mark.parametrize("mode", ["pinned", "clamped"])
 def test_force_is_the_gradient_of_the_potential(mesh, gravity, mode):
     """Force (and torque) against central differences of the energy."""
-    model, grasp = hanging(mesh, gravity), top(mesh, mode)
+    model, grasp = prestress(mesh, gravity), top(mesh, mode)
     pose = pulled(grasp, 0.12, 0.05, -0.05)
     at = solve_static(model, grasp=grasp, pose=pose).require()
     step = 1e-5
@@ -90,7 +90,7 @@ def test_a_standing_column_buckles_where_theory_says(mesh):
     """Greenhill: a column stands up to (rho g A L^3) / (E I) = 7.837."""
     width = 0.012
     critical = 900 * 9.81 * width**2 * LENGTH**3 / (7.837 * width**4 / 12)
-    model = hanging(mesh, DOWN)
+    model = prestress(mesh, DOWN)
     for young, stands in ((1.03 * critical, True), (0.97 * critical, False)):
         tangent = model.equations().tangent(model.with_young(young), np.zeros_like(mesh.nodes))
         assert tangent.is_positive_definite is stands
@@ -98,7 +98,7 @@ def test_a_standing_column_buckles_where_theory_says(mesh):
 
 def test_what_is_hung_on_later_bends_it(mesh):
     """A fruit added to a hanging branch acts as a load of its weight."""
-    model = hanging(mesh, SIDEWAYS, young=3e8)
+    model = prestress(mesh, SIDEWAYS, young=3e8)
     point = mesh.nodes[mesh.nodes[:, 2].argmax()]
     loads = np.zeros_like(mesh.nodes)
     loads[np.linalg.norm(mesh.nodes - point, axis=1).argmin()] = 0.02 * np.array(SIDEWAYS)
@@ -111,7 +111,7 @@ def test_what_is_hung_on_later_bends_it(mesh):
 def test_sensitivities(mesh):
     """To Young's modulus, Poisson's ratio and density, against central differences."""
     grasp, step = top(mesh), 1e-4
-    model = hanging(mesh, SIDEWAYS)
+    model = prestress(mesh, SIDEWAYS)
     pose = pulled(grasp, 0.10, 0.06, -0.04)
     at = solve_static(model, grasp=grasp, pose=pose).require()
     found = static_sensitivities(model, at, grasp, None, ("log_young", "poisson", "log_density"))
@@ -132,7 +132,7 @@ def test_sensitivities(mesh):
 
 def test_density_field_and_factor_agree(mesh):
     """A density that is given again for each tetrahedron is carried as one by a factor."""
-    model = hanging(mesh, SIDEWAYS, point_masses=[PointMass((0, 0, LENGTH), 0.01)])
+    model = prestress(mesh, SIDEWAYS, point_masses=[PointMass((0, 0, LENGTH), 0.01)])
     twice = model.with_parameters(density=1800.0).weight_stiffness
     anew = BranchModel(mesh, young=1e8, poisson=0.35, density=1800.0, gravity=SIDEWAYS,
                        point_masses=model.point_masses).as_scanned().weight_stiffness
@@ -141,7 +141,7 @@ def test_density_field_and_factor_agree(mesh):
 
 def test_stress_at_rest_is_that_of_the_weight(mesh):
     """Bending stress at the base of a cantilever under its weight: rho g A L^2 / (2 W)."""
-    model = hanging(mesh, SIDEWAYS, young=1e9)
+    model = prestress(mesh, SIDEWAYS, young=1e9)
     state = strain_state(model, np.zeros_like(mesh.nodes))
     width, height = 0.012, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)[:, 2]
     low = np.abs(height - 0.05) < 0.01
@@ -157,7 +157,7 @@ def test_motion_keeps_still_and_swings_as_a_pendulum_would(mesh):
     from limber.mechanics.dynamics.motion import NewmarkSettings
     from limber.mechanics.materials.materials import RayleighDamping
 
-    model = hanging(mesh, SIDEWAYS, damping=RayleighDamping(0.0, 0.0))
+    model = prestress(mesh, SIDEWAYS, damping=RayleighDamping(0.0, 0.0))
     times = np.linspace(0.0, 0.2, 21)
     still = simulate_dynamics(model, times=times)
     assert np.abs(still.displacement).max() < 1e-12

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from limber.core.errors import InputError
-from limber.planning.constraints.chance import Exposure, Surface, YoungDoubt, _chosen, _design
+from limber.planning.constraints.chance import Exposure, Surface, YoungUncertainty, _chosen, _design
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.settings import PlanSettings
@@ -22,12 +22,12 @@ def bent(small_model):
                         small_model.rest_position[None])
 
 
-def doubt_of(small_model, deviations, correlation=0.0):
+def uncertainty_of(small_model, deviations, correlation=0.0):
     """Control points at a third and two thirds of the height, or one alone."""
     height = small_model.mesh.centroids[:, 2] / 0.5
     shares = np.column_stack([1.0 - height, height])[:, :len(deviations)]
     count = len(deviations)
-    return YoungDoubt(shares / shares.sum(axis=1, keepdims=True), np.array(deviations),
+    return YoungUncertainty(shares / shares.sum(axis=1, keepdims=True), np.array(deviations),
                       np.eye(count) + correlation * (1 - np.eye(count)))
 
 
@@ -42,7 +42,7 @@ def test_a_branch_that_is_stiffer_everywhere(small_model, bent):
     """Force goes with E, strain does not: both chances are known in closed form."""
     peak = bent.solved.force_sizes.max()
     limits = Limits(force=1.1 * peak, strain=1.01 * bent.solved.strains.max())
-    found = doubt_of(small_model, [0.08]).risk(small_model, bent, limits, 0.95)
+    found = uncertainty_of(small_model, [0.08]).risk(small_model, bent, limits, 0.95)
     z = norm.ppf(0.975)
     assert found.factors["force"] == pytest.approx(np.exp(0.08 * z), rel=1e-3)
     assert found.factors["strain"] == pytest.approx(1.0, abs=1e-3)
@@ -51,7 +51,7 @@ def test_a_branch_that_is_stiffer_everywhere(small_model, bent):
     tighter = limits.tightened(found.factors)
     assert tighter.force < peak
     wide = replace(limits, force=1.2 * peak)
-    assert not doubt_of(small_model, [0.08]).risk(small_model, bent, wide, 0.95).told()
+    assert not uncertainty_of(small_model, [0.08]).risk(small_model, bent, wide, 0.95).told()
 
 
 def test_what_is_left_to_a_motion_is_what_the_moduli_leave(small_model, bent):
@@ -59,7 +59,7 @@ def test_what_is_left_to_a_motion_is_what_the_moduli_leave(small_model, bent):
     left for the estimate's branch as the stiffest branch in question takes of the limit."""
     peak = bent.ahead.force_sizes.max()
     limits = Limits(force=1.3 * peak, strain=0.5)
-    found = doubt_of(small_model, [0.08]).risk(small_model, bent, limits, 0.95)
+    found = uncertainty_of(small_model, [0.08]).risk(small_model, bent, limits, 0.95)
     left = found.left(limits, bent)
     assert left.force == pytest.approx(peak / found.excess["force"])
     assert peak < left.force < limits.force and left.strain == limits.strain
@@ -67,11 +67,11 @@ def test_what_is_left_to_a_motion_is_what_the_moduli_leave(small_model, bent):
 
 def test_forces_under_other_moduli_are_those_of_the_full_model(small_model, bent):
     """Also where the moduli change against each other and the force turns with them."""
-    doubt = doubt_of(small_model, [0.2, 0.3], -0.5)
-    exposure = doubt.exposure(small_model, bent, Limits(force=bent.solved.force_sizes.max()))
+    uncertainty = uncertainty_of(small_model, [0.2, 0.3], -0.5)
+    exposure = uncertainty.exposure(small_model, bent, Limits(force=bent.solved.force_sizes.max()))
     surface = exposure.surfaces["force"]
     for logs in np.array([[0.35, -0.45], [-0.3, 0.4], [0.25, 0.1]]):
-        truth = doubt.solved(small_model, logs, bent.solved).force_sizes
+        truth = uncertainty.solved(small_model, logs, bent.solved).force_sizes
         found = surface.sizes(logs[None])[0]
         size = np.abs(truth - truth.max()) <= 0.5 * truth.max()
         assert len(found) == size.sum()

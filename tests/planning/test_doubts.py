@@ -64,13 +64,13 @@ def test_what_the_field_may_be_wrong_by_is_no_proof(rough_field, name):
     """A wall of a load, over the limit by less than the field's error, proves nothing; a limit that
     is too low for that as well does."""
     lowest = lowest_in_the_wall(rough_field, name)
-    doubt = Limits(**{name: lowest}).doubts(rough_field)[name]
-    assert 0.5 * ROUGH < doubt < 5.0 * ROUGH
-    near = problem_on(rough_field, Limits(**{name: lowest - 0.4 * doubt}))
+    uncertainty = Limits(**{name: lowest}).doubts(rough_field)[name]
+    assert 0.5 * ROUGH < uncertainty < 5.0 * ROUGH
+    near = problem_on(rough_field, Limits(**{name: lowest - 0.4 * uncertainty}))
     held_for_true = judge(replace(near, beyond=near.limits))
     assert held_for_true.proven, "the field alone would have been a proof"
     assert not judge(near).proven
-    assert judge(problem_on(rough_field, Limits(**{name: lowest - 1.4 * doubt}))).proven
+    assert judge(problem_on(rough_field, Limits(**{name: lowest - 1.4 * uncertainty}))).proven
 
 
 @pytest.mark.parametrize("seen", [f"None was found, {UNPROVEN}.", "No path exists."])
@@ -82,18 +82,18 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
         tried.append(tried_limits.max_loads[0])
-        assert beyond.max_loads[0] == pytest.approx(2.4 + doubt)
+        assert beyond.max_loads[0] == pytest.approx(2.4 + uncertainty)
         if tried[-1] <= 2.4:
             raise NoWayError(seen, "On a grid.", "Raise the limit.")
         return there
 
-    doubt = limits.doubts(rough_field)["strain"]
+    uncertainty = limits.doubts(rough_field)["strain"]
     monkeypatch.setattr(two_paths, "plan_pair", plan_pair)
     arguments = rough_field, START, GOAL, settings, limits
     progress = Progress(on_warning=told.append)
     if UNPROVEN in seen:
         found = two_paths.plan_within(*arguments, progress=progress)
-        assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + doubt)
+        assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + uncertainty)
         assert any("extended by the field's error (strain 0." in words for words in told)
     else:
         with pytest.raises(NoWayError, match="No path exists"):

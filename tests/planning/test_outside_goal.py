@@ -39,7 +39,7 @@ class SideGoal:
     def distance(self, field, points):
         return np.abs(np.asarray(points)[:, 0] - self.x)
 
-    def doubt(self, field):
+    def uncertainty(self, field):
         return 0.0
 
     def guess(self, field, count, generator):

@@ -7,7 +7,7 @@ import pytest
 
 from limber.planning.field import refining
 from limber.planning.field.energy_field import fit_field
-from limber.planning.field.low_energy_surface import Valley
+from limber.planning.field.low_energy_surface import LowEnergySurface
 from limber.planning.field.refining import refined
 from limber.planning.field.sampling import Sampled
 from limber.planning.field.solved import Solved
@@ -34,7 +34,9 @@ def test_poses_are_added_until_the_asked_error_holds(ridge, followed):
     that is good enough is left as it is."""
     samples = ridge.samples(count=60)
     field = fit_field(samples)
-    before = Sampled(samples, list(samples.positions[:, None]), Valley(np.zeros(3), 0.0), {}, 0)
+    before = Sampled(
+        samples, list(samples.positions[:, None]), LowEnergySurface(np.zeros(3), 0.0), {}, 0
+    )
     asked = 0.4 * field.errors["energy_error"]
     after, finer = refined(followed, before, field, asked, 200, workers=1)
     assert finer.errors["energy_error"] <= asked and 60 < len(finer.samples.poses) < 200

@@ -12,21 +12,21 @@ from limber.mechanics import Grasp, solve_static
 from limber.planning.field.chart import Chart, pulled_back_size
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import Reach
-from limber.planning.field.low_energy_surface import Valley, walk_valley
+from limber.planning.field.low_energy_surface import LowEnergySurface, walk_energy_surface
 from limber.planning.field.sampling import (
     _slack,
     sample_branch,
     sample_field,
     sample_positions,
 )
-from limber.planning.field.solver_pool import Crew
+from limber.planning.field.solver_pool import SolverPool
 from limber.stages.paths.energy import EnergySettings
 from limber.store import Branch
 from limber.store.loading import load_grasp_model
 
 REACH = Reach(np.zeros(3), 0.4, 0.38, np.array([0.0, 0.0, 0.6]))
 REST = np.array([0.0, 0.0, 0.38])
-SHELL = Valley(np.array([0.0, 0.0, 0.08]), 0.3)
+SHELL = LowEnergySurface(np.array([0.0, 0.0, 0.08]), 0.3)
 
 
 def test_positions_stay_in_reach():
@@ -53,12 +53,12 @@ def test_no_room_is_an_error():
     """A grasp at the base has nowhere to go, and the message says what to change."""
     with pytest.raises(WorkError, match="farther from its base"):
         sample_positions(Reach(np.zeros(3), 0.4, 0.38, REST), np.array([0, 0, -0.5]), 50,
-                         Valley(np.zeros(3), 0.5), deflection=0.4)
+                         LowEnergySurface(np.zeros(3), 0.5), deflection=0.4)
 
 
 @pytest.fixture(scope="module")
 def some(small_model):
-    shell = Valley(small_model.reach.base, small_model.reach.chord)
+    shell = LowEnergySurface(small_model.reach.base, small_model.reach.chord)
     targets = sample_positions(small_model.reach, small_model.rest_position, 14, shell,
                                deflection=0.3)
     return targets, *sample_branch(small_model, targets)
@@ -129,7 +129,7 @@ def test_the_number_of_processes_is_no_setting_of_a_result():
 def test_cancel_ends_sampling(small_model, workers):
     """A cancel is obeyed between poses, in this process and across processes."""
     # So many that quick processes are not done before the cancel reaches them.
-    targets = sample_positions(small_model.reach, small_model.rest_position, 200, Valley(
+    targets = sample_positions(small_model.reach, small_model.rest_position, 200, LowEnergySurface(
         small_model.reach.base, small_model.reach.chord), deflection=0.3)
     progress = Progress(lambda fraction, _message, _numbers:
                         progress.cancel() if fraction > 0 else None)
@@ -139,19 +139,19 @@ def test_cancel_ends_sampling(small_model, workers):
 
 def test_grasp_moves_on_a_sphere_by_itself(small_model):
     """States under forces across lie on the shell within 0.3 mm, those drawn outward beyond it."""
-    valley, states = walk_valley(Crew(small_model, 1), 8, deflection=0.4)
-    away = np.array([np.linalg.norm(state.pose[:3] - valley.pivot)
-                     for state in states]) - valley.radius
+    energy_surface, states = walk_energy_surface(SolverPool(small_model, 1), 8, deflection=0.4)
+    away = np.array([np.linalg.norm(state.pose[:3] - energy_surface.pivot)
+                     for state in states]) - energy_surface.radius
     assert len(states) == 17 and np.abs(away[:8]).max() < 3e-4
     assert (away[9:] > away[:8]).all()
-    assert 0.6 < valley.radius / small_model.reach.chord < 0.95
+    assert 0.6 < energy_surface.radius / small_model.reach.chord < 0.95
 
 
 @pytest.mark.slow
 def test_rest_lies_inside_the_sampled_region(small_model):
     """Samples lie beyond rest on all sides, and so do those of the shell about it."""
     sampled = sample_field(small_model, EnergySettings(samples=60), workers=1)
-    field = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius)
+    field = fit_field(sampled.samples, sampled.energy_surface.pivot, sampled.energy_surface.radius)
     assert sampled.samples.energies[0] == 0.0
     assert field.region.height(field.rest[None])[0] < -1e-4
     around = field.rest + 1e-4 * np.concatenate([np.eye(3), -np.eye(3)])

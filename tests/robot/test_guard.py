@@ -39,11 +39,17 @@ class Bench:
         return 0.05 * self.rng.standard_normal(6)
 
     def look(self, force=(0, 0, 0), torque=(0, 0, 0), expected=None, grasp=INSIDE, sent=None,
-             doubt=None, **changes):
+             uncertainty=None, **changes):
         wrench = np.r_[force, torque].astype(float) + self.noise()
-        return self.guard.look(self.sample(**changes), wrench=wrench,
-                               raw=np.stack([wrench, wrench]), grasp=grasp, sent=sent, doubt=doubt,
-                               expected=None if expected is None else np.r_[expected, 0, 0, 0])
+        return self.guard.look(
+            self.sample(**changes),
+            wrench=wrench,
+            raw=np.stack([wrench, wrench]),
+            grasp=grasp,
+            sent=sent,
+            uncertainty=uncertainty,
+            expected=None if expected is None else np.r_[expected, 0, 0, 0],
+        )
 
     def run(self, count: int = 30, **changes):
         for _ in range(count):
@@ -220,8 +226,8 @@ def test_more_is_allowed_where_the_prediction_is_unsure_never_more_than_the_soft
     """3 N are allowed; along z, where the force is known to 2 N, 3 and 4 N in quadrature."""
     bench = Bench()
     bench.guard.begin()
-    doubt = np.diag([0, 0, sigma**2, 0, 0, 0])
-    assert bench.run(200, force=off, expected=(0, 0, 0), doubt=doubt).verdict == verdict
+    uncertainty = np.diag([0, 0, sigma**2, 0, 0, 0])
+    assert bench.run(200, force=off, expected=(0, 0, 0), uncertainty=uncertainty).verdict == verdict
 
 
 def test_slip_is_told_without_a_prediction_by_a_sudden_fall(bench):

@@ -108,15 +108,15 @@ def test_without_weight_the_branch_rises(session, branch_folder):
     from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 
     session.release()
-    hanging = settled(session, session.set_gravity(True)["id"])
+    prestress = settled(session, session.set_gravity(True)["id"])
     light = settled(session, session.set_gravity(False)["id"])
     session.set_gravity(True)
-    assert hanging.gravity_on and not light.gravity_on
+    assert prestress.gravity_on and not light.gravity_on
     scanned = load_model(Branch.open(branch_folder))
     surface = np.unique(scanned.mesh.surface_faces())
-    np.testing.assert_allclose(hanging.positions, scanned.mesh.nodes[surface], atol=1e-7)
+    np.testing.assert_allclose(prestress.positions, scanned.mesh.nodes[surface], atol=1e-7)
     expected = unloaded_rest_shape(scanned).nodes[surface]
-    rise = np.abs(expected - hanging.positions).max()
+    rise = np.abs(expected - prestress.positions).max()
     assert rise > 1e-6
     np.testing.assert_allclose(light.positions, expected, atol=0.05 * rise)
 

@@ -189,14 +189,14 @@ def _timed_field(model: GraspModel, settings: EnergySettings, progress: Progress
     """Return samples, field, and the seconds that both took."""
     began = time.perf_counter()
     sampled = sample_field(model, settings, progress=progress)
-    known = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius)
+    known = fit_field(sampled.samples, sampled.energy_surface.pivot, sampled.energy_surface.radius)
     return sampled, known, time.perf_counter() - began
 
 
 def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, settings: EnergySettings,
            count: int, seed: int, progress: Progress) -> tuple[_Fresh, float]:
     """Return errors at ``count`` fresh trusted poses, and the share of the hull not trusted."""
-    targets = sample_positions(model.reach, model.rest_position, 4 * count, sampled.valley,
+    targets = sample_positions(model.reach, model.rest_position, 4 * count, sampled.energy_surface,
                                deflection=settings.deflection, seed=seed)
     targets = targets[known.region.height(targets) <= 0.0]
     trusted = known.region.contains(targets)

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.planning_branches import Subject
 from benchmarks.table import Asked, Row
 from limber.core.errors import LimberError, NoPathError
-from limber.planning.constraints.chance import YoungDoubt
+from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.grasp_goal import GraspGoal
@@ -50,25 +50,30 @@ def run_sure(subject: Subject, known: EnergyField, goal: GraspGoal, draws: int, 
              source: str = "") -> Sure:
     """Plan from rest under a force that binds, with confidence; draw moduli, solve the motion."""
     sure = Sure(subject.name, seed, source)
-    model, doubt = subject.model, doubt_of(subject)
+    model, uncertain_part = subject.model, uncertainty_of(subject)
     settings = PlanSettings(seed=seed, iterations=500, goal=goal.position,
                             goal_tolerance=goal.tolerance)
     try:
-        motion, cap = _planned(sure, subject, known, doubt, settings)
+        motion, cap = _planned(sure, subject, known, uncertain_part, settings)
         sure.before = motion.summary["confidence"]["of_a_plan_for_the_estimate"]
         states = motion.plan.approach.joined(motion.plan.solved)
         high = np.flatnonzero(states.force_sizes > _LOW * cap)
         chosen = np.unique([*high[::_EVERY], *high[-1:], int(states.force_sizes.argmax())])
         generator = np.random.default_rng([seed, 5])
-        kept = [doubt.solved(model, doubt.draw(generator), states.take(chosen)).force_sizes.max()
-                <= cap for _ in range(draws)]
+        kept = [
+            uncertain_part.solved(
+                model, uncertain_part.draw(generator), states.take(chosen)
+            ).force_sizes.max()
+            <= cap
+            for _ in range(draws)
+        ]
         sure.kept = float(np.mean(kept))
     except LimberError as error:
         sure.trouble = f"{type(error).__name__}: {error}"
     return sure
 
 
-def _planned(sure: Sure, subject: Subject, known: EnergyField, doubt: YoungDoubt,
+def _planned(sure: Sure, subject: Subject, known: EnergyField, uncertain_part: YoungUncertainty,
              settings: PlanSettings) -> tuple[PlannedMotion, float]:
     """Return a plan with confidence under a force limit that binds, and the limit [N].
 
@@ -78,34 +83,42 @@ def _planned(sure: Sure, subject: Subject, known: EnergyField, doubt: YoungDoubt
     model = subject.model
     free = plan_motion(known, model, settings, workers=1)
     states = free.plan.approach.joined(free.plan.solved)
-    likely = _likely_forces(doubt, subject, states)
+    likely = _likely_forces(uncertain_part, subject, states)
     end = tuple(map(float, free.plan.solved.poses[-1, :3]))
     for tight in _TIGHT:
         cap = float(max(likely[-1] + tight * (likely.max() - likely[-1]), 1.02 * likely[-1]))
         sure.tight = tight
         try:
-            return plan_motion(free.field, model, settings.model_copy(update={
-                "max_force": cap, "confidence": CONFIDENCE, "goal": end}), doubt=doubt,
-                workers=1), cap
+            return plan_motion(
+                free.field,
+                model,
+                settings.model_copy(
+                    update={"max_force": cap, "confidence": CONFIDENCE, "goal": end}
+                ),
+                uncertain_part=uncertain_part,
+                workers=1,
+            ), cap
         except NoPathError:
             if tight == _TIGHT[-1]:
                 raise
     raise AssertionError("the last limit either has a plan or raises")
 
 
-def _likely_forces(doubt: YoungDoubt, subject: Subject, states: SolvedPoses) -> np.ndarray:
+def _likely_forces(
+    uncertain_part: YoungUncertainty, subject: Subject, states: SolvedPoses
+) -> np.ndarray:
     """Return the force [N] that each state takes at most with the confidence, shape [n]."""
     peak = states.force_sizes.max()
-    found = doubt.exposure(subject.model, ResolvedPath(
+    found = uncertain_part.exposure(subject.model, ResolvedPath(
         states, states.take(np.arange(1)), np.empty((0, 3)), (), True), Limits(force=2.0 * peak))
-    return states.force_sizes * found.risk(doubt.covariance, CONFIDENCE).factors["force"]
+    return states.force_sizes * found.risk(uncertain_part.covariance, CONFIDENCE).factors["force"]
 
 
-def doubt_of(subject: Subject) -> YoungDoubt:
+def uncertainty_of(subject: Subject) -> YoungUncertainty:
     """Return a posterior as an estimate's: the same deviation at each control point."""
     count = subject.shares.shape[1]
     near = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) == 1
-    return YoungDoubt(subject.shares, np.full(count, _DEVIATION),
+    return YoungUncertainty(subject.shares, np.full(count, _DEVIATION),
                       np.eye(count) + _NEIGHBOUR * near)
 
 

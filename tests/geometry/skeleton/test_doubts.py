@@ -22,7 +22,7 @@ def test_each_doubt_is_found_with_its_place(y_skeleton) -> None:
     told = doubtful_parts(replace(
         y_skeleton, radius_state=state, radius_sigma=sigma,
         probability=np.where(y_skeleton.branch == 1, 0.3, 1.0)))
-    assert [doubt.kind for doubt in told] == [
+    assert [uncertainty.kind for uncertainty in told] == [
         DoubtKind.unlikely, DoubtKind.unresolved, DoubtKind.bridged]
     unlikely, unresolved, bridged = told
     assert unlikely.branch == 1 and unlikely.value == pytest.approx(0.3)
@@ -39,7 +39,7 @@ def test_kinks_and_backward_starts_are_found() -> None:
     skeleton = Skeleton.from_edges(
         np.vstack([stem, down]), np.concatenate([np.arange(41) - 1, [10], 41 + np.arange(4)]),
         np.full(46, 0.006))
-    told = {doubt.kind: doubt for doubt in doubtful_parts(skeleton)}
+    told = {uncertainty.kind: uncertainty for uncertainty in doubtful_parts(skeleton)}
     assert set(told) == {DoubtKind.kink, DoubtKind.backwards}
     np.testing.assert_allclose(told[DoubtKind.kink].at, [0, 0, 0.2], atol=1e-9)
     assert told[DoubtKind.kink].value == pytest.approx(np.pi / 2, abs=0.01)

@@ -7,7 +7,7 @@ from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import sides_seen
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.sides_seen import side_doubt, side_told
+from limber.geometry.skeleton.radii.sides_seen import side_told, side_uncertainty
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
@@ -39,7 +39,7 @@ def test_view_and_limit_are_told_to_a_degree_or_two(limit: float, noise: float) 
     assert np.degrees(told.limit) == pytest.approx(limit, abs=1.0)
     # What is told is less in doubt than what is not.
     assert told.limit_sigma < 0.5 * sides_seen._GRAZING_SIGMA
-    doubts = [side_doubt(seen, np.array([0.005]), 0.001)[0] for seen in (
+    doubts = [side_uncertainty(seen, np.array([0.005]), 0.001)[0] for seen in (
         told, sides_seen._one_side(mean))]
     assert doubts[0] < 0.5 * doubts[1]
 

@@ -379,16 +379,18 @@ def test_a_bow_that_turned_over_is_said_to_have_another_state(column):
     push = np.where(middle[:, None], [1.0 / middle.sum(), 0.0, 0.0], 0.0)
     aside = solve_static(model, grasp=end, pose=pressed, nodal_forces=0.3 * push).require()
     bow = solve_static(model, grasp=end, pose=pressed, start=aside).require()
-    assert bow.displacement[middle, 0].mean() > 0.02 and not bow.doubt
+    assert bow.displacement[middle, 0].mean() > 0.02 and not bow.uncertainty
     over = solve_static(model, grasp=end, pose=pressed, nodal_forces=-2 * push,
                         start=bow).require()
     assert over.displacement[middle, 0].mean() < -0.02
-    assert "another stable state" in over.doubt and over.doubt[1:] in "".join(over.warnings)
+    assert "another stable state" in over.uncertainty and over.uncertainty[1:] in "".join(
+        over.warnings
+    )
     unasked = solve_static(model, grasp=end, pose=pressed, nodal_forces=-2 * push, start=bow,
                            settings=StaticSettings(way_back=False)).require()
-    assert not unasked.doubt and np.array_equal(unasked.displacement, over.displacement)
+    assert not unasked.uncertainty and np.array_equal(unasked.displacement, over.displacement)
     buckled = solve_static(model, grasp=end, pose=end.rest_pose - [0, 0, 0.01, 0, 0, 0])
-    assert buckled.snapped_at and not buckled.doubt
+    assert buckled.snapped_at and not buckled.uncertainty
 
 
 def test_dead_load_beyond_buckling(column):

@@ -19,36 +19,36 @@ LOAD = np.array([0.01, 0.006, 0.0])
 
 
 @pytest.fixture(scope="module")
-def hanging(small, small_bench):
+def prestress(small, small_bench):
     """The small branch under its weight."""
     return BranchModel(small_bench.mesh, young=2e8, poisson=0.36, density=900.0).as_scanned()
 
 
 @pytest.fixture(scope="module")
-def tree(hanging, small):
-    return rod_tree(hanging, small.skeleton, small.skeleton.length / 10)
+def tree(prestress, small):
+    return rod_tree(prestress, small.skeleton, small.skeleton.length / 10)
 
 
-def test_links_have_the_branchs_mass_and_rest_as_scanned(tree, hanging):
+def test_links_have_the_branchs_mass_and_rest_as_scanned(tree, prestress):
     """All mass is in the links; each spring carries what hangs beyond it."""
-    assert tree.mass.sum() == pytest.approx(hanging.total_mass, rel=1e-6)
+    assert tree.mass.sum() == pytest.approx(prestress.total_mass, rel=1e-6)
     middle = np.einsum("n,ni->i", tree.mass, tree.centre) / tree.mass.sum()
-    own, _ = hanging.nodal_masses
-    np.testing.assert_allclose(middle, own @ hanging.mesh.nodes / own.sum(), atol=1e-3)
+    own, _ = prestress.nodal_masses
+    np.testing.assert_allclose(middle, own @ prestress.mesh.nodes / own.sum(), atol=1e-3)
     assert (tree.stiffness[1:] > 0).all() and (tree.parent[1:] < np.arange(1, tree.count)).all()
     assert np.abs(tree.carried[1]).max() > 0
 
 
-def test_mujoco_holds_it_at_rest_and_bends_it_as_we_do(tree, hanging, small):
+def test_mujoco_holds_it_at_rest_and_bends_it_as_we_do(tree, prestress, small):
     """At rest nothing moves; static tip and first frequency agree to 4 % with 10 links."""
     mujoco = pytest.importorskip("mujoco")
     model = mujoco.MjModel.from_xml_string(mjcf_text(tree, RayleighDamping(), "b", {}))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     assert np.abs(data.qacc).max() < 1e-3
-    node = int(np.linalg.norm(hanging.mesh.nodes - small.skeleton.nodes[-1], axis=1).argmin())
-    ours = bent_here(hanging, node, LOAD)
-    theirs = bent_in_mujoco(hanging, small.skeleton, hanging.mesh.nodes[node], LOAD, links=10)
+    node = int(np.linalg.norm(prestress.mesh.nodes - small.skeleton.nodes[-1], axis=1).argmin())
+    ours = bent_here(prestress, node, LOAD)
+    theirs = bent_in_mujoco(prestress, small.skeleton, prestress.mesh.nodes[node], LOAD, links=10)
     assert np.linalg.norm(theirs.tip - ours.tip) < 0.04 * np.linalg.norm(ours.tip)
     assert theirs.frequency == pytest.approx(ours.frequency, rel=0.04)
 

@@ -50,7 +50,7 @@ class Subject:
     @property
     def hangs(self) -> bool:
         """Whether its weight acts in the scanned shape."""
-        return self.model.hanging is not None and bool(self.model.gravity.any())
+        return self.model.prestress is not None and bool(self.model.gravity.any())
 
     def carries_itself(self, values: Values) -> bool:
         """Whether it stays in the scanned shape under its weight, with these values."""

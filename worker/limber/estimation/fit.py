@@ -83,7 +83,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
             except WorkError as second:
                 raise error from second
 
-    hangs = subject.hangs and any(under_its_weight(subject.model, pull.entry).hanging is not None
+    hangs = subject.hangs and any(under_its_weight(subject.model, pull.entry).prestress is not None
                                   for pull in pulls)
     return _as_it_hangs(subject, fitted, progress) if hangs else fitted(subject)
 

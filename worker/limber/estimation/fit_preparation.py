@@ -7,7 +7,7 @@ from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.forward.forward_model import Forward, under_its_weight
-from limber.estimation.forward.observed_path import WatchedForward
+from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings
@@ -75,12 +75,12 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
 
         return DynamicForward(name, subject.model, subject.weights, entry, frames, rest,
                               field=subject.field)
-    kind = WatchedForward if is_watched(entry, frames, settings) else QuasiStaticForward
+    kind = ObservedPathForward if is_path_observed(entry, frames, settings) else QuasiStaticForward
     return kind(name, subject.model, subject.weights, entry, frames, rest,
                 key_count=settings.key_frames, field=subject.field)
 
 
-def is_watched(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
+def is_path_observed(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
     """Whether a slow pull's force is prescribed and the gripper's recorded path is observed.
 
     So it is wherever the force was measured, of a clamped grasp the torque too, and the gripper's

@@ -19,7 +19,7 @@ from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.uncertainty.model_error import refined
 from limber.geometry.cloud.camera import D455, Camera, write_camera
-from limber.geometry.shape_samples import likely_skeletons, reshaped
+from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import base_nodes
@@ -111,7 +111,7 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
 def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random.Generator,
              ) -> tuple[Skeleton, TetMesh]:
     """Axes and tetrahedra of a branch that the scan allows as well."""
-    for shape in likely_skeletons(skeleton, scan, SHAPE_TRIES, rng):
+    for shape in sample_skeletons(skeleton, scan, SHAPE_TRIES, rng):
         moved = reshaped(mesh, skeleton, shape)
         if moved.volumes.min() > 0:
             return shape, moved
@@ -129,7 +129,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     """
     rng = np.random.default_rng(settings.seed)
     model = _model(truth, settings, progress)
-    is_weightless = not (model.gravity.any() and (settings.own_weight or model.hanging))
+    is_weightless = not (model.gravity.any() and (settings.own_weight or model.prestress))
     entry = _entry(truth, settings, is_weightless)
     grasp = grasp_on(truth.mesh, entry.grasp)
     model = model.gripped(grasp)

@@ -28,7 +28,7 @@ _LEAST_VOLUME = 0.1  # of a tetrahedron's own, below which its corners go half a
 _HALVINGS = 30
 
 
-def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
+def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
                      rng: np.random.Generator) -> list[Skeleton]:
     """Draw ``count`` skeletons from the fit's covariance and the twigs' probabilities.
 

@@ -36,7 +36,7 @@ from limber.mechanics.materials.materials import (
     per_tet,
 )
 from limber.mechanics.mesh_data import MeshData
-from limber.mechanics.prestress import Hanging, carried
+from limber.mechanics.prestress import Prestress, carried
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
@@ -111,7 +111,7 @@ class BranchModel:
         self.damping = damping
         self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
-        self.hanging: Hanging | None = None
+        self.prestress: Prestress | None = None
         # Not known yet: whatever comes is a change of it.
         self.density = np.zeros(0)
         self.stiffening: np.ndarray | float = 1.0
@@ -159,7 +159,7 @@ class BranchModel:
             other.damping = damping
         if gravity is not None:
             # What carries the weight now is not what carried it on the scan.
-            other.gravity, other.hanging = np.asarray(gravity, float), None
+            other.gravity, other.prestress = np.asarray(gravity, float), None
         other._set(self.young if young is None else young,
                    self.poisson if poisson is None else poisson,
                    self.density if density is None else density)
@@ -183,7 +183,7 @@ class BranchModel:
     def with_rest_nodes(self, nodes: np.ndarray) -> "BranchModel":
         """Return the model with other rest positions [m] of the same tetrahedra."""
         other = copy.copy(self)
-        other.hanging = None
+        other.prestress = None
         other._data = self._data.moved(nodes)
         other._mass = {}
         # Added masses stay with their nodes, not with the place in space.
@@ -199,14 +199,14 @@ class BranchModel:
             NotPositiveDefiniteError: the mesh cannot bear anything.
         """
         other = copy.copy(self)
-        other.hanging = None
-        other.hanging = carried(other)
+        other.prestress = None
+        other.prestress = carried(other)
         return other
 
     def linear(self, young: float, poisson: float) -> "BranchModel":
         """Return the branch of one linear material, without what it carries and what grips it."""
         other = copy.copy(self)
-        other.hanging, other.stiffening = None, 1.0
+        other.prestress, other.stiffening = None, 1.0
         other.material = material_named("linear")
         other._set(young, poisson, self.density)
         return other
@@ -231,8 +231,8 @@ class BranchModel:
         other = copy.copy(self)
         other.point_masses = tuple(one.heavier(factor) for one in self.point_masses)
         other._mass = {}
-        if other.hanging is not None and other.hanging.added is not None:
-            other.hanging = replace(other.hanging, added=other.hanging.added.scaled(factor))
+        if other.prestress is not None and other.prestress.added is not None:
+            other.prestress = replace(other.prestress, added=other.prestress.added.scaled(factor))
         return other
 
     def without_point_masses(self) -> "BranchModel":
@@ -242,8 +242,8 @@ class BranchModel:
         other = copy.copy(self)
         # Made once, too: each step of a motion asks for it where the density is sought.
         other.point_masses, other._mass = (), self._mass.setdefault("bare", {})
-        if other.hanging is not None:
-            other.hanging = replace(other.hanging, added=None, mass_count=0)
+        if other.prestress is not None:
+            other.prestress = replace(other.prestress, added=None, mass_count=0)
         return other
 
     def equations(self, grasps: Sequence[Grasp] = ()) -> Equations:
@@ -380,9 +380,9 @@ class BranchModel:
 
         At small strains a weight that is carried has no effect.
         """
-        if self.hanging is None or self.material.is_linear:
+        if self.prestress is None or self.material.is_linear:
             return None
-        return self.hanging.total.stiffness
+        return self.prestress.total.stiffness
 
     def _weight_times(self, field: np.ndarray) -> np.ndarray:
         return product_with(self.weight_stiffness, field)
@@ -390,9 +390,9 @@ class BranchModel:
     @property
     def weight_force(self) -> np.ndarray:
         """Weight that the mesh's shape does not carry already [N], shape [node_count, 3]."""
-        if self.hanging is None:
+        if self.prestress is None:
             return self.mass_load[:, None] * self.gravity
-        later = nodal_masses(self._ties[self.hanging.mass_count:], self.mesh.node_count)
+        later = nodal_masses(self._ties[self.prestress.mass_count:], self.mesh.node_count)
         return later[:, None] * self.gravity
 
     @property
@@ -453,9 +453,9 @@ class BranchModel:
         if changed:
             # Shared by the models that are made of this one with the same density.
             self._mass: dict[str, Any] = {}
-        if changed and self.hanging is not None:
+        if changed and self.prestress is not None:
             ratio = self.density / before
-            self.hanging = (self.hanging.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
+            self.prestress = (self.prestress.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
                             else carried(self))
 
 def product_with(matrix: sp.csr_matrix, field: np.ndarray) -> np.ndarray:

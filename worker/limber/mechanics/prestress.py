@@ -65,7 +65,7 @@ class CarriedWeight:
 
 
 @dataclass(frozen=True)
-class Hanging:
+class Prestress:
     """How the weight of a hanging branch is carried.
 
     Attributes:
@@ -82,12 +82,12 @@ class Hanging:
     def total(self) -> CarriedWeight:
         return self.own if self.added is None else self.own + self.added
 
-    def with_density(self, factor: float) -> "Hanging":
+    def with_density(self, factor: float) -> "Prestress":
         """Return the same of a branch ``factor`` times as dense."""
         return replace(self, own=self.own.scaled(factor))
 
 
-def carried(model: "BranchModel") -> Hanging:
+def carried(model: "BranchModel") -> Prestress:
     """Return how a model that is taken to hang in its mesh's shape carries its weight.
 
     Raises:
@@ -105,7 +105,7 @@ def carried(model: "BranchModel") -> Hanging:
         return _carried(plain, load, tangent.solve(equations.free_part(load)))
 
     own_load, added_load = (mass[:, None] * model.gravity for mass in (own, added))
-    return Hanging(carrying(own_load), carrying(added_load) if added_load.any() else None,
+    return Prestress(carrying(own_load), carrying(added_load) if added_load.any() else None,
                    len(model.point_masses))
 
 

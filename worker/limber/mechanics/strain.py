@@ -124,7 +124,7 @@ def strain_of(model: BranchModel, stress: np.ndarray, tets: np.ndarray | slice =
 def carried_strain(model: BranchModel) -> np.ndarray | None:
     """Return the mean strain that carries the weight on the scan, [tet_count, 6] (00 11 22 01 02
     12), None for a branch that carries none there."""
-    if model.hanging is None:
+    if model.prestress is None:
         return None
     part = model.weights / model.weights.sum(axis=1, keepdims=True)
     strain = np.einsum("eq,eqij->eij", part, strain_of(model, _carried(model)))
@@ -133,9 +133,9 @@ def carried_strain(model: BranchModel) -> np.ndarray | None:
 
 def _carried(model: BranchModel, tets: np.ndarray | slice = ALL) -> np.ndarray:
     """Return the stress that carries the weight on the scan [Pa], shape [tet_count, q, 3, 3]."""
-    if model.hanging is None:
+    if model.prestress is None:
         return np.zeros((*model.weights[tets].shape, 3, 3))
-    return model.hanging.total.stress[tets][..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+    return model.prestress.total.stress[tets][..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 
 
 def gradient_metric(model: BranchModel) -> sp.csr_matrix:

@@ -5,9 +5,9 @@ Positions for the grasp within a branch's reach:
 >>> import numpy as np
 >>> from limber.planning import sample_positions
 >>> from limber.planning.field.grasp_model import Reach
->>> from limber.planning.field.low_energy_surface import Valley
+>>> from limber.planning.field.low_energy_surface import LowEnergySurface
 >>> reach = Reach(np.zeros(3), arc_length=0.5, chord=0.48, tip=np.array([0, 0, 0.6]))
->>> shell = Valley(np.array([0, 0, 0.1]), radius=0.38)
+>>> shell = LowEnergySurface(np.array([0, 0, 0.1]), radius=0.38)
 >>> sample_positions(reach, np.array([0, 0, 0.48]), 32, shell, deflection=0.4).shape
 (32, 3)
 """

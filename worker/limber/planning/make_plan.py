@@ -15,7 +15,7 @@ import numpy as np
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
-from limber.planning.constraints.chance import Risk, YoungDoubt
+from limber.planning.constraints.chance import Risk, YoungUncertainty
 from limber.planning.constraints.full_model_check import broken_on_full_model, field_error, learnt
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.motion_check import MotionCheck, check_motion
@@ -34,7 +34,7 @@ from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace
 from limber.planning.two_paths import PathPair, plan_within
-from limber.planning.undecided_passages import Narrows, asked_in_doubt, said_after
+from limber.planning.undecided_passages import Passages, asked_in_doubt, said_after
 
 _RESERVE = 1.01  # on what limits are tightened by: the risk changes a little with the path
 
@@ -63,7 +63,7 @@ class PlannedMotion:
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
                 limits: Limits | None = None, cell: Mapping[str, CellPlace] | None = None,
-                doubt: YoungDoubt | None = None, pace: Pace | None = None,
+                uncertainty: YoungUncertainty | None = None, pace: Pace | None = None,
                 workers: int | None = None, progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
@@ -93,7 +93,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
         field = _knowing(field, grasp_model, limits, workers, progress)
-    rounds = _Rounds(grasp_model, settings, limits, goal, start, doubt, workers, field, goal,
+    rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, goal,
                      limits, pace or Pace(settings.speed, settings.acceleration), progress)
     count = settings.replans + 1
     for number in range(count):
@@ -122,7 +122,7 @@ class _Rounds:
     limits: Limits
     goal: Goal
     start: np.ndarray
-    doubt: YoungDoubt | None
+    uncertainty: YoungUncertainty | None
     workers: int | None
     field: EnergyField
     aim: Goal
@@ -133,7 +133,7 @@ class _Rounds:
     plan: ResolvedPath | None = None
     baseline: ResolvedPath | None = None
     risks: list[Risk] = fresh(default_factory=list)
-    narrows: list[Narrows] = fresh(default_factory=list)
+    passages: list[Passages] = fresh(default_factory=list)
     moving: MotionCheck | None = None
     told: list[dict[str, Any]] = fresh(default_factory=list)
 
@@ -177,11 +177,11 @@ class _Rounds:
             found = None if is_last else asked_in_doubt(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
                 ahead.part(0.3, 1.0))
-            if found is None and self.narrows:
-                raise said_after(none, len(self.narrows), self.narrows[-1].told) from none
+            if found is None and self.passages:
+                raise said_after(none, len(self.passages), self.passages[-1].told) from none
             if found is None:
                 raise
-            self.narrows.append(found)
+            self.passages.append(found)
             self.progress.warn(
                 f"{none.seen} The energy field's error makes this uncertain, so poses are added: "
                 f"{found.told}.")
@@ -207,8 +207,10 @@ class _Rounds:
         broken = broken_on_full_model(plan, self.limits, self.goal, self.grasp_model.mesh.nodes)
         if plan.is_whole:
             self.aim = self.aim.drawn_in(plan.solved)
-        if self.doubt is not None and not broken:
-            risk = self.doubt.risk(self.grasp_model, plan, self.limits, self.settings.confidence)
+        if self.uncertainty is not None and not broken:
+            risk = self.uncertainty.risk(
+                self.grasp_model, plan, self.limits, self.settings.confidence
+            )
             self.risks.append(risk)
             broken = risk.told()
             self._tighten(risk.excess)

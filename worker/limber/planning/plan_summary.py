@@ -68,7 +68,7 @@ def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMe
     error = float(np.quantile(missed, 0.95)) if len(missed) else float(
         np.abs(field.missed[:, 0]).max())
     cost = weights.energy * found.energy_integral_jm + weights.length * found.length_m
-    if not np.isfinite(error) or goal.doubt(field) > 0.0:
+    if not np.isfinite(error) or goal.uncertainty(field) > 0.0:
         return {"field_error_j": error if np.isfinite(error) else None, "lower_bound": None,
                 "cost": cost, "gap_percent": None}
     lower = pair.certificate.lower * weights.length / (weights.length + weights.energy * error)

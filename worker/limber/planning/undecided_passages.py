@@ -19,7 +19,7 @@ from limber.planning.planners.easiest import easiest_way
 
 
 @dataclass(frozen=True)
-class Narrows:
+class Passages:
     """The easiest way to the goal on the full model: what was ``learnt`` there, and in words
     ``told`` what it takes."""
 
@@ -28,7 +28,7 @@ class Narrows:
 
 
 def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarray, goal: Goal,
-                   limits: Limits, progress: Progress = SILENT) -> Narrows | None:
+                   limits: Limits, progress: Progress = SILENT) -> Passages | None:
     """Solve the branch along the way that goes least over the limits; None where the field's error
     does not leave in doubt that it goes over them, or nothing new is to be learnt there."""
     way = easiest_way(field, limits.on(field), start, goal)
@@ -45,7 +45,7 @@ def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarra
     found = learnt(field, grasp_model, solved, limits)
     if not len(found.poses) and not len(found.rejected_poses):
         return None
-    return Narrows(found, _told(solved, limits))
+    return Passages(found, _told(solved, limits))
 
 
 def _told(solved: ResolvedPath, limits: Limits) -> str:

@@ -59,8 +59,8 @@ def model_key(model: BranchModel, grasp: Grasp, weights: np.ndarray, control_you
     for array in (weights, control_young, model.poisson, model.density, model.gravity,
                   grasp.nodes, grasp.weights, model.fixed):
         digest.update(np.ascontiguousarray(array).tobytes())
-    if model.hanging is not None:
-        digest.update(np.ascontiguousarray(model.hanging.total.stress).tobytes())
+    if model.prestress is not None:
+        digest.update(np.ascontiguousarray(model.prestress.total.stress).tobytes())
     return digest.hexdigest()[:32]
 
 

@@ -288,7 +288,7 @@ class ReducedModel:
             np.log(self.training_young / self.young)).max(axis=1)
         return np.argsort(distance)[:count]
 
-    def doubt(self, pose: np.ndarray, novelty: float, limit: float) -> str:
+    def uncertainty(self, pose: np.ndarray, novelty: float, limit: float) -> str:
         """Return why a state lies outside the range of the basis, or an empty string."""
         distance = self._table.distance(pose).min()
         if distance > 3 * self._spacing:
@@ -377,10 +377,10 @@ class ReducedModel:
         energy, force = self.energy_force(found.q)
         reaction, torque = self.wrench(pose, force - load)
         strain = energy - 0.5 * float(found.q @ self.weight_stiffness @ found.q)
-        doubt = "" if found.converged else "no stable equilibrium was found"
-        doubt = doubt or self.doubt(pose, found.novelty, settings.novelty_limit)
+        uncertainty = "" if found.converged else "no stable equilibrium was found"
+        uncertainty = uncertainty or self.uncertainty(pose, found.novelty, settings.novelty_limit)
         return ReducedState(
-            found.converged, not doubt, doubt, found.q, pose, self.young, strain,
+            found.converged, not uncertainty, uncertainty, found.q, pose, self.young, strain,
             float(energy - self.load @ found.q), reaction, torque, found.novelty, iterations,
             time.perf_counter() - began)
 

@@ -96,19 +96,21 @@ def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance:
     bad states lie within, at moduli that the basis knows, where a free end points a little astray.
     """
     if not state.converged:
-        doubt = "no stable equilibrium was found"
+        uncertainty = "no stable equilibrium was found"
     elif not estimate.certain:
-        doubt = "the full model is not stable there"
+        uncertainty = "the full model is not stable there"
     elif estimate.min_det_f <= 0:
-        doubt = "an element of the full mesh is inside out there"
+        uncertainty = "an element of the full mesh is inside out there"
     elif estimate.position > position_tolerance:
-        doubt = (f"on the full model a node is {100 * estimate.position:.2g} % of the branch's "
-                 "extent away")
+        uncertainty = (
+            f"on the full model a node is {100 * estimate.position:.2g} % of the branch's "
+            "extent away"
+        )
     elif abs(estimate.energy) > energy_tolerance:
-        doubt = f"its energy differs from the full model's by {100 * estimate.energy:+.2g} %"
+        uncertainty = f"its energy differs from the full model's by {100 * estimate.energy:+.2g} %"
     else:
-        doubt = ""
-    return replace(state, trusted=not doubt, doubt=doubt)
+        uncertainty = ""
+    return replace(state, trusted=not uncertainty, uncertainty=uncertainty)
 
 
 def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedState,

@@ -70,7 +70,7 @@ class ReducedState:
 
     converged: bool
     trusted: bool
-    doubt: str
+    uncertainty: str
     coordinates: np.ndarray
     pose: np.ndarray
     young: np.ndarray

@@ -84,7 +84,7 @@ class HeldBranch:
         self.surface, compact = np.unique(faces, return_inverse=True)
         self.faces = compact.reshape(-1, 3)
         self.grasps: dict[int, Held] = {}
-        self.gravity_on = model.hanging is not None
+        self.gravity_on = model.prestress is not None
         self._hung: np.ndarray | None = None
         self._weather: np.ndarray | None = None
         self._is_gone = np.zeros(len(model.mesh.tets), bool)
@@ -158,7 +158,7 @@ class HeldBranch:
         Raises:
             InputError: it was loaded without weight, so there is none to switch on.
         """
-        if on and self.model.hanging is None:
+        if on and self.model.prestress is None:
             raise InputError("The branch has no weight.", "The session was started without it.",
                              "Start it without --no-gravity.")
         self.gravity_on = on
@@ -215,7 +215,7 @@ class HeldBranch:
         if self._outdoors is None:
             raise InputError("There is no wind, snow, fruit or cut.", "",
                              "Send `outdoors` first.")
-        if not self.gravity_on and self.model.hanging is not None:
+        if not self.gravity_on and self.model.prestress is not None:
             raise InputError("The branch's weight is switched off.",
                              "Effects of loads are computed for a branch under its "
                              "weight.", "Switch it on.")
@@ -231,7 +231,7 @@ class HeldBranch:
         """Forces on the nodes besides what the hanging branch carries [N], None where there are
         none, shape [node_count, 3]."""
         acting = [forces for forces in (self._hung, self._weather) if forces is not None]
-        if not self.gravity_on and self.model.hanging is not None:
+        if not self.gravity_on and self.model.prestress is not None:
             acting.append(-self.model.mass_load[:, None] * self.model.gravity)
         return sum(acting, np.zeros(3)) if acting else None
 

@@ -21,11 +21,11 @@ def _run(*corners) -> Skeleton:
 def test_an_end_that_folds_back_goes() -> None:
     """The run ends where it turned; the rest stays as it was."""
     run = _run((0, 0, 0), (0, 0, 0.3), (0.012, 0, 0.27))
-    assert any(doubt.kind is DoubtKind.kink for doubt in doubtful_parts(run))
+    assert any(uncertainty.kind is DoubtKind.kink for uncertainty in doubtful_parts(run))
     mended, count = without_kinks(run)
     assert count == 1 and mended.nodes[-1, 2] == pytest.approx(0.3, abs=0.006)
     assert (mended.nodes == run.nodes[:mended.node_count]).all()
-    assert not any(doubt.kind is DoubtKind.kink for doubt in doubtful_parts(mended))
+    assert not any(uncertainty.kind is DoubtKind.kink for uncertainty in doubtful_parts(mended))
 
 
 def test_an_end_that_folds_twice_goes_whole() -> None:

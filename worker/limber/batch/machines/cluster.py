@@ -33,8 +33,11 @@ _NO_DAEMON = {"distributed.worker.daemon": False}
 _UNSERVED: dict[str, list[str]] = {
     "distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask's pages are not asked for."""
-_UNWATCHED = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s",
-              "distributed.admin.system-monitor.interval": "2s"}
+_NOT_OBSERVED = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "2s",
+}
 """Nor how Dask's own processes spend their time, which takes some of the stages'."""
 _WAIT_SECONDS = 0.5
 _MEMORY_MB = 4000.0
@@ -141,7 +144,7 @@ class Cluster:
                                 "Start `dask scheduler` and `dask worker --no-nanny`, with the "
                                 "same certificates in Dask's settings on all machines.") from error
         # As long as the cluster is there: it may start a lost worker anew.
-        stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _UNWATCHED))
+        stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _NOT_OBSERVED))
         cluster = stack.enter_context(
             self._local(jobs) if kind == "local"
             else self._queue(present(kind, "kind of cluster"), jobs))

@@ -8,7 +8,7 @@ from limber.core.errors import WorkError
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import Forward
-from limber.estimation.forward.observed_path import WatchedForward, is_watched
+from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 
 PARTS = (0.25, 0.45, 0.7)
@@ -52,13 +52,13 @@ def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
     Returns:
         The values, and whether they explain the pulls at all.
     """
-    watched = [forward for forward in objective.forwards if is_watched(forward)]
-    if not watched:
+    observed = [forward for forward in objective.forwards if is_path_observed(forward)]
+    if not observed:
         return values, True
     space = objective.space
     likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
-    counts = [forward.key_count for forward in watched]
-    for forward, count in zip(watched, counts, strict=True):
+    counts = [forward.key_count for forward in observed]
+    for forward, count in zip(observed, counts, strict=True):
         forward.is_watching = False
         forward.set_key_count(min(ROUGH_KEYS, count))
     try:
@@ -66,31 +66,33 @@ def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
         found = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
                              force_rounds=0).evaluation
         explains = found.mean_square < RAN_OFF
-        for forward in watched:
+        for forward in observed:
             forward.keep()
         if explains:
-            found = _followed(rough, found, watched)
+            found = _followed(rough, found, observed)
     except WorkError:
         return values, True
     finally:
-        for forward, count in zip(watched, counts, strict=True):
+        for forward, count in zip(observed, counts, strict=True):
             forward.is_watching = True
             forward.set_key_count(count)
     objective.forward_count = rough.forward_count
     return likely.unpack(found.free), explains
 
 
-def _followed(rough: Objective, found: Evaluation, watched: list[WatchedForward]) -> Evaluation:
+def _followed(
+    rough: Objective, found: Evaluation, observed: list[ObservedPathForward]
+) -> Evaluation:
     """Fit on where the force is as a first fit says that it was; there, unless that is worse."""
     rough.follow_forces(found)
     there = rough.evaluate(found.free, jacobian=True)
     if there is None or there.objective > WORSE * found.objective:
-        for forward in watched:
+        for forward in observed:
             forward.step_back()
         return found
     fit = gauss_newton(rough, found.free, evaluation_limit=12, tolerance=3e-2, is_near=True,
                        force_rounds=0)
-    for forward in watched:
+    for forward in observed:
         forward.keep()
     return fit.evaluation
 
@@ -221,7 +223,7 @@ def _first_standing(objective: Objective, trials: list[Values],
     """Return the first that has an equilibrium; the force is taken as it was read."""
     for trial in trials:
         for forward in objective.forwards:
-            if is_watched(forward):
+            if is_path_observed(forward):
                 forward.forget()
         found = objective.evaluate(objective.space.pack(trial), jacobian=True)
         if found is not None:

@@ -13,7 +13,7 @@ from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
 from limber.estimation.fitting.residuals import Residuals, seen_in
 from limber.estimation.forward.forward_model import Forward, Simulated
-from limber.estimation.forward.observed_path import is_watched
+from limber.estimation.forward.observed_path import is_path_observed
 from limber.estimation.parameters import ParameterSpace, Values
 
 FAILED_OBJECTIVE = 1e12
@@ -203,7 +203,7 @@ class Objective:
     def _simulated(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
         """Simulate all pulls; forces that are unknowns beside a recorded path are settled."""
         settling = {index: forward for index, forward in enumerate(self.forwards)
-                    if is_watched(forward)}
+                    if is_path_observed(forward)}
         if not settling:
             return self._compared(free, values, jacobian)
         left = sum(forward.iteration_limit for forward in settling.values())
@@ -236,14 +236,14 @@ class Objective:
     def keep_forces(self) -> None:
         """Remember the forces of pulls that settle; :meth:`step_back` returns to them."""
         for forward in self.forwards:
-            if is_watched(forward):
+            if is_path_observed(forward):
                 forward.keep()
 
     def step_back(self) -> None:
         """Return to the forces that were kept last."""
         self._last = None
         for forward in self.forwards:
-            if is_watched(forward):
+            if is_path_observed(forward):
                 forward.step_back()
 
     def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:

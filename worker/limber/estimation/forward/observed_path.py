@@ -32,7 +32,7 @@ SAME_RESPONSE = 0.02
 """After a smaller change over the branch's size it answers to its force as before."""
 
 
-class WatchedForward(QuasiStaticForward):
+class ObservedPathForward(QuasiStaticForward):
     """Simulates one pose-recorded pull by its force; arguments as of its base class."""
 
     is_watching = True
@@ -84,7 +84,7 @@ class WatchedForward(QuasiStaticForward):
     def begin_at(self, other: QuasiStaticForward) -> None:
         """As of the base class, and for the values that the force was found for."""
         super().begin_at(other)
-        if isinstance(other, WatchedForward):
+        if isinstance(other, ObservedPathForward):
             self._drives_for = other._drives_for
 
     def keep(self) -> None:
@@ -154,7 +154,7 @@ class WatchedForward(QuasiStaticForward):
         return axis * np.sign(axis @ outward or 1.0)
 
 
-def is_watched(forward: Forward) -> TypeGuard[WatchedForward]:
+def is_path_observed(forward: Forward) -> TypeGuard[ObservedPathForward]:
     """Whether the force of a pull is an unknown at present, and its gripper's path an observation.
     """
-    return isinstance(forward, WatchedForward) and forward.watches_pose
+    return isinstance(forward, ObservedPathForward) and forward.watches_pose

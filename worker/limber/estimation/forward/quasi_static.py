@@ -274,7 +274,7 @@ class QuasiStaticForward(Forward):
         """
         other = copy.copy(self)
         model = self._model.with_rest_nodes(nodes)
-        other._model = model if self._model.hanging is None else model.as_scanned()
+        other._model = model if self._model.prestress is None else model.as_scanned()
         other.grasp = self.grasp.elsewhere(other.mesh, np.array(self.entry.grasp.point_m))
         if self.drive == "pose":
             other._drives = [pose_on(other.grasp, self.entry.grasp, pose)

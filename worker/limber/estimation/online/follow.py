@@ -185,7 +185,7 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
         pull.entry.rest_points_m)
     branch = FullBranch(subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson,
                         start.density, tuple(model.gravity), model.point_masses,
-                        model.hanging is not None)
+                        model.prestress is not None)
     return Begun(reduced, branch, pull, deviation)
 
 

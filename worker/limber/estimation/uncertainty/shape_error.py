@@ -15,7 +15,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.uncertainty.path_error import WIDEST
 from limber.estimation.uncertainty.shape_sensitivity import hung_slopes, shape_slopes, taken_up
-from limber.geometry.shape_samples import likely_skeletons, reshaped
+from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.mechanics.added_masses import HungTwig
 
 FEWEST = 8
@@ -45,7 +45,7 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     if count < FEWEST:
         return None
     progress(0.0, "evaluating posterior samples of the shape")
-    meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in likely_skeletons(
+    meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in sample_skeletons(
         subject.skeleton, points, count, np.random.default_rng(seed))]
     steps = taken_up(evaluation, objective,
                      lambda forward, values: shape_slopes(forward, values, meshes))

@@ -14,7 +14,7 @@ _BACKWARDS = np.deg2rad(110.0)  # of a twig against its carrier, likewise
 _CHORD = 2.0  # radii on each side of a node that tell its turn
 
 
-class DoubtKind(StrEnum):
+class DoubtfulKind(StrEnum):
     """Why a part is uncertain."""
 
     unlikely = "unlikely branch"
@@ -25,7 +25,7 @@ class DoubtKind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Doubt:
+class DoubtfulPart:
     """One uncertain part.
 
     Attributes:
@@ -38,7 +38,7 @@ class Doubt:
             one; angle [rad] of a kink; NaN for a gap.
     """
 
-    kind: DoubtKind
+    kind: DoubtfulKind
     branch: int
     at: np.ndarray
     length: float
@@ -46,34 +46,40 @@ class Doubt:
     value: float
 
 
-def doubtful_parts(skeleton: Skeleton) -> list[Doubt]:
+def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
     """Return what to look at, the longest of each kind first."""
-    found: list[Doubt] = []
+    found: list[DoubtfulPart] = []
     for run, (members, own) in enumerate(
             zip(skeleton.runs(), skeleton.own_runs(), strict=True)):
         probability = float(skeleton.probability[own].min())
         if probability < _LIKELY:
-            found.append(_part(skeleton, DoubtKind.unlikely, run, own, probability))
+            found.append(_part(skeleton, DoubtfulKind.unlikely, run, own, probability))
         share = skeleton.radius_sigma / np.maximum(skeleton.radius, 1e-300)
         for part in _stretches(own, skeleton.radius_state[own] == UNRESOLVED):
-            found.append(_part(skeleton, DoubtKind.unresolved, run, part, float(share[part].max())))
+            found.append(
+                _part(skeleton, DoubtfulKind.unresolved, run, part, float(share[part].max()))
+            )
         for part in _stretches(own, skeleton.radius_state[own] == BRIDGED):
-            found.append(_part(skeleton, DoubtKind.bridged, run, part, float("nan")))
+            found.append(_part(skeleton, DoubtfulKind.bridged, run, part, float("nan")))
         turn = turns(skeleton, members)
         for part in _stretches(np.arange(len(members)), turn > KINK):
             worst = part[np.argmax(turn[part])]
-            found.append(_part(skeleton, DoubtKind.kink, run, members[worst:worst + 1],
+            found.append(_part(skeleton, DoubtfulKind.kink, run, members[worst:worst + 1],
                                float(turn[worst])))
         back = start_angle(skeleton, members) if run else 0.0
         if back > _BACKWARDS:
-            found.append(_part(skeleton, DoubtKind.backwards, run, own[:1], back))
-    order = list(DoubtKind)
-    return sorted(found, key=lambda doubt: (order.index(doubt.kind), -doubt.length))
+            found.append(_part(skeleton, DoubtfulKind.backwards, run, own[:1], back))
+    order = list(DoubtfulKind)
+    return sorted(
+        found, key=lambda uncertain_part: (order.index(uncertain_part.kind), -uncertain_part.length)
+    )
 
 
-def _part(skeleton: Skeleton, kind: DoubtKind, run: int, nodes: np.ndarray, value: float) -> Doubt:
+def _part(
+    skeleton: Skeleton, kind: DoubtfulKind, run: int, nodes: np.ndarray, value: float
+) -> DoubtfulPart:
     length = float(skeleton.steps[nodes].sum()) if len(nodes) > 1 else 0.0
-    return Doubt(kind, run, skeleton.nodes[nodes[len(nodes) // 2]], length,
+    return DoubtfulPart(kind, run, skeleton.nodes[nodes[len(nodes) // 2]], length,
                  float(np.median(skeleton.radius[nodes])), value)
 
 

@@ -23,7 +23,7 @@ _NOT_KNOWN = {"sag_interval_m": None, "greatest_strain_interval": None,
 
 def tip_node(outdoors: LoadedOutdoors) -> int:
     """Return the mesh's node at the outermost place of the main path that is not cut off."""
-    skeleton, nodes = outdoors.skeleton, outdoors.hanging.mesh.nodes
+    skeleton, nodes = outdoors.skeleton, outdoors.prestress.mesh.nodes
     path = [node for node in skeleton.main_path() if not outdoors.gone[node]]
     return int(np.linalg.norm(nodes - skeleton.nodes[path[-1]], axis=1).argmin())
 
@@ -68,7 +68,7 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
     Raises:
         WorkError: it finds no rest under them.
     """
-    gravity = outdoors.hanging.gravity
+    gravity = outdoors.prestress.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     tip = tip_node(outdoors)
 

@@ -97,12 +97,12 @@ class LoadedOutdoors:
         self._model = self._cut(model)
         # The scan's shape carries the weight of what is cut off: without it, it springs up.
         lost = model.mass_load - self._model.mass_load
-        if model.hanging is not None:
+        if model.prestress is not None:
             self._forces -= lost[:, None] * model.gravity
         self.cut_mass = float(lost.sum())
 
     @property
-    def hanging(self) -> BranchModel:
+    def prestress(self) -> BranchModel:
         """The branch as it hangs, without these loads."""
         return self._plain
 

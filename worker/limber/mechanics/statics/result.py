@@ -89,7 +89,7 @@ class StaticResult:
     message: str = ""
     warnings: list[str] = field(default_factory=list)
     snapped_at: list[float] = field(default_factory=list)
-    doubt: str = ""
+    uncertainty: str = ""
 
     @property
     def converged(self) -> bool:

@@ -16,7 +16,7 @@ _SAME = 1e-3
 """How near to the start, as part of the branch's extent, is the start."""
 
 
-def doubt_of(path: Path, result: StaticResult) -> str:
+def uncertainty_of(path: Path, result: StaticResult) -> str:
     """Return why a converged result may not be the only state of its grasp, or an empty string.
 
     Costs nothing unless the branch snapped; else as much as the way there.

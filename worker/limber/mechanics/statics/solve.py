@@ -18,7 +18,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.path import Path
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
-from limber.mechanics.statics.return_path import doubt_of
+from limber.mechanics.statics.return_path import uncertainty_of
 from limber.mechanics.statics.static_problem import StaticProblem, Target
 
 
@@ -84,10 +84,12 @@ def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
     """Return the end of a path, with a warning where it is uncertain."""
     result = path.run(progress, guess, strain)
     asked = result.converged and path.settings.way_back
-    doubt = doubt_of(path, result) if asked else ""
-    if not doubt:
+    uncertainty = uncertainty_of(path, result) if asked else ""
+    if not uncertainty:
         return result
-    return replace(result, doubt=doubt, warnings=[*result.warnings, f"{_capital(doubt)}."])
+    return replace(
+        result, uncertainty=uncertainty, warnings=[*result.warnings, f"{_capital(uncertainty)}."]
+    )
 
 
 def _capital(text: str) -> str:

@@ -115,7 +115,7 @@ class HowFound(TypedDict, total=False):
     message: str
     warnings: list[str]
     snapped_at: list[float]
-    doubt: str
+    uncertainty: str
 
 
 def make_result(problem: StaticProblem, displacement: np.ndarray, state: InternalState,
@@ -148,7 +148,7 @@ def base_forces(model: BranchModel, out: np.ndarray) -> np.ndarray:
         out: Internal and inertial force less loads on all nodes [N], shape [node_count, 3].
     """
     base = np.where(model.fixed[:, None], out, 0.0)
-    return base if model.hanging is None else base + model.hanging.total.base
+    return base if model.prestress is None else base + model.prestress.total.base
 
 
 def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, out: np.ndarray,

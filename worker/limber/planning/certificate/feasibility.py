@@ -87,7 +87,7 @@ class _Cells:
         number = np.floor((self.chart.map(place)[0] - self.low) / self.edges)
         return (np.abs(self.numbers - number) <= 1).all(axis=1)
 
-    def hanging(self, some: np.ndarray) -> np.ndarray:
+    def prestress(self, some: np.ndarray) -> np.ndarray:
         """Return which cells are connected to any of ``some``, bool [n]."""
         together = connected_components(self._neighbours(), directed=False)[1]
         return np.isin(together, together[some])
@@ -144,29 +144,29 @@ def judge(problem: GentleProblem) -> Verdict:
     on_field = _judged(problem, problem.limits, 0.0)
     if not on_field.proven:
         return on_field
-    return _judged(problem, problem.sure_limits, problem.goal.doubt(problem.energy_field))
+    return _judged(problem, problem.sure_limits, problem.goal.uncertainty(problem.energy_field))
 
 
-def _judged(problem: GentleProblem, limits: FieldArrays, goal_doubt: float) -> Verdict:
+def _judged(problem: GentleProblem, limits: FieldArrays, goal_uncertainty: float) -> Verdict:
     """Cut cells until they prove that no path keeps ``limits`` and comes as near as ``goal_doubt``
     [m] to the goal, or a way leads by them, or there are too many."""
     cells = _first(problem)
     while True:
         cells = cells.take(~_surely_outside(cells))
         positions, nodes = cells.nodes()
-        over, doubt = _surely_over(cells, limits, positions, nodes)
+        over, uncertainty = _surely_over(cells, limits, positions, nodes)
         begin = cells.holding(problem.start)
         away = problem.goal.distance(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
         tolerance = problem.goal.tolerance
-        ends = ~over & (least <= tolerance + goal_doubt)
+        ends = ~over & (least <= tolerance + goal_uncertainty)
         kept = allowed_points(positions, problem.limits)[nodes]
         open_cells = np.flatnonzero(~over | begin)
         cells, begin, ends = cells.take(open_cells), begin[open_cells], ends[open_cells]
         if not begin.any() or not ends.any():
             return Verdict(cells.edges, proven=True)
-        hanging = cells.hanging(begin)
-        if not (hanging & ends).any():
+        prestress = cells.prestress(begin)
+        if not (prestress & ends).any():
             return Verdict(cells.edges, proven=True)
         free = kept[open_cells][:, _AT].all(axis=1)
         reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
@@ -180,12 +180,12 @@ def _judged(problem: GentleProblem, limits: FieldArrays, goal_doubt: float) -> V
                                    chart.map(positions[end])])
             # Along the shell: the chord of a curved cell may lie well off it.
             return Verdict(cells.edges, way=chart.curved(resample(flat, _FINE)))
-        doubt = np.maximum(doubt[open_cells][~free].sum(axis=0),
+        uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
                            (bends / tolerance)[open_cells][ends].sum(axis=0))
-        parts = np.where(doubt >= _DOUBTED * doubt.max(), 2, 1)
-        if hanging.sum() * parts.prod() > _MOST_CELLS:
+        parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
+        if prestress.sum() * parts.prod() > _MOST_CELLS:
             return Verdict(cells.edges)
-        cells = cells.take(hanging).cut(parts)
+        cells = cells.take(prestress).cut(parts)
 
 
 def _first(problem: GentleProblem) -> _Cells:
@@ -220,12 +220,12 @@ def _surely_over(cells: _Cells, limits: FieldArrays, positions: np.ndarray, node
                  ) -> tuple[np.ndarray, np.ndarray]:
     """Return in which cells no point keeps ``limits``, bool [n], and how much in doubt each axis
     leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3]."""
-    over, doubt = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
+    over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
     for values, slopes, limit in _limited(cells.problem, limits, positions):
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
         over |= least > limit
-        doubt = np.maximum(doubt, bends / limit)
+        uncertainty = np.maximum(uncertainty, bends / limit)
     limit = limits.max_force
     if limit < np.inf:
         force = cells.problem.energy_field.force(positions)[nodes]
@@ -235,8 +235,8 @@ def _surely_over(cells: _Cells, limits: FieldArrays, positions: np.ndarray, node
         apart = force[:, _AT].reshape(-1, 2, 2, 2, 3)
         apart = np.stack([np.linalg.norm(np.diff(apart, axis=axis), axis=-1).max(axis=(1, 2, 3))
                           for axis in (1, 2, 3)], axis=1)
-        doubt = np.maximum(doubt, (bends + apart) / limit)
-    return over, doubt
+        uncertainty = np.maximum(uncertainty, (bends + apart) / limit)
+    return over, uncertainty
 
 
 def _limited(problem: GentleProblem, limits: FieldArrays, positions: np.ndarray,

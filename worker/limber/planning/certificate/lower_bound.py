@@ -208,7 +208,7 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
     goal = about_goal(problem, grid, ground)
     if not goal.meets:
-        if problem.goal.doubt(problem.energy_field) > 0.0:
+        if problem.goal.uncertainty(problem.energy_field) > 0.0:
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
                             "of reach, but by less than the error of the energy field.")
         raise _separated(problem, grid, open_cells)

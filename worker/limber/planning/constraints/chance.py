@@ -141,7 +141,7 @@ def _draws(covariance: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class YoungDoubt:
+class YoungUncertainty:
     """Moduli at control points, log-normal about the estimate.
 
     Attributes:

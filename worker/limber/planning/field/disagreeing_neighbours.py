@@ -19,7 +19,7 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.guess import foretold_by, half_way
 from limber.planning.field.solved import Solved, taken
-from limber.planning.field.solver_pool import Crew
+from limber.planning.field.solver_pool import SolverPool
 
 _JUMP = 0.01  # of the branch's length, by which neighbours' slopes foretell differently
 _ONE = 0.003  # of it: nearer shapes are one
@@ -33,8 +33,15 @@ _CORNERS = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 Pair = tuple[Solved, Solved]
 
 
-def ask_between(crew: Crew, known: Sequence[Solved], chart: Chart, usual: np.ndarray, most: int, *,
-                progress: Progress = SILENT) -> tuple[list[Solved], np.ndarray]:
+def ask_between(
+    solvers: SolverPool,
+    known: Sequence[Solved],
+    chart: Chart,
+    usual: np.ndarray,
+    most: int,
+    *,
+    progress: Progress = SILENT,
+) -> tuple[list[Solved], np.ndarray]:
     """Return samples between neighbours that do not agree, and places [t, 3] of two shapes.
 
     Args:
@@ -48,7 +55,7 @@ def ask_between(crew: Crew, known: Sequence[Solved], chart: Chart, usual: np.nda
     torn = np.empty((0, 3))
     for number in range(_ROUNDS):
         wanted = round(most * (number + 1) / _ROUNDS) - asked
-        pairs = disagreeing(known, chart, usual, crew.grasp_model.reach.arc_length)
+        pairs = disagreeing(known, chart, usual, solvers.grasp_model.reach.arc_length)
         chosen = _apart(pairs, known, torn, chart)[:wanted]
         if not chosen:
             break
@@ -56,7 +63,7 @@ def ask_between(crew: Crew, known: Sequence[Solved], chart: Chart, usual: np.nda
         # In turn: hard places come first, and lie together.
         count = max(2, -(-len(chosen) // _SHARE_PAIRS))
         shares = [chosen[k::count] for k in range(count)]
-        found = crew.run(_ask, [(share,) for share in shares if share],
+        found = solvers.run(_ask, [(share,) for share in shares if share],
                          progress=progress.part(number / _ROUNDS, (number + 1) / _ROUNDS),
                          message="between neighbouring poses")
         known += [one for added, _ in found for one in added]

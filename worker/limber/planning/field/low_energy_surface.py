@@ -17,7 +17,7 @@ from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.solved import Solved, taken
-from limber.planning.field.solver_pool import Crew
+from limber.planning.field.solver_pool import SolverPool
 
 _STEP = 1e-4  # [m] of the moves that measure the stiffness at rest
 _RIM = 1.1  # times the force that linear bending needs for the largest deflection
@@ -28,15 +28,15 @@ _SHARE_DIRECTIONS = 3
 
 
 @dataclass(frozen=True)
-class Valley:
+class LowEnergySurface:
     """A sphere: ``pivot`` [m] of shape [3] and ``radius`` [m]."""
 
     pivot: np.ndarray
     radius: float
 
 
-def walk_valley(crew: Crew, count: int, *, deflection: float, seed: int = 0,
-                progress: Progress = SILENT) -> tuple[Valley, list[Solved]]:
+def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, seed: int = 0,
+                progress: Progress = SILENT) -> tuple[LowEnergySurface, list[Solved]]:
     """Return the shell, and states of the branch on it and a little beyond.
 
     Args:
@@ -47,7 +47,7 @@ def walk_valley(crew: Crew, count: int, *, deflection: float, seed: int = 0,
 
     A branch that is no cantilever (its states lie on no sphere) gets the sphere about its base.
     """
-    grasp_model = crew.grasp_model
+    grasp_model = solvers.grasp_model
     reach = grasp_model.reach
     stiffness, axes = _stiffness(grasp_model)
     force = float(np.sqrt(max(stiffness[0] * stiffness[1], 0.0))) * deflection * reach.arc_length
@@ -58,7 +58,7 @@ def walk_valley(crew: Crew, count: int, *, deflection: float, seed: int = 0,
     across = np.concatenate([np.zeros((1, 3)), across])
     # In turn: the farther from rest, the longer it takes.
     shares = max(2, -(-len(across) // _SHARE_DIRECTIONS))
-    found = crew.run(_walk, [(across[k::shares], force) for k in range(shares)],
+    found = solvers.run(_walk, [(across[k::shares], force) for k in range(shares)],
                      progress=progress, message="finding the low-energy surface")
     pairs = [found[k % shares][k // shares] for k in range(len(across))]
     slack = [pair[0] for pair in pairs[1:] if pair[0] is not None]
@@ -99,7 +99,7 @@ def _under(grasp_model: GraspModel, force: np.ndarray, start: StaticResult) -> S
     return None if refusal(held) else held
 
 
-def _sphere(places: np.ndarray, base: np.ndarray, rest: np.ndarray) -> Valley:
+def _sphere(places: np.ndarray, base: np.ndarray, rest: np.ndarray) -> LowEnergySurface:
     arm = rest - base
     chord = float(np.linalg.norm(arm))
 
@@ -112,8 +112,8 @@ def _sphere(places: np.ndarray, base: np.ndarray, rest: np.ndarray) -> Valley:
         pivot, radius = found.x[:3], float(found.x[3])
         close = np.sqrt(np.mean(found.fun**2)) < _WORST * radius
         if close and 0.2 * chord < radius < 3.0 * chord and (rest - pivot) @ arm > 0.0:
-            return Valley(pivot, radius)
-    return Valley(np.asarray(base, float), chord)
+            return LowEnergySurface(pivot, radius)
+    return LowEnergySurface(np.asarray(base, float), chord)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

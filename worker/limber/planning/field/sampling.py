@@ -22,9 +22,9 @@ from limber.planning.field.disagreeing_neighbours import ask_between
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach
 from limber.planning.field.guess import guess_of
-from limber.planning.field.low_energy_surface import Valley, walk_valley
+from limber.planning.field.low_energy_surface import LowEnergySurface, walk_energy_surface
 from limber.planning.field.solved import Solved, samples_of, taken
-from limber.planning.field.solver_pool import Crew
+from limber.planning.field.solver_pool import SolverPool
 from limber.planning.settings import EnergySettings
 
 _LAYER = 0.06  # share of the shell's radius
@@ -57,7 +57,7 @@ class Sampled:
 
     samples: GraspSamples
     displacements: list[np.ndarray]
-    valley: Valley
+    energy_surface: LowEnergySurface
     reasons: dict[str, int]
     taut_count: int
 
@@ -73,31 +73,44 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
     """
     spread = round(settings.samples * _SPREAD)
     directions = max(_FEWEST_DIRECTIONS, round(spread * _WALK))
-    with Crew(grasp_model, workers) as crew:
-        valley, walked = walk_valley(crew, directions, deflection=settings.deflection,
-                                     seed=settings.seed, progress=progress.part(0.0, 0.2))
+    with SolverPool(grasp_model, workers) as solvers:
+        energy_surface, walked = walk_energy_surface(
+            solvers,
+            directions,
+            deflection=settings.deflection,
+            seed=settings.seed,
+            progress=progress.part(0.0, 0.2),
+        )
         count = max(spread - len(walked), 1)
         usual = sample_positions(
-            grasp_model.reach, grasp_model.rest_position, max(_USUAL, count), valley,
+            grasp_model.reach, grasp_model.rest_position, max(_USUAL, count), energy_surface,
             deflection=settings.deflection, seed=settings.seed, fewest=count)
         targets = usual[:count]
-        good, bad = solve_branch(crew, targets, walked, progress=progress.part(0.2, 0.6))
+        good, bad = solve_branch(solvers, targets, walked, progress=progress.part(0.2, 0.6))
         drawn = max((float(np.linalg.norm(state.force)) for state in walked), default=0.0)
         forces = np.array([np.linalg.norm(one.force) for one in good])
         slack = _slack(forces, forces[1 + len(walked):], drawn)
         good = [one for one, kept in zip(good, slack, strict=True) if kept]
-        chart = Chart.about(valley.pivot, valley.radius, grasp_model.rest_position)
-        added, torn = ask_between(crew, good, chart, usual, settings.samples - spread,
+        chart = Chart.about(energy_surface.pivot, energy_surface.radius, grasp_model.rest_position)
+        added, torn = ask_between(solvers, good, chart, usual, settings.samples - spread,
                                   progress=progress.part(0.6, 1.0))
     good += added
     reasons = _counted(bad) | ({TWO_SHAPES: len(torn)} if len(torn) else {})
     samples = samples_of(good, np.concatenate([_asked(bad, targets), torn]))
-    return Sampled(samples, [one.displacement for one in good], valley, reasons,
+    return Sampled(samples, [one.displacement for one in good], energy_surface, reasons,
                    int((~slack).sum()))
 
 
-def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley, *,
-                     deflection: float, seed: int = 0, fewest: int | None = None) -> np.ndarray:
+def sample_positions(
+    reach: Reach,
+    rest: np.ndarray,
+    count: int,
+    energy_surface: LowEnergySurface,
+    *,
+    deflection: float,
+    seed: int = 0,
+    fewest: int | None = None,
+) -> np.ndarray:
     """Return ``count`` positions [m] to which the grasp may be taken, shape [count, 3].
 
     Where there is little room fewer, but no fewer than ``fewest`` (by default all).
@@ -115,14 +128,14 @@ def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley,
     for _ in range(64):
         draw = sequence.random(512)
         points = rest + radius * (2.0 * draw[:, :3] - 1.0)
-        arm = points[1::2] - valley.pivot
+        arm = points[1::2] - energy_surface.pivot
         depth = 1.0 - _LAYER * draw[1::2, 3:]
-        points[1::2] = valley.pivot + arm * (
-            valley.radius * depth / np.linalg.norm(arm, axis=1, keepdims=True))
+        points[1::2] = energy_surface.pivot + arm * (
+            energy_surface.radius * depth / np.linalg.norm(arm, axis=1, keepdims=True))
         inside = np.linalg.norm(points - rest, axis=1) <= radius
-        inside &= np.linalg.norm(points - valley.pivot, axis=1) <= valley.radius
+        inside &= np.linalg.norm(points - energy_surface.pivot, axis=1) <= energy_surface.radius
         # The sphere's other half is no shell: nothing is sampled beyond the pivot.
-        inside &= (points - valley.pivot) @ (rest - valley.pivot) > 0.0
+        inside &= (points - energy_surface.pivot) @ (rest - energy_surface.pivot) > 0.0
         inside &= points[:, 2] >= reach.base[2]
         bulk, layer = points[::2][inside[::2]], points[1::2][inside[1::2]]
         found.append(_alternating(bulk, layer))
@@ -148,19 +161,19 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
     Returns:
         The accepted samples, the rest pose first; and how many were rejected for which reason.
     """
-    with Crew(grasp_model, workers) as crew:
-        good, bad = solve_branch(crew, targets, progress=progress)
+    with SolverPool(grasp_model, workers) as solvers:
+        good, bad = solve_branch(solvers, targets, progress=progress)
     return samples_of(good, _asked(bad, targets)), _counted(bad)
 
 
-def solve_branch(crew: Crew, targets: np.ndarray, known: Sequence[Solved] = (), *,
+def solve_branch(solvers: SolverPool, targets: np.ndarray, known: Sequence[Solved] = (), *,
                  progress: Progress = SILENT) -> tuple[list[Solved], list[Solved]]:
     """Return accepted solutions, the rest state first, then ``known`` ones, and refused ones."""
     # Slabs of space: in each a tree of its own out of what is known.
     share_count = max(2, -(-len(targets) // _SHARE_POSES))
     shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), share_count)
-    begin = [taken(crew.grasp_model, crew.grasp_model.rest), *known]
-    found = crew.run(_solve_share, [(targets[share], share, begin) for share in shares],
+    begin = [taken(solvers.grasp_model, solvers.grasp_model.rest), *known]
+    found = solvers.run(_solve_share, [(targets[share], share, begin) for share in shares],
                      progress=progress, message="solving grasp poses")
     solved = sorted((one for share in found for one in share), key=lambda s: s.target)
     return ([*begin, *(one for one in solved if not one.trouble)],
@@ -225,8 +238,8 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
     Raises:
         ConvergenceError: one cannot be solved again.
     """
-    with Crew(grasp_model, workers) as crew:
-        good, bad = solve_branch(crew, positions, progress=progress)
+    with SolverPool(grasp_model, workers) as solvers:
+        good, bad = solve_branch(solvers, positions, progress=progress)
     if bad:
         place = ", ".join(f"{x:.3f}" for x in positions[bad[0].target])
         raise ConvergenceError(

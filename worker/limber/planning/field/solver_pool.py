@@ -14,7 +14,7 @@ from limber.planning.field.grasp_model import GraspModel
 _held: list[GraspModel] = []  # in a process of a crew
 
 
-class Crew:
+class SolverPool:
     """Solves a branch side by side; close it, or use it in a ``with``.
 
     Args:
@@ -51,7 +51,7 @@ class Crew:
             self._pool.close()
             self._pool = None
 
-    def __enter__(self) -> "Crew":
+    def __enter__(self) -> "SolverPool":
         return self
 
     def __exit__(self, *_error: object) -> None:

@@ -46,7 +46,7 @@ def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> 
             if (least := float(one.size(points).min())) > one.limit]
     if outside.min() > 0.0:
         told.append(f"the workspace is {outside.min():.3f} m away"
-                    + unit_doubt(outside.min(), field))
+                    + unit_uncertainty(outside.min(), field))
     return " and ".join(told) or "every pose breaks at least one of them"
 
 
@@ -67,14 +67,14 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     return NoPathError(
         f"No sampled pose brings {goal.what} to the goal; the nearest misses it by "
         f"{distance.min():.3f} m, with the grasp at ({place})"
-        f"{unit_doubt(float(distance.min()), field)}.",
+        f"{unit_uncertainty(float(distance.min()), field)}.",
         f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
         f"{_place(field.region.low)} to {_place(field.region.high)}.",
         "Choose a goal nearer to this region, raise --goal-tolerance, or sample farther (`limber "
         "energy --deflection`).")
 
 
-def unit_doubt(off: float, field: EnergyField) -> str:
+def unit_uncertainty(off: float, field: EnergyField) -> str:
     """Return words of doubt about the unit where something is so far ``off`` [m] that it can hardly
     be in metres; nothing else."""
     size = float(np.linalg.norm(field.region.high - field.region.low))

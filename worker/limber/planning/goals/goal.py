@@ -35,7 +35,7 @@ class Goal(Protocol):
         """Return how far off the goal the branch is with its grasp at ``points`` [m], [n]."""
         ...
 
-    def doubt(self, field: EnergyField) -> float:
+    def uncertainty(self, field: EnergyField) -> float:
         """Return how much nearer than its ``distance`` the branch may be at most [m]; infinite
         where the field's error is not known."""
         ...

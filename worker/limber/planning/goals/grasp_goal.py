@@ -23,7 +23,7 @@ class GraspGoal:
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.asarray(points) - self.position, axis=1)
 
-    def doubt(self, field: EnergyField) -> float:
+    def uncertainty(self, field: EnergyField) -> float:
         return 0.0
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:

@@ -43,7 +43,7 @@ class TargetGoal:
         outside = self.region.distance(field.tip(points, self.target))
         return outside + self.tolerance + self.inset
 
-    def doubt(self, field: EnergyField) -> float:
+    def uncertainty(self, field: EnergyField) -> float:
         return self.inset + field.place_error(self.target)
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:

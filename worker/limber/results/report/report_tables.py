@@ -161,7 +161,7 @@ def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                _known(row["sigmas"], "{:+.1f}")] for row in compared)]
 
 
-def doubt_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the uncertain parts of a skeleton.
 
     Args:

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.skeleton import qsm_tables
-from limber.geometry.skeleton.doubtful_parts import Doubt, doubtful_parts
+from limber.geometry.skeleton.doubtful_parts import DoubtfulPart, doubtful_parts
 from limber.geometry.skeleton.qsm_tables import Caliper
 from limber.results.report import figures
 from limber.results.report.report_tables import (
     caliper_rows,
     diameter_rows,
-    doubt_rows,
+    doubtful_rows,
     order_rows,
     share_rows,
 )
@@ -61,10 +61,20 @@ def scan_section(branch: Branch) -> Section:
     return section
 
 
-def _doubt_table(doubtful: list[Doubt]) -> tuple[str, list[list[str]]]:
-    rows = doubt_rows([{"kind": doubt.kind, "branch": doubt.branch, "at": np.round(doubt.at, 4),
-                        "length_m": doubt.length, "radius_m": doubt.radius, "value": doubt.value}
-                       for doubt in doubtful[:_DOUBTS_SHOWN]])
+def _doubt_table(doubtful: list[DoubtfulPart]) -> tuple[str, list[list[str]]]:
+    rows = doubtful_rows(
+        [
+            {
+                "kind": uncertain_part.kind,
+                "branch": uncertain_part.branch,
+                "at": np.round(uncertain_part.at, 4),
+                "length_m": uncertain_part.length,
+                "radius_m": uncertain_part.radius,
+                "value": uncertain_part.value,
+            }
+            for uncertain_part in doubtful[:_DOUBTS_SHOWN]
+        ]
+    )
     rest = len(doubtful) - _DOUBTS_SHOWN
     more = f"; `limber skeleton` lists {rest} more" if rest > 0 else ""
     return f"Uncertain parts of the skeleton, positions in the branch's frame [m]{more}", rows

@@ -291,7 +291,7 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None
         reading = sensor.read(sample)
         now, _ = chain.wrench(sample, reading)
         guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]),
-                   expected=now, doubt=np.eye(6), grasp=sample.pose[:3])
+                   expected=now, uncertainty=np.eye(6), grasp=sample.pose[:3])
         turn_between(sample.pose, sample.pose)
         guard.state = State.MOVING
         guard.permit(sample.pose, sample.pose + 1e-3, 0.002)

@@ -24,7 +24,7 @@ _DEVIATIONS = 2.0  # of a prediction that are allowed for
 _MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a difference lies
 _MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides pulls askew
 _PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, on a retreat
-_NO_DOUBT = np.zeros((6, 6))
+_CERTAIN = np.zeros((6, 6))
 _RISES = "the {} rises during the return"
 _UNLIKE = "the force differs from the predicted one [N]"
 _SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
@@ -234,7 +234,7 @@ class Guard:
         return self._stop(reason)
 
     def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,
-             expected: np.ndarray | None = None, doubt: np.ndarray | None = None,
+             expected: np.ndarray | None = None, uncertainty: np.ndarray | None = None,
              grasp: np.ndarray | None = None, sent: np.ndarray | None = None) -> Decision:
         """Judge a sample.
 
@@ -254,7 +254,7 @@ class Guard:
         for check in (self._check_clock(sample), self._check_modes(sample),
                       self._check_wrench(sample, wrench, raw),
                       self._check_place(sample, grasp, sent),
-                      self._check_expected(wrench, expected, doubt)):
+                      self._check_expected(wrench, expected, uncertainty)):
             if check.verdict == Verdict.STOP:
                 return check
         if self._memory.relief is not None:
@@ -423,7 +423,7 @@ class Guard:
         return _GO
 
     def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None,
-                        doubt: np.ndarray | None) -> Decision:
+                        uncertainty: np.ndarray | None) -> Decision:
         settings, memory = self._settings, self._memory
         if self.state not in (State.MOVING, State.PAUSED):
             return _GO
@@ -443,12 +443,12 @@ class Guard:
                 return self._stop("the force dropped suddenly: slip or break [N]", lost,
                                   max(settings.lost_share * memory.peak, settings.least_force))
             return _GO
-        doubt = _NO_DOUBT if doubt is None else doubt
+        uncertainty = _CERTAIN if uncertainty is None else uncertainty
         wanted = length(expected[:3])
         if wanted > settings.least_force:
             along = float(filtered[:3] @ expected[:3]) / wanted
             unsure = _DEVIATIONS * float(np.sqrt(max(
-                expected[:3] @ doubt[:3, :3] @ expected[:3], 0.0))) / wanted
+                expected[:3] @ uncertainty[:3, :3] @ expected[:3], 0.0))) / wanted
             if along < (1 - settings.lost_share) * wanted - settings.least_force - unsure:
                 return self._stop("the branch slipped, broke or was never held: force in the "
                                   "predicted direction [N]", along, wanted)
@@ -461,7 +461,7 @@ class Guard:
                  settings.largest_torque_error, limits.hard_torque_nm)):
             error = length(off[part])
             if error > allowed:
-                within = _allowed(off[part], doubt[part, part], allowed, most)
+                within = _allowed(off[part], uncertainty[part, part], allowed, most)
                 if error > within:
                     return self._stop(name or self._force_named(off[:3], expected[:3], before),
                                       error, within)

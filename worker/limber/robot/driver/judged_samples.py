@@ -69,18 +69,20 @@ class Senses:
         # First what must not wait for the rest.
         self._under_way.judge(self._guard.feel(now), sample)
         following = self._under_way.following
-        expected = doubt = sent = None
+        expected = uncertainty = sent = None
         if following is not None:
             self.way_back.note(sample)
             # The arm is where its target was a look-ahead ago.
             behind = max(following.time - self._lookahead * following.rate, 0.0)
             planned = following.trajectory.pose(behind)
             sent = planned[:3]
-            expected, doubt = self._expected(following.trajectory, behind, planned, sample.pose)
+            expected, uncertainty = self._expected(
+                following.trajectory, behind, planned, sample.pose
+            )
         grasp = self._base @ frame_of(sample.pose)
         decision = self._guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
-            doubt=doubt, grasp=grasp[:3, 3], sent=sent)
+            uncertainty=uncertainty, grasp=grasp[:3, 3], sent=sent)
         if (reading.age > _OLDEST_READING_SECONDS and decision.verdict != Verdict.STOP
                 and not self._hold_ups.has_just_woken):
             decision = self._guard.event(f"the force sensor has been silent for {reading.age:.3f} "
@@ -89,7 +91,7 @@ class Senses:
         self._batch.append(np.concatenate((
             (sample.clock,), pose_of(grasp), now, self.smooth, sample.joints,
             _NOTHING if expected is None else expected,
-            _NOTHING if doubt is None else doubt[:3, :3][_UPPER])))
+            _NOTHING if uncertainty is None else uncertainty[:3, :3][_UPPER])))
         if self._tare_until is not None and sample.clock >= self._tare_until:
             self._end_tare()
 

@@ -40,8 +40,12 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         progress(0.0, "rest state")
         sampled = sample_field(grasp_model, settings, workers=workers,
                                progress=progress.part(0.02, 0.7))
-        field = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius,
-                          progress=progress.part(0.7, 0.8))
+        field = fit_field(
+            sampled.samples,
+            sampled.energy_surface.pivot,
+            sampled.energy_surface.radius,
+            progress=progress.part(0.7, 0.8),
+        )
         if settings.field_error is not None:
             sampled, field = refined(grasp_model, sampled, field, settings.field_error / 100.0,
                                      _MOST_TIMES * settings.samples, workers=workers,

@@ -24,7 +24,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.mechanics import BranchModel, Grasp, StaticResult
-    from limber.planning.constraints.chance import YoungDoubt
+    from limber.planning.constraints.chance import YoungUncertainty
     from limber.planning.field.grasp_model import GraspModel
     from limber.robot.cell.cell import Cell
     from limber.robot.driver.link import RobotLink
@@ -181,11 +181,11 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
     from limber.mechanics.sensitivities import grasp_slopes
     from limber.planning.field.grasp_model import refusal
     from limber.robot.motion.expected_wrench import Predicted
-    from limber.stages.paths.plan_uncertainty import estimated_doubt
+    from limber.stages.paths.plan_uncertainty import estimated_uncertainty
     from limber.stages.pulls.record_path import GRASP_RADIUS_M
 
-    doubt = estimated_doubt(branch, model)
-    if doubt is None:
+    uncertainty = estimated_uncertainty(branch, model)
+    if uncertainty is None:
         progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
                       "The interval of the predicted force does not include it.")
     positions = _closely(positions)
@@ -210,21 +210,21 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
         poses.append(pose)
         wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
         stiffness.append(grasp_slopes(firm, clamped, held).wrench)
-        covariances.append(np.zeros((3, 3)) if doubt is None
-                           else _by_young(firm, clamped, result, doubt))
+        covariances.append(np.zeros((3, 3)) if uncertainty is None
+                           else _by_young(firm, clamped, result, uncertainty))
         progress(0.05 + 0.35 * number / len(positions), "forces along the path")
     return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
                      np.array(covariances))
 
 
-def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, doubt: YoungDoubt,
+def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, uncertainty: YoungUncertainty,
               ) -> np.ndarray:
     """Covariance of the force for what is not known of Young's modulus [N^2], shape [3, 3]."""
     from limber.mechanics.sensitivities import static_sensitivities
 
-    slopes = static_sensitivities(model, result, grasp, None, shares=doubt.shares.T)
-    scaled = slopes.reaction_force * doubt.deviations
-    return scaled @ doubt.correlation @ scaled.T
+    slopes = static_sensitivities(model, result, grasp, None, shares=uncertainty.shares.T)
+    scaled = slopes.reaction_force * uncertainty.deviations
+    return scaled @ uncertainty.correlation @ scaled.T
 
 
 def _force_sigma(cell: Cell, samples: np.ndarray) -> float:

@@ -81,7 +81,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
     from limber.stages.paths.plan_cell import reached_by
-    from limber.stages.paths.plan_uncertainty import young_doubt
+    from limber.stages.paths.plan_uncertainty import young_uncertainty
     from limber.store.loading import known_damping, load_grasp_model
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
@@ -108,7 +108,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     stiffer = _stiffer(branch) if settings.max_stress else 1.0
     digests = digests | {"stiffer": f"{stiffer:.6f}"}
     asked = Limits.of(settings, stiffer)
-    doubt = None if settings.confidence is None else young_doubt(branch, grasp_model, asked)
+    uncertainty = (
+        None if settings.confidence is None else young_uncertainty(branch, grasp_model, asked)
+    )
     in_cell = None
     if cell_file is not None:
         in_cell = _InCell.of(branch, cell_file, asked, progress)
@@ -127,9 +129,17 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:
             pace = in_cell.slowed(pace)
-        found = plan_motion(field, grasp_model, settings, limits=limits,
-                            cell=None if in_cell is None else in_cell.places, doubt=doubt,
-                            pace=pace, workers=workers, progress=progress)
+        found = plan_motion(
+            field,
+            grasp_model,
+            settings,
+            limits=limits,
+            cell=None if in_cell is None else in_cell.places,
+            uncertainty=uncertainty,
+            pace=pace,
+            workers=workers,
+            progress=progress,
+        )
         if found.summary["stopped"]:
             progress = progress.to_the_end()
         if found.summary["stopped"] and finished:

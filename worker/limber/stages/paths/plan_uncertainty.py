@@ -5,7 +5,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.estimation.estimate_file import read_estimate
 from limber.mechanics.materials.young_field import young_weights
-from limber.planning.constraints.chance import YoungDoubt
+from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.grasp_model import GraspModel
 from limber.store import Branch
@@ -13,7 +13,7 @@ from limber.store import Branch
 _INTERVAL = 2 * 1.96  # standard deviations in an interval of 95 %
 
 
-def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungDoubt:
+def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungUncertainty:
     """Return the moduli's distribution by the branch's estimate, for a plan with limits.
 
     Raises:
@@ -23,15 +23,15 @@ def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> Youn
         raise InputError("--confidence was given without a limit.",
                          "It is the probability that the limits hold.",
                          "Give --max-force, --max-strain or another limit as well.")
-    doubt = estimated_doubt(branch, grasp_model)
-    if doubt is None:
+    uncertainty = estimated_uncertainty(branch, grasp_model)
+    if uncertainty is None:
         raise InputError("--confidence was given, but there is no estimate.",
                          "The uncertainty of Young's modulus comes from `limber estimate`.",
                          "Import a pull and estimate, or omit --confidence.")
-    return doubt
+    return uncertainty
 
 
-def estimated_doubt(branch: Branch, grasp_model: GraspModel) -> YoungDoubt | None:
+def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncertainty | None:
     """Return the moduli's distribution by the branch's estimate; None where there is none.
 
     Deviations are those of the stated intervals, all that is not known included; correlations those
@@ -54,5 +54,5 @@ def estimated_doubt(branch: Branch, grasp_model: GraspModel) -> YoungDoubt | Non
     correlation = np.clip(covariance / np.outer(size, size), -1.0, 1.0)
     weights = young_weights(grasp_model.mesh, points) * np.array(
         found.get("young_mesh_pa") or found["young_pa"], float)
-    return YoungDoubt(weights / weights.sum(axis=1, keepdims=True),
+    return YoungUncertainty(weights / weights.sum(axis=1, keepdims=True),
                       np.log(interval[:, 1] / interval[:, 0]) / _INTERVAL, correlation)

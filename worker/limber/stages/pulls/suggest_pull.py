@@ -160,7 +160,7 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
     from limber.planning.constraints.limits import limits_in_file
     from limber.planning.path_on_full_model import resolve_path
     from limber.planning.plan_file import read_plan
-    from limber.stages.paths.plan_uncertainty import estimated_doubt
+    from limber.stages.paths.plan_uncertainty import estimated_uncertainty
     from limber.store.loading import load_grasp_model
 
     plan = read_plan(branch.path(f"plans/{name}.json"))
@@ -171,8 +171,8 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
                 "nothing about it."}
     gravity = bool(branch.manifest.stages["energy"].settings["gravity"])
     grasp_model = load_grasp_model(branch, gravity=gravity, progress=progress)
-    doubt = estimated_doubt(branch, grasp_model)
-    if doubt is None:
+    uncertainty = estimated_uncertainty(branch, grasp_model)
+    if uncertainty is None:
         return {"worth": True, "why": "There is no estimate, so it is unknown whether the plan "
                 "keeps its limits."}
     phases = np.array(plan.motion.phases)
@@ -180,7 +180,7 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
     path = resolve_path(grasp_model, there[phases == "path"],
                         np.vstack([there[phases == "approach"], there[phases == "path"][:1]]),
                         progress.part(0.0, 0.4)).require()
-    exposure = doubt.exposure(grasp_model, path, limits, progress.part(0.4, 1.0))
+    exposure = uncertainty.exposure(grasp_model, path, limits, progress.part(0.4, 1.0))
     before, then = (exposure.risk(each.total, confidence) for each in (now, after))
     worth, why = verdict(before, then, confidence)
     return {"worth": worth, "why": why, "confidence": confidence, "kept_now": before.kept,

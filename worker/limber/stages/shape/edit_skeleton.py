@@ -39,7 +39,7 @@ from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, wri
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.geometry.skeleton.doubtful_parts import Doubt
+    from limber.geometry.skeleton.doubtful_parts import DoubtfulPart
     from limber.geometry.skeleton.edits import Edit
     from limber.geometry.skeleton.skeleton import Skeleton
 
@@ -99,11 +99,18 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
     if output is not None:
         _write(skeleton.in_file(alignment), output, branch.manifest.source.get("unit", "m"))
     applied = _applied(branch)
-    return {"doubtful": [_told(doubt, alignment) for doubt in doubtful_parts(skeleton)],
-            "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
-            "length_m": skeleton.length, "mesh": mesh, "unit": _unit(branch),
-            "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
-            "output": output}
+    return {
+        "doubtful": [
+            _told(uncertain_part, alignment) for uncertain_part in doubtful_parts(skeleton)
+        ],
+        "node_count": skeleton.node_count,
+        "branch_count": skeleton.branch_count,
+        "length_m": skeleton.length,
+        "mesh": mesh,
+        "unit": _unit(branch),
+        "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
+        "output": output,
+    }
 
 
 def _wanted(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
@@ -219,23 +226,28 @@ def _write(skeleton: Skeleton, path: Path, unit: str) -> None:
                          "The skeleton goes there.", "Choose another location.") from error
 
 
-def _told(doubt: Doubt, alignment: Alignment) -> dict[str, Any]:
-    return {"kind": doubt.kind, "branch": doubt.branch,
-            "at": np.round(alignment.undo(doubt.at[None])[0], 6), "at_m": doubt.at,
-            "length_m": doubt.length, "radius_m": doubt.radius,
-            "value": None if math.isnan(doubt.value) else doubt.value}
+def _told(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str, Any]:
+    return {
+        "kind": uncertain_part.kind,
+        "branch": uncertain_part.branch,
+        "at": np.round(alignment.undo(uncertain_part.at[None])[0], 6),
+        "at_m": uncertain_part.at,
+        "length_m": uncertain_part.length,
+        "radius_m": uncertain_part.radius,
+        "value": None if math.isnan(uncertain_part.value) else uncertain_part.value,
+    }
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
     """Return the doubtful parts as a table."""
-    from limber.results.report.report_tables import doubt_rows
+    from limber.results.report.report_tables import doubtful_rows
 
     doubtful = result["doubtful"]
     if not doubtful:
         return []
     more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
     return [(f"Doubtful parts, places in the scan's coordinates [{result['unit']}]{more}",
-             doubt_rows(doubtful[:_SHOWN]))]
+             doubtful_rows(doubtful[:_SHOWN]))]
 
 
 STAGE = StageDescription(

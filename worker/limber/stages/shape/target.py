@@ -64,7 +64,7 @@ def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, forc
     """
     from limber.store.loading import load_mesh, load_targets
 
-    _check_wishes(name, settings)
+    _check_request(name, settings)
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
     key, known = f"target:{name}", load_targets(branch)
@@ -89,7 +89,7 @@ def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, forc
     return stage.result
 
 
-def _check_wishes(name: str, settings: TargetSettings) -> None:
+def _check_request(name: str, settings: TargetSettings) -> None:
     import re
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):

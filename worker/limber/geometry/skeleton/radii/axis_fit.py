@@ -19,7 +19,7 @@ from limber.geometry.skeleton.radii.noisy_rings import (
     Aims,
     held_across,
     mean_places,
-    place_doubt,
+    position_uncertainty,
     weighted_aims,
 )
 from limber.geometry.skeleton.radii.normal_equations import normal_equations, radius_deviations
@@ -35,8 +35,8 @@ from limber.geometry.skeleton.radii.sides_seen import (
     across_sight,
     evenly_seen,
     seen_sides,
-    side_doubt,
     side_told,
+    side_uncertainty,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 
@@ -155,8 +155,8 @@ class _Rounds:
         if uncertainty:
             sigma, pooled = radius_deviations(start, nodes, radius, match, weight,
                                               max(noise, 1e-12))
-            sigma = np.hypot(sigma * place_doubt(seen, radius, noise),
-                             side_doubt(seen, radius, noise))
+            sigma = np.hypot(sigma * position_uncertainty(seen, radius, noise),
+                             side_uncertainty(seen, radius, noise))
             state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
         fitted = replace(start, nodes=nodes, radius=np.maximum(radius, 0.1 * self._floor),
                          radius_sigma=sigma, radius_state=state)

@@ -29,7 +29,7 @@ _RADII = np.geomspace(0.05, 12.0, 48)  # in standard deviations of the noise, up
 _DISTANCES = 300
 
 
-def place_doubt(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
+def position_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
     """Times as large as of points with known places a radius's standard deviation is, shape [n]."""
     if seen.along_sight:
         return np.ones_like(radius)

@@ -235,7 +235,7 @@ def _across(view: np.ndarray) -> np.ndarray:
     return np.stack([other, np.cross(view, other)], axis=1)
 
 
-def side_doubt(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
+def side_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
     """Standard deviation of radii [m] from not knowing where the seen side ends, shape [n]."""
     if not seen.one_sided:
         return np.zeros_like(radius)
