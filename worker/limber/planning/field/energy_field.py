@@ -354,8 +354,8 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     Args:
         samples: What the branch model says.
         base: Pivot of the shell along which the branch yields
-        (:class:`~.valley.LowEnergySurface`), or where
-            the branch is rooted [m]; None: no chart is tried.
+            (:class:`~limber.planning.field.low_energy_surface.LowEnergySurface`), or where the
+            branch is rooted [m]; None: no chart is tried.
         radius: The shell's [m]; default the distance of the rest position.
 
     Raises:
