@@ -213,5 +213,5 @@ def extension_zip(tmp_path_factory) -> Path:
     done = subprocess.run([ROOT / "scripts" / "build_extension", "--output-dir", out], check=False,
                           capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "valid, says" in done.stderr
+    assert "valid according to" in done.stderr
     return Path(done.stdout.splitlines()[-1])

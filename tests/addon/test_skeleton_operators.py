@@ -96,18 +96,18 @@ def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_pat
 
 @pytest.mark.slow
 def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
-    """A circle is the worker's error; the folder and what was marked stay."""
+    """A cycle is the worker's error; the folder and what was marked stay."""
     folder, skeleton = opened
     tip = _tip(folder)
     before = (folder / "skeleton.csv").read_bytes()
-    with pytest.raises(RuntimeError, match="There is no node 99999"):
+    with pytest.raises(RuntimeError, match="Node 99999 does not exist"):
         bpy.ops.limber.edit_node(action="ROOT", node=99999)
     with pytest.raises(RuntimeError, match="The root carries the whole skeleton"):
         bpy.ops.limber.edit_node(action="DELETE", node=0)
     with pytest.raises(RuntimeError, match="Select nodes"):
         bpy.ops.limber.edit_node(action="BRIDGE", node=tip)
     bpy.ops.limber.edit_node(action="BRIDGE", node=1, target=tip)
-    with pytest.raises(RuntimeError, match="circle"):
+    with pytest.raises(RuntimeError, match="cycle"):
         bpy.ops.limber.apply_skeleton()
     assert (folder / "skeleton.csv").read_bytes() == before
     skeletons = importlib.import_module("limber_addon.bridge.skeletons")

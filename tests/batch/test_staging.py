@@ -262,7 +262,7 @@ at = [0.0, 0.0, 0.1]
     (one, two) = ([records.of(branch, task) for task in branch.tasks]
                   for branch in checked.branches)
     assert [record.status for record in one] == ["done", "done"]
-    assert two[0].status == "failed" and "no memory://scans/two.csv" in two[0].error
+    assert two[0].status == "failed" and "memory://scans/two.csv does not exist" in two[0].error
     assert not memory.exists("/night/two.branch")
     memory.pipe_file("/scans/two.csv", BODY.encode())
     code, told = call(capsys, "batch", jobs, "--workers", "1", "--retry-failed")

@@ -189,4 +189,4 @@ def test_processes_of_a_pool_warn_through_the_command():
     told = []
     with damage_told_to(told.append), Pool(2) as pool:
         assert sorted(pool.map(_damaged, [(0,), (1,)])) == [0, 1]
-    assert len(told) == 1 and "is damaged" in told[0]
+    assert len(told) == 1 and "was damaged" in told[0]

@@ -168,7 +168,7 @@ def test_two_pieces_exit_with_2(folder, capsys):
         {k: np.concatenate([v, v]) for k, v in mesh.point_data.items()})
     _replace_mesh(folder, two)
     assert call(["simulate", str(folder), "--progress", "none"]) == 2
-    assert "2 pieces" in "".join(capsys.readouterr())
+    assert "2 separate pieces" in "".join(capsys.readouterr())
 
 
 def test_grasp_in_the_base_exits_with_2(folder, capsys):

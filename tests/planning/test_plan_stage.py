@@ -168,7 +168,7 @@ def test_refusals_leave_the_folder_as_it_was(copied):
     before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
     with pytest.raises(NoPathError, match="misses it by"):
         plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
-    with pytest.raises(NoPathError, match=r"force .* its limit is 0.01 "):
+    with pytest.raises(NoPathError, match=r"force .* exceeds the limit 0.01 "):
         plan_paths(copied, PlanSettings(max_force=0.01, replans=0, iterations=300), name="bad",
                    workers=1)
     with pytest.raises(NoPathError, match=r"in millimetres\?"):

@@ -143,7 +143,7 @@ _ASKED = "from limber.robot.known_arms import arm_named; print(arm_named('plugge
 
 @pytest.mark.slow
 @pytest.mark.parametrize("module, told", [("plugged", "plugged-6"),
-                                          ("gone", "The arm 'six' of gone cannot be imported")])
+                                          ("gone", "The arm 'six' from gone cannot be imported")])
 def test_an_installed_package_has_its_arm_known_in_every_process(tmp_path, module, told):
     (tmp_path / "plugged.py").write_text(_PLUGGED, encoding="utf-8")
     (tmp_path / "plugged-1.0.dist-info").mkdir()

@@ -63,7 +63,7 @@ def test_a_robot_that_cannot_be_moved_is_refused(resting_robot, action, values, 
 
 
 def test_the_wrong_robot_is_refused(resting_robot):
-    for model, told in (("ur10e", "says that it is a UR5"), ("ur5", "different series")):
+    for model, told in (("ur10e", "reports that it is a UR5"), ("ur5", "different series")):
         cell = Cell(robot={"model": model, "address": resting_robot.address},
                     base={"pose": (0,) * 6})
         with pytest.raises(InputError, match=told):

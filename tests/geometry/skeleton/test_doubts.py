@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubtful_parts import DoubtKind, doubtful_parts
+from limber.geometry.skeleton.doubtful_parts import DoubtfulKind, doubtful_parts
 from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
 
 
@@ -23,7 +23,7 @@ def test_each_doubt_is_found_with_its_place(y_skeleton) -> None:
         y_skeleton, radius_state=state, radius_sigma=sigma,
         probability=np.where(y_skeleton.branch == 1, 0.3, 1.0)))
     assert [uncertainty.kind for uncertainty in told] == [
-        DoubtKind.unlikely, DoubtKind.unresolved, DoubtKind.bridged]
+        DoubtfulKind.unlikely, DoubtfulKind.unresolved, DoubtfulKind.bridged]
     unlikely, unresolved, bridged = told
     assert unlikely.branch == 1 and unlikely.value == pytest.approx(0.3)
     assert unresolved.length == pytest.approx(0.1) and unresolved.value == pytest.approx(0.4)
@@ -40,7 +40,7 @@ def test_kinks_and_backward_starts_are_found() -> None:
         np.vstack([stem, down]), np.concatenate([np.arange(41) - 1, [10], 41 + np.arange(4)]),
         np.full(46, 0.006))
     told = {uncertainty.kind: uncertainty for uncertainty in doubtful_parts(skeleton)}
-    assert set(told) == {DoubtKind.kink, DoubtKind.backwards}
-    np.testing.assert_allclose(told[DoubtKind.kink].at, [0, 0, 0.2], atol=1e-9)
-    assert told[DoubtKind.kink].value == pytest.approx(np.pi / 2, abs=0.01)
-    assert told[DoubtKind.backwards].value > np.deg2rad(150)
+    assert set(told) == {DoubtfulKind.kink, DoubtfulKind.backwards}
+    np.testing.assert_allclose(told[DoubtfulKind.kink].at, [0, 0, 0.2], atol=1e-9)
+    assert told[DoubtfulKind.kink].value == pytest.approx(np.pi / 2, abs=0.01)
+    assert told[DoubtfulKind.backwards].value > np.deg2rad(150)

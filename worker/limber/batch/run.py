@@ -276,6 +276,6 @@ def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,
             elif record.has_succeeded:
                 told = "done earlier; runs again if its input has changed"
             else:
-                told = "to be run" if record.status != FAILED else "to be repeated"
+                told = "to run" if record.status != FAILED else "to try again"
             found.append((branch, task, told))
     return found

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubtful_parts import KINK, DoubtKind, doubtful_parts, turns
+from limber.geometry.skeleton.doubtful_parts import KINK, DoubtfulKind, doubtful_parts, turns
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
 
@@ -21,11 +21,11 @@ def _run(*corners) -> Skeleton:
 def test_an_end_that_folds_back_goes() -> None:
     """The run ends where it turned; the rest stays as it was."""
     run = _run((0, 0, 0), (0, 0, 0.3), (0.012, 0, 0.27))
-    assert any(uncertainty.kind is DoubtKind.kink for uncertainty in doubtful_parts(run))
+    assert any(part.kind is DoubtfulKind.kink for part in doubtful_parts(run))
     mended, count = without_kinks(run)
     assert count == 1 and mended.nodes[-1, 2] == pytest.approx(0.3, abs=0.006)
     assert (mended.nodes == run.nodes[:mended.node_count]).all()
-    assert not any(uncertainty.kind is DoubtKind.kink for uncertainty in doubtful_parts(mended))
+    assert not any(part.kind is DoubtfulKind.kink for part in doubtful_parts(mended))
 
 
 def test_an_end_that_folds_twice_goes_whole() -> None:

@@ -104,8 +104,9 @@ def _followed(name: str, process: subprocess.Popen, progress: Progress,
 
 
 def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:
-    for line in stream:
-        lines.put(line)
+    with stream:
+        for line in stream:
+            lines.put(line)
     lines.put(None)
 
 
