@@ -227,8 +227,8 @@ def test_cylinder_model_stands_beside_calipers(tmp_path):
     assert row["difference"] == pytest.approx(20 / 21 - 1)
     assert row["sigmas"] == pytest.approx(-0.001 / 4e-4)
     html = (branch.folder / "report.html").read_text(encoding="utf-8")
-    for text in ("74.0 %", "26.0 %", "probability 0.40", "sigma 25% of the radius", "-4.8 %", "-2.5",
-                 "By branching order", "taper [mm of radius per m]"):
+    for text in ("74.0 %", "26.0 %", "probability 0.40", "sigma 25% of the radius", "-4.8 %",
+                 "-2.5", "By branching order", "taper [mm of radius per m]"):
         assert text in html, text
     for content, told in (("along_m,diameter_mm\n0.5,21\n", "0.5 m, but the main path is 0.4 m"),
                           ("along_m,diameter_mm\n0.1,-3\n", "line 2: -3 mm"), ("", "no values")):
