@@ -246,7 +246,7 @@ def test_grab(run, blender, environment, beam, tmp_path):
     assert live["hidden"] > 5 and live["bent_m"] > 1e-3
     assert live["fruit"].endswith(" 0.02") and float(live["cut"].split()[2]) == pytest.approx(
         0.45, abs=0.04)
-    assert live["lines"][0].startswith("Sag") and "hung 0.02 kg" in live["lines"][2]
+    assert live["lines"][0].startswith("Sag") and "added 0.02 kg" in live["lines"][2]
     assert seen["after_live"] == ["", "", False]
     for name in ("grab", "loads"):
         assert _colour_count(tmp_path / f"{name}.png") > 50
