@@ -7,6 +7,7 @@ import sys
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from limber.cli import main
 from limber.stages.command_line import command_line
@@ -173,3 +174,17 @@ def test_a_file_is_a_stage(tmp_path, monkeypatch):
     finally:
         monkeypatch.undo()
         registry._stages.cache_clear()
+
+
+@pytest.mark.parametrize("stage, option", [("simulate", "--grasp-mode"),
+                                           ("virtual-pull", "--mode"),
+                                           ("import-pull", "--grasp-mode")])
+def test_grasps_have_the_names_of_the_field_and_those_that_files_keep(stage, option):
+    """`rigid` is `clamped` and `point` is `pinned`, in a command and in Python."""
+    settings = stage_description(stage).settings
+    field = option[2:].replace("-", "_")
+    for new, kept in (("rigid", "clamped"), ("point", "pinned")):
+        assert getattr(settings(**{field: new}), field) == kept
+        assert getattr(settings(**{field: kept}), field) == kept
+    told = CliRunner().invoke(main.main, [stage, "--help-all"]).output
+    assert "[rigid|point]" in told and "default: clamped" not in told

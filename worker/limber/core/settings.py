@@ -9,9 +9,9 @@ import difflib
 import math
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import core_schema
@@ -48,6 +48,23 @@ class OneOf:
             raise ValueError(f"it must be one of {', '.join(self.names())}")
         return name
 
+
+class Renamed:
+    """Annotates a choice that has new names beside those that files and results keep."""
+
+    def __init__(self, kept: Mapping[str, str]):
+        self.kept = kept
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.no_info_before_validator_function(self._as_kept, handler(source))
+
+    def _as_kept(self, value: Any) -> Any:
+        return self.kept.get(value, value) if isinstance(value, str) else value
+
+
+GraspMode = Annotated[Literal["clamped", "pinned"],
+                      Renamed({"rigid": "clamped", "point": "pinned"})]
+"""Rigid: position and rotation of a piece are held; point: its mean position alone."""
 
 Groups = dict[str, tuple[str, ...]]
 """Title to the names of the fields that stand under it."""

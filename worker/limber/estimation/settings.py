@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Groups, Settings
+from limber.core.settings import GraspMode, Groups, Settings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -140,9 +140,10 @@ class VirtualPullSettings(Settings):
         0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
         "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
         "modulus there cannot be estimated.")
-    mode: Literal["clamped", "pinned"] = Field(
-        "pinned", description="pinned: a loop holds the branch and lets it turn. clamped: the "
-        "gripper turns the branch less than it would turn freely, so that a torque acts.")
+    mode: GraspMode = Field(
+        "pinned", description="point (pinned): a loop holds the branch and lets it turn. rigid "
+        "(clamped): the gripper turns the branch less than it would turn freely, so that a torque "
+        "acts.")
     reach: float = Field(
         0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
             "length.")

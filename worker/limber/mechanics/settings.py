@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Groups, OneOf, Settings
+from limber.core.settings import GraspMode, Groups, OneOf, Settings
 from limber.mechanics.materials.material_registry import material_names
 
 Point = tuple[float, float, float]
@@ -42,9 +42,9 @@ class SimulateSettings(Settings):
     grasp_radius: float = Field(
         0.01, gt=0, description="Radius of the grasp and of the patches of --hold-at and "
         "--load-at [m].")
-    grasp_mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="clamped: hold position and rotation. pinned: hold the position "
-            "only.")
+    grasp_mode: GraspMode = Field(
+        "clamped", description="rigid (clamped): hold position and rotation. point (pinned): hold "
+            "the position only.")
     hold_at: tuple[Point, ...] = Field(
         (), description="Position X Y Z [m] of another gripper or a tie, with the same grasp "
         "mode. May be given several times.", json_schema_extra={"metavar": "X Y Z"})

@@ -29,7 +29,7 @@ class EnergySettings(Settings):
     seed: int = Field(0, ge=0, description="Seed of the sampled positions.")
     forward: Literal["full", "reduced"] = Field("full", description=(
         "full: solve every pose on the full model. reduced: use the reduced model of `limber "
-        "session --mode pinned`, and train it first if there is none. The full model corrects "
+        "session --mode point`, and train it first if there is none. The full model corrects "
         "each state once and solves uncertain ones."))
 
 

@@ -97,7 +97,7 @@ def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: St
         turns[known] = Rotation.from_quat(quaternion[known]).as_rotvec()
     else:
         warnings.append("The robot's table has no rotation, so the gripper is assumed not to "
-                        "rotate. This is correct for a pinned grasp (--grasp-mode pinned).")
+                        "rotate. This is correct for a point grasp (--grasp-mode point).")
         turns = np.zeros((len(stream), 3))
     values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
 

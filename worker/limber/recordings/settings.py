@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Groups, OneOf, Settings
+from limber.core.settings import GraspMode, Groups, OneOf, Settings
 from limber.recordings.importing.recording_formats import kind_names
 
 
@@ -45,9 +45,9 @@ class ImportSettings(Settings):
     grasp_radius: float = Field(
         0.01, gt=0, description="Radius of the grasp patch, or half the length of the piece that "
         "a clamping gripper holds [m].")
-    grasp_mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="clamped: the gripper holds position and rotation. pinned: it "
-            "holds the position only.")
+    grasp_mode: GraspMode = Field(
+        "clamped", description="rigid (clamped): the gripper holds position and rotation. point "
+            "(pinned): it holds the position only.")
     weight: float | None = Field(
         None, ge=0, description="Weight [N] that hangs at --grasp-point instead of a robot's "
         "pull. SOURCE begins without it and ends at rest under it. 0 with --own-weight: the "

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from limber.core.errors import InputError
 from limber.core.json_lines import json_object
+from limber.core.settings import GraspMode
 
 PROTOCOL = 2
 """Version of commands, events and the frames' file; clients with another one are refused."""
@@ -62,7 +63,7 @@ class Grab(_Command, _OnBranch):
     """Hold the branch at a position, where that is now."""
 
     command: Literal["grasp"]
-    mode: Literal["clamped", "pinned"] = "pinned"
+    mode: GraspMode = "pinned"
     radius_m: float = Field(0.01, ge=0, le=_FAR)
 
 

@@ -1,9 +1,10 @@
 """The settings of a session."""
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from limber.core.settings import GraspMode
 
 
 class SessionSettings(BaseModel):
@@ -11,9 +12,9 @@ class SessionSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="What the marked grasp holds: position and rotation, or the "
-            "position only.")
+    mode: GraspMode = Field(
+        "clamped", description="rigid (clamped): the marked grasp holds position and rotation. "
+            "point (pinned): it holds the position only.")
     grasp: bool = Field(True, description="Start with the marked grasp held. Otherwise no grasp "
         "is held.")
     gravity: bool = Field(True, description="The branch carries its own weight, as when it was "

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import click
 from pydantic import BaseModel
 
-from limber.core.settings import OneOf, Settings, checked_settings
+from limber.core.settings import OneOf, Renamed, Settings, checked_settings
 from limber.stages.registry import StageDescription
 
 
@@ -206,9 +206,15 @@ def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) 
         return click.option(f"{flag}/--no-{flag[2:]}", destination, **common)
     if typing.get_origin(kind) is tuple:
         return _tuple_option([*flags, destination], typing.get_args(kind), common)
-    names = next((part.names for part in field.metadata if isinstance(part, OneOf)), None)
-    return click.option(*flags, destination,
-                        type=click.Choice(names()) if names else _click_type(kind), **common)
+    for part in field.metadata:
+        if isinstance(part, OneOf):
+            return click.option(*flags, destination, type=click.Choice(part.names()), **common)
+        if isinstance(part, Renamed):
+            # Scripts may go on with the names that files keep.
+            taken = click.Choice([*part.kept, *typing.get_args(kind)])
+            common = {"metavar": f"[{'|'.join(part.kept)}]", **common}
+            return click.option(*flags, destination, type=taken, **common)
+    return click.option(*flags, destination, type=_click_type(kind), **common)
 
 
 def _tuple_option(names: list[str], items: tuple, common: dict[str, Any]) -> Callable:
@@ -253,9 +259,15 @@ def _help(name: str, field: Any, kind: Any, default: Any) -> str:
             between = "," if typing.get_args(kind)[-1] is Ellipsis else " "
             told.append(f"default: {between.join(map(_shown, default))}")
         else:
-            told.append(f"default: {_shown(default)}")
+            told.append(f"default: {_shown(_new_name(field, default))}")
     told += _bounds(field)
     return f"{field.description or ''}  [{'; '.join(told)}]" if told else field.description or ""
+
+
+def _new_name(field: Any, value: Any) -> Any:
+    """What a value that files keep is called today."""
+    kept = next((part.kept for part in field.metadata if isinstance(part, Renamed)), {})
+    return next((new for new, old in kept.items() if old == value), value)
 
 
 def _bounds(field: Any) -> list[str]:

@@ -54,7 +54,7 @@ class LearntGraspModel(GraspModel):
                progress: Progress = SILENT) -> "LearntGraspModel":
         """Return a grasp model that asks the reduced model of its branch first.
 
-        That of `limber session --mode pinned` on the same branch, from the ``cache``, by default
+        That of `limber session --mode point` on the same branch, from the ``cache``, by default
         the one that sessions use; learnt now, which takes minutes, where there is none yet.
 
         Raises:
