@@ -1,11 +1,20 @@
 """A cloud's own frame: the same places wherever its file has it."""
 
+import sys
+
 import numpy as np
+import pytest
 
 from limber.geometry.cloud.canonical_frame import OwnFrame
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(3000, 3)) ** 3 * [1.0, 0.3, 0.1]
+
+
+@pytest.fixture(autouse=True)
+def _fresh_draws(monkeypatch):
+    """Each test draws anew: what ran before it changes no points."""
+    monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(0))
 
 
 def test_places_are_the_same_digits_for_a_cloud_moved_turned_and_shuffled() -> None:

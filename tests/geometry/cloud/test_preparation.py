@@ -1,6 +1,8 @@
 """Cleaning a cloud: digits, duplicates, outliers, and what is refused."""
 
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,12 @@ from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.generated import generate_branch
 
 RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def _fresh_draws(monkeypatch):
+    """Each test draws anew: what ran before it changes no points."""
+    monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(0))
 
 
 def _rod(count=2000):

@@ -1,5 +1,7 @@
 """From points to a skeleton: truth found again, and what is no branch refused."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,12 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def _fresh_draws(monkeypatch):
+    """Each test draws anew: what ran before it changes no points."""
+    monkeypatch.setattr(sys.modules[__name__], "RNG", np.random.default_rng(0))
 
 
 def _tube(start, end, radius, count):
