@@ -26,7 +26,8 @@ class Species:
 
     Attributes:
         title: Its name in the handbook.
-        young, strength: Young's modulus and modulus of rupture [Pa], table 5-3a.
+        young, strength: Young's modulus and modulus of rupture [Pa], table 5-3a; of cherry and red
+            maple table 5-3b, converted from psi.
         density: Of green wood [kg/m^3]: specific gravity of table 5-3a and moisture of table 4-1,
             heartwood and sapwood in equal parts; None where the latter has none.
         rupture_strain: Modulus of rupture over Young's modulus in table 5-3b, which has more
