@@ -12,6 +12,7 @@ from benchmarks.held_up import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
 from limber.mechanics.solve_status import Status
+from limber.robot.driver.real_time import may_use_two_processors
 from limber.robot.virtual.controller import Controller
 from limber.store import Branch
 from limber.store.loading import load_grasp_model, load_skeleton
@@ -208,5 +209,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if "worker_address" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.real_time)
         if item.get_closest_marker("real_time") is not None:
+            item.add_marker(pytest.mark.skipif(
+                not may_use_two_processors(),
+                reason="real time: a robot and its driver want a processor each"))
             item.add_marker(pytest.mark.flaky(
                 reruns=4, condition=Watch.saw_the_machine_stand_still))

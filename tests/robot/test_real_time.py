@@ -18,6 +18,22 @@ print(before, len(gc.get_objects()))
 """
 
 
+_ALONE = """
+import os
+from limber.robot.driver.real_time import claim_real_time
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+print(claim_real_time(), os.sched_getscheduler(0) == os.SCHED_OTHER)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no affinity on this system")
+def test_a_single_processor_is_not_taken_from_the_program_that_gives_orders():
+    """There its orders and the robot's samples did not arrive for seconds."""
+    asked = subprocess.run([sys.executable, "-c", _ALONE], capture_output=True, text=True,
+                           check=True).stdout.split()
+    assert asked == ["False", "True"]
+
+
 @pytest.mark.slow
 def test_a_search_for_garbage_no_longer_goes_through_what_is_loaded():
     """Else one takes longer than a loop may be silent, some minutes into a motion."""

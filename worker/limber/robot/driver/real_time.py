@@ -18,15 +18,23 @@ def claim_real_time(priority: int = 20) -> bool:
     """Ask for round-robin real-time scheduling; returns whether it was granted.
 
     Linux grants it to root and to users with a real-time limit. Without it other programs can
-    hold the loop up for tens of milliseconds, which ends in a stop.
+    hold the loop up for tens of milliseconds, which ends in a stop. It is not asked for where this
+    process may use a single processor: the loop would take it from the program that gives orders.
     """
-    if not hasattr(os, "sched_setscheduler"):
+    if not hasattr(os, "sched_setscheduler") or not may_use_two_processors():
         return False
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
     except OSError:
         return False
     return True
+
+
+def may_use_two_processors() -> bool:
+    """Whether the system lets this process use more than one processor."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0)) > 1
+    return (os.cpu_count() or 1) > 1
 
 
 def spare_what_is_loaded() -> bool:
