@@ -12,13 +12,16 @@ FAILURE = '<testcase classname="a" name="fails"><failure message="no">no</failur
 
 @pytest.fixture
 def pytest_runs(monkeypatch):
-    """Calls of pytest that write what a list says: True fails, False passes."""
-    outcomes, calls = [], []
+    """Calls of pytest that write what a list says of their part: True fails, False passes."""
+    outcomes, calls = {"real_time": [False], "not real_time": [False]}, []
 
-    def called(arguments, report):
+    def called(arguments, report, output):
         calls.append(arguments)
-        failed = outcomes.pop(0)
+        part = arguments[arguments.index("-m") + 1] if "-m" in arguments else "not real_time"
+        failed = outcomes[part].pop(0)
         report.write_text(REPORT.format(FAILURE if failed else ""))
+        if output is not None:
+            output.write_text("said by pytest")
         return int(failed)
 
     monkeypatch.setattr(run, "_pytest", called)
@@ -28,32 +31,38 @@ def pytest_runs(monkeypatch):
 
 def test_a_failed_part_hides_no_other(pytest_runs, capsys):
     outcomes, calls = pytest_runs
-    outcomes += [True, False]
+    outcomes["not real_time"] = [True]
     assert run.main([]) == 1
-    assert len(calls) == 2 and "real_time" in calls[1]
-    assert capsys.readouterr().out.rstrip().endswith("2 passed, 1 failed, 2 skipped")
+    assert len(calls) == 2
+    printed = capsys.readouterr().out
+    assert "said by pytest" in printed
+    assert printed.rstrip().endswith("2 passed, 1 failed, 2 skipped")
 
 
 def test_real_time_tests_are_tried_once_more(pytest_runs, capsys):
     """Only those that failed; what passes then counts as passed."""
     outcomes, calls = pytest_runs
-    outcomes += [False, True, False]
+    outcomes["real_time"] = [True, False]
     assert run.main([]) == 0
     assert "--last-failed" in calls[2]
     printed = capsys.readouterr().out
     assert "3 passed, 0 failed, 2 skipped" in printed and "2  wants ccx" in printed
 
 
+def test_what_fails_twice_fails(pytest_runs, capsys):
+    """And is counted once."""
+    pytest_runs[0]["real_time"] = [True, True]
+    assert run.main([]) == 1
+    assert "2 passed, 1 failed, 2 skipped" in capsys.readouterr().out
+
+
 def test_a_failed_style_check_fails_the_run(pytest_runs, monkeypatch, capsys):
-    outcomes, _ = pytest_runs
-    outcomes += [False, False]
     monkeypatch.setattr(run, "command", lambda name, words: run.Part(name, 0.1, name == "style"))
     assert run.main([]) == 1
     assert "2 passed, 1 failed" in capsys.readouterr().out
 
 
 def test_arguments_go_to_pytest(pytest_runs):
-    outcomes, calls = pytest_runs
-    outcomes.append(False)
+    _, calls = pytest_runs
     assert run.main(["tests/geometry", "-k", "skeleton"]) == 0
     assert calls == [["tests/geometry", "-k", "skeleton"]]
