@@ -45,7 +45,8 @@ def test_thicker_all_along_is_softer_by_the_fourth_power(monkeypatch, fitted, sm
     skeleton = small.skeleton
     found = _with(monkeypatch, fitted, [
         replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)])
-    assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
+    assert found[0] == pytest.approx(0.04 * QUANTILE, rel=0.1)
+    assert found[1].max() < 0.003  # bending stiffness is what it was
 
 
 @pytest.mark.slow
@@ -55,7 +56,7 @@ def test_an_axis_that_is_off_is_not_exact(monkeypatch, fitted, small):
     share = skeleton.arc_length / skeleton.arc_length.max()
     aside = 1e-4 * np.sin(np.pi * share)[:, None] * [0.0, 1.0, 0.0]
     once, twice, never = (_with(monkeypatch, fitted, [
-        replace(skeleton, nodes=skeleton.nodes + sign * factor * aside) for sign in 4 * (1, -1)])
+        replace(skeleton, nodes=skeleton.nodes + sign * factor * aside) for sign in 4 * (1, -1)])[0]
         for factor in (1, 2, 0))
     assert 0.002 < once.max() < 0.2
     assert twice == pytest.approx(2 * once, rel=0.1)
@@ -93,7 +94,8 @@ def test_a_pull_that_its_force_drives_is_no_exception(monkeypatch, small, small_
                       Values(np.full(4, 1e7), 0.36, 900.0))
     found = _with(monkeypatch, (bench.fit([pull], SETTINGS), subject), [
         replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)])
-    assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
+    assert found[0] == pytest.approx(0.04 * QUANTILE, rel=0.1)
+    assert found[1].max() < 0.003
 
 
 @pytest.mark.slow
@@ -117,7 +119,8 @@ def test_a_watched_path_and_an_open_field_are_no_exception(monkeypatch, small, s
     shapes = [replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)]
     monkeypatch.setattr(module, "sample_skeletons", lambda *_: shapes)
     found = shape_error(evaluation, objective, subject, np.empty((0, 3)), len(shapes))
-    assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
+    assert found[0] == pytest.approx(0.04 * QUANTILE, rel=0.1)
+    assert found[1].max() < 0.003
 
 
 @pytest.mark.slow

@@ -150,6 +150,10 @@ class Estimate(Result):
     Attributes:
         young: At the control points [Pa], shape [K].
         interval: Its 95 % interval [Pa], shape [K, 2]; NaN where an end is open.
+        bending_stiffness: E times the second moment of area, mean over each control point's part of
+            the branch [N m^2], shape [K]; NaN in a folder of an earlier version.
+        bending_interval: Its 95 % interval [N m^2], shape [K, 2]: narrower than that of E where the
+            scan leaves the radius open.
         fractions: Positions of the control points on the main path, 0 base to 1 tip, shape [K].
         control_points: [m], branch frame, shape [K, 3].
         poisson: Poisson's ratio.
@@ -159,6 +163,8 @@ class Estimate(Result):
 
     young: np.ndarray
     interval: np.ndarray
+    bending_stiffness: np.ndarray
+    bending_interval: np.ndarray
     fractions: np.ndarray
     control_points: np.ndarray
     poisson: float
@@ -171,15 +177,22 @@ class Estimate(Result):
         from limber.estimation.estimate_file import read_estimate
 
         content = read_estimate(branch.path("estimate.json"))
+        count = len(content["young_pa"])
         return cls(MappingProxyType({**values}), _array(content["young_pa"]),
-                   _array(content["young_interval_pa"]), _array(content["fractions"]),
+                   _array(content["young_interval_pa"]),
+                   _array(content.get("bending_stiffness_nm2") or [np.nan] * count),
+                   _array(content.get("bending_stiffness_interval_nm2") or [[np.nan] * 2] * count),
+                   _array(content["fractions"]),
                    _array(content["control_points_m"]), content["poisson"],
                    float(_array(content["loss_m2"])), content["converged"], content)
 
     def table(self) -> dict[str, np.ndarray]:
-        """Return the columns ``fraction``, ``young_pa``, ``low_pa``, ``high_pa``."""
+        """Return the columns ``fraction``, ``young_pa``, ``low_pa``, ``high_pa``, ``ei_nm2``,
+        ``ei_low_nm2`` and ``ei_high_nm2``.
+        """
         return {"fraction": self.fractions, "young_pa": self.young,
-                **_columns(self.interval, "low_pa", "high_pa")}
+                **_columns(self.interval, "low_pa", "high_pa"), "ei_nm2": self.bending_stiffness,
+                **_columns(self.bending_interval, "ei_low_nm2", "ei_high_nm2")}
 
     def plot(self) -> "Figure":
         """Draw Young's modulus along the branch with its interval, and the truth if known."""

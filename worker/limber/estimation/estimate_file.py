@@ -86,6 +86,8 @@ class _Estimate(_Told):
     young_mesh_pa: list[_Positive] | None = None
     young_interval_pa: list[tuple[_Maybe, _Maybe]]
     young_interval_sensor_pa: list[tuple[_Maybe, _Maybe]] | None = None
+    bending_stiffness_nm2: list[_Positive] | None = None
+    bending_stiffness_interval_nm2: list[tuple[_Maybe, _Maybe]] | None = None
     young_deviation: _Deviation | None = None
     poisson: float = Field(gt=-1, lt=0.5)
     density: _Positive | None = None
@@ -116,6 +118,8 @@ class _Estimate(_Told):
         lists = {
             "young_mesh_pa": self.young_mesh_pa, "young_interval_pa": self.young_interval_pa,
             "young_interval_sensor_pa": self.young_interval_sensor_pa,
+            "bending_stiffness_nm2": self.bending_stiffness_nm2,
+            "bending_stiffness_interval_nm2": self.bending_stiffness_interval_nm2,
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
             **{f"young_deviation.{name}": getattr(told, name)

@@ -9,7 +9,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.judgement import Estimate
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import outliers
-from limber.estimation.uncertainty.model_error import total_interval
+from limber.estimation.uncertainty.model_error import bending_interval, total_interval
 from limber.estimation.uncertainty.variance_parts import largest
 from limber.recordings.recording import Pull
 
@@ -33,7 +33,17 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "is_weightless": found.is_weightless, "held_out": found.held_out,
         "variance_factor": sure.variance_factor, "warnings": found.warnings,
-        "forward": settings.forward} | _reduced_error(found)
+        "forward": settings.forward} | _bending(found) | _reduced_error(found)
+
+
+def _bending(found: Estimate) -> dict[str, Any]:
+    """Bending stiffness at the control points, where the branch's shape was judged."""
+    if found.second_moment is None:
+        return {}
+    interval = bending_interval(found.values.young, found.uncertainty.young_interval,
+                                found.model_error)
+    return {"bending_stiffness_nm2": found.young * found.second_moment,
+            "bending_stiffness_interval_nm2": interval * found.second_moment[:, None]}
 
 
 def _reduced_error(found: Estimate) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.uncertainty.bending_stiffness import SectionMean
 from limber.estimation.uncertainty.covariance import Uncertainty, outliers
 from limber.estimation.uncertainty.grip_error import grip_error
 from limber.estimation.uncertainty.identifiability import (
@@ -59,6 +60,8 @@ class Estimate:
         held_out: Per pull, the prediction of a fit without it: RMS distance [m] and RMS force
             error [N], also relative to the pull's travel and peak force.
         model_error: Errors of shape and mesh, which residuals do not show.
+        second_moment: Mean second moment of area of each control point's part of the branch [m^4],
+            shape [K]; None before the shape was judged.
         is_weightless: Whether the estimate ignores the weight because the branch cannot carry it.
     """
 
@@ -69,6 +72,7 @@ class Estimate:
     warnings: list[str] = field(default_factory=list)
     held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     model_error: ModelError = field(default_factory=ModelError)
+    second_moment: np.ndarray | None = None
     is_weightless: bool = False
 
     @property
@@ -226,6 +230,8 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         cloud: The scan's points [m], shape [n, 3], or None.
     """
     subject = subject.without_weight() if found.is_weightless else subject
+    found.second_moment = np.exp(SectionMean.of(
+        subject.skeleton, subject.mesh, subject.weights).log_second_moment(subject.skeleton.radius))
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
     if settings.mesh_check:
         progress(1.0, "measuring the excess stiffness of the mesh")
@@ -272,7 +278,8 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
         return ModelError(radii)
     drawn = shape_error(found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
                         progress=progress)
-    return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
+    return (ModelError(radii) if drawn is None else
+            ModelError(drawn[0], bending=drawn[1], axis_is_exact=False))
 
 
 def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None:

@@ -6,7 +6,7 @@ says how sure each radius is, and a finer mesh how much stiffer this one is than
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +41,8 @@ class ModelError:
     Attributes:
         geometry: At the control points, from what the scan leaves open, shape [K]; None where
             the branch's radii came without a deviation.
+        bending: What of ``geometry`` is left in bending stiffness E I, shape [K]; 0 where an error
+            of the radii is the same all over a control point's part of the branch.
         mesh: From the mesh, shape [K]; None where it was not measured.
         axis_is_exact: Whether ``geometry`` is of the radii alone (:func:`geometry_error`), not
             of axis and radii (:func:`limber.estimation.uncertainty.shape_error.shape_error`).
@@ -55,6 +57,7 @@ class ModelError:
     """
 
     geometry: np.ndarray | None = None
+    bending: np.ndarray | float = 0.0
     mesh: np.ndarray | None = None
     axis_is_exact: bool = True
     mesh_factor: np.ndarray | float = 1.0
@@ -67,6 +70,10 @@ class ModelError:
         parts = [part for part in (sensor, self.geometry, self.mesh, self.path, self.hung,
                                    self.grip) if part is not None]
         return np.sqrt(np.sum(np.square(parts), axis=0))
+
+    def total_of_bending(self, sensor: np.ndarray) -> np.ndarray:
+        """Standard deviation of log E I with that of the sensors, shape [K]."""
+        return replace(self, geometry=self.bending + np.zeros(len(sensor))).total(sensor)
 
 
 def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.ndarray | None:
@@ -243,9 +250,23 @@ def total_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> 
         sensor: 95 % interval from the sensors alone [Pa], shape [K, 2].
         error: What the fit does not see.
     """
-    other = 1.96 * error.total(np.zeros(len(young)))
+    return _interval(young, sensor, error.total(np.zeros(len(young))), error.mesh_factor)
+
+
+def bending_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> np.ndarray:
+    """95 % interval of E I over the I of the skeleton [Pa], shape [K, 2].
+
+    Arguments as of :func:`total_interval`.
+    """
+    return _interval(young, sensor, error.total_of_bending(np.zeros(len(young))),
+                     error.mesh_factor)
+
+
+def _interval(young: np.ndarray, sensor: np.ndarray, deviation: np.ndarray,
+              factor: np.ndarray | float) -> np.ndarray:
+    other = 1.96 * deviation
     middle, low, high = (np.log(values) for values in (young, *sensor.T))
     # The sensors' part may be one-sided, where a bound of the modulus cuts it.
     spread = np.column_stack([middle - np.hypot(middle - low, other),
                               middle + np.hypot(high - middle, other)])
-    return np.exp(spread) * np.reshape(error.mesh_factor, (-1, 1))
+    return np.exp(spread) * np.reshape(factor, (-1, 1))

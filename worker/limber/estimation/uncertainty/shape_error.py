@@ -13,6 +13,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.uncertainty.bending_stiffness import SectionMean
 from limber.estimation.uncertainty.path_error import WIDEST
 from limber.estimation.uncertainty.shape_sensitivity import hung_slopes, shape_slopes, taken_up
 from limber.geometry.shape_samples import reshaped, sample_skeletons
@@ -24,11 +25,12 @@ FEWEST = 8
 
 def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
                 points: np.ndarray, count: int, *, seed: int = 0,
-                progress: Progress = SILENT) -> np.ndarray | None:
-    """Relative standard deviation of E at the control points from axis and radii, shape [K].
+                progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray] | None:
+    """Relative standard deviations of E and of E I at the control points from axis and radii.
 
     Root mean square over the shapes of what the fit would have taken up, times Student's quantile
-    over the normal one since they are few.
+    over the normal one since they are few. A shape that is thicker all along changes E by what it
+    changes I, so that E I stays.
 
     Args:
         evaluation: At the fit's end.
@@ -40,20 +42,25 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
         progress: Called as it goes.
 
     Returns:
-        None where shapes are too few, or as :func:`taken_up`.
+        Those of E and of E I, shape [K] each; None where shapes are too few, or as
+        :func:`taken_up`.
     """
     if count < FEWEST:
         return None
     progress(0.0, "evaluating posterior samples of the shape")
-    meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in sample_skeletons(
-        subject.skeleton, points, count, np.random.default_rng(seed))]
+    shapes = sample_skeletons(subject.skeleton, points, count, np.random.default_rng(seed))
+    meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in shapes]
     steps = taken_up(evaluation, objective,
                      lambda forward, values: shape_slopes(forward, values, meshes))
     if steps is None:
         return None
-    spread = np.sqrt(np.mean(steps**2, axis=1))
+    section = SectionMean.of(subject.skeleton, subject.mesh, subject.weights)
+    moments = np.column_stack([section.log_second_moment(shape.radius) for shape in shapes])
+    thicker = moments - section.log_second_moment(subject.skeleton.radius)[:, None]
     student, normal = scipy.special.stdtrit(count, 0.975), scipy.special.ndtri(0.975)
-    return np.minimum(spread * student / normal, WIDEST)
+    of_young, of_bending = (np.minimum(np.sqrt(np.mean(change**2, axis=1)) * student / normal,
+                                       WIDEST) for change in (steps, steps + thicker))
+    return of_young, of_bending
 
 
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:

@@ -34,8 +34,9 @@ def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -
 def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncertainty | None:
     """Return the moduli's distribution by the branch's estimate; None where there is none.
 
-    Deviations are those of the stated intervals, all that is not known included; correlations those
-    of the fit. Control points of one group have one modulus.
+    Deviations are those of the stated intervals of bending stiffness: a plan uses the mesh of the
+    estimate, and an error of its radius cancels with that of the modulus. Correlations are those of
+    the fit. Control points of one group have one modulus.
 
     Raises:
         InputError: the estimate has no interval.
@@ -43,7 +44,8 @@ def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncer
     if not branch.has("estimate.json"):
         return None
     found = read_estimate(branch.require("estimate.json", "estimate"))
-    interval = np.array(found["young_interval_pa"], float)
+    interval = np.array(found.get("bending_stiffness_interval_nm2") or found["young_interval_pa"],
+                        float)
     if not (np.isfinite(interval).all() and (interval > 0.0).all()):
         raise InputError("The estimate has no interval for some control points.",
                          "The uncertainty of Young's modulus is unknown there.",
