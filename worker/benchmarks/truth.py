@@ -104,7 +104,7 @@ def _efficient(bounds: list[tuple]) -> str:
 
 PARTS = {
     "one-pull": Part(_one_pull, 60, _ONE_PULL, grows=True),
-    "scans": Part(truth_scans.scan_row, 60, (truth_scans.SCAN_ROW,), grows=True),
+    "scans": Part(truth_scans.scan_row, 60, truth_scans.ROWS, grows=True),
     "three-pulls": Part(_three_pulls, 150, _THREE_PULLS, grows=True),
     "bad-recordings": Part(bad_recordings_row, 80, (BAD_RECORDINGS,), grows=True),
     "beam": Part(truth_beam.beam_rows, 60, truth_beam.BEAM_ROWS),

@@ -20,7 +20,10 @@ from benchmarks.truth_branch import drawn_cell, recorded
 from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import simulate_pull
+from limber.estimation.uncertainty.bending_stiffness import SectionMean
 from limber.geometry.generated import generate_branch
+from limber.geometry.skeleton.radii.cylinders import on_cylinders
+from limber.mechanics.materials.young_field import young_weights
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import write_pull
 from limber.recordings.settings import ImportSettings
@@ -30,6 +33,7 @@ from limber.stages.pulls.virtual_pull import load_truth
 from limber.stages.shape.generate import write_generated
 from limber.stages.shape.reconstruct import reconstruct
 from limber.store import Branch
+from limber.store.loading import load_mesh, load_skeleton
 
 VIEWS = ("round", "one-sided")
 NOISE_M = (1e-3, 3e-3)
@@ -51,6 +55,8 @@ class ScanTrial:
         errors: Relative errors of the moduli; empty: there is no estimate.
         covered: Whether each interval holds the truth.
         widths: Half widths of the intervals in log E.
+        bending_covered: Whether each interval of E I holds the truth.
+        bending_widths: Half widths of the intervals in log E I.
         refusal: Why there is no estimate.
         seconds: Of all.
         source: Digest of the sources; another one's trials are not taken over.
@@ -62,6 +68,8 @@ class ScanTrial:
     errors: tuple[float, ...]
     covered: tuple[bool, ...]
     widths: tuple[float, ...]
+    bending_covered: tuple[bool, ...]
+    bending_widths: tuple[float, ...]
     refusal: str
     seconds: float
     source: str
@@ -69,6 +77,8 @@ class ScanTrial:
 
 SCAN_ROW = Asked("scan to moduli, round and one-sided, noise 1 to 3 mm: 95 % intervals that hold",
                  "88 to 99 %, or a refusal that says what the scan lacks")
+BENDING_ROW = Asked("the same of bending stiffness E I", "88 to 99 %")
+ROWS = SCAN_ROW, BENDING_ROW
 
 
 def scan_row(setting: Setting) -> list[Row]:
@@ -80,7 +90,7 @@ def scan_row(setting: Setting) -> list[Row]:
     trials = go_on(read_trials(ScanTrial, kept), tasks, lambda each: each.seed,
                    partial(scan_trial, source=source), source, kept, setting.budget, None,
                    setting.progress)
-    return [coverage_row(trials)]
+    return [coverage_row(trials), bending_row(trials)]
 
 
 def coverage_row(trials: list[ScanTrial]) -> Row:
@@ -101,6 +111,19 @@ def coverage_row(trials: list[ScanTrial]) -> Row:
         False if mute else is_met, len(trials))
 
 
+def bending_row(trials: list[ScanTrial]) -> Row:
+    """How many intervals of E I hold the truth, and how wide they are beside those of E."""
+    fitted = [each for each in trials if not each.refusal]
+    if not fitted:
+        return Row(*BENDING_ROW, "no estimate", False, len(trials))
+    held = np.concatenate([each.bending_covered for each in fitted])
+    width, of_young = (100 * np.median(np.concatenate(parts)) for parts in (
+        [each.bending_widths for each in fitted], [each.widths for each in fitted]))
+    return Row(*BENDING_ROW, f"{100 * held.mean():.1f} % of {len(held)} (median half width "
+               f"{width:.0f} %, of E {of_young:.0f} %)",
+               share_met(float(held.mean()), len(held), 0.88, 0.99), len(trials))
+
+
 def scan_trial(seed: tuple[int, ...], source: str = "") -> ScanTrial:
     """Draw a branch, scan it, reconstruct it, pull it in a cell with errors, and estimate."""
     rng, view = np.random.default_rng(seed), VIEWS[seed[-1] % len(VIEWS)]
@@ -119,13 +142,32 @@ def scan_trial(seed: tuple[int, ...], source: str = "") -> ScanTrial:
             refusal = str(error)
     seconds = round(time.perf_counter() - started, 1)
     if refusal:
-        return ScanTrial(seed, view, noise, (), (), (), refusal, seconds, source)
-    log_truth = np.log(made.young)
-    low, high = np.log(np.array(found["young_interval_pa"])).T
+        return ScanTrial(seed, view, noise, (), (), (), (), (), refusal, seconds, source)
+    of_young, of_bending = (_compared(found[name], truth) for name, truth in (
+        ("young_interval_pa", made.young),
+        ("bending_stiffness_interval_nm2", found["true_bending_stiffness"])))
     return ScanTrial(seed, view, noise,
                      tuple((np.array(found["young_pa"]) / made.young - 1).tolist()),
-                     tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
-                     tuple(((high - low) / 2).tolist()), "", seconds, source)
+                     *of_young, *of_bending, "", seconds, source)
+
+
+def _compared(interval: list, truth: np.ndarray) -> tuple[tuple[bool, ...], tuple[float, ...]]:
+    """Whether each interval holds its truth, and their half widths in the log."""
+    low, high = np.log(np.array(interval, float)).T
+    log_truth = np.log(truth)
+    return (tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
+            tuple(((high - low) / 2).tolist()))
+
+
+def _true_bending(branch: Branch, made: object) -> np.ndarray:
+    """True E times the second moment of area of the true branch, over the same parts, shape [K]."""
+    skeleton, mesh = load_skeleton(branch), load_mesh(branch)
+    points = np.array(json.loads(branch.path("estimate.json").read_text())["control_points_m"])
+    true = made.skeleton
+    low, high, fraction, _ = on_cylinders(true, skeleton.nodes)
+    radius = (1 - fraction) * true.radius[low] + fraction * true.radius[high]
+    mean = SectionMean.of(skeleton, mesh, young_weights(mesh, points))
+    return made.young * np.exp(mean.log_second_moment(radius))
 
 
 def _estimated(folder: Path, made: object, rng: np.random.Generator) -> dict:
@@ -144,4 +186,6 @@ def _estimated(folder: Path, made: object, rng: np.random.Generator) -> dict:
         grasp_point=entry.grasp.point_m, grasp_radius=entry.grasp.radius_m, grasp_mode="pinned",
         position_sigma=entry.sensor.position_sigma_m, force_sigma=entry.sensor.force_sigma_n))
     estimate(branch, EstimateSettings(hold_out=False))
-    return json.loads(Branch.open(branch).path("estimate.json").read_text(encoding="utf-8"))
+    done = Branch.open(branch)
+    return json.loads(done.path("estimate.json").read_text(encoding="utf-8")) | {
+        "true_bending_stiffness": _true_bending(done, made)}
