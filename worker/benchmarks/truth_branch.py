@@ -9,16 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
-from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import PaperBranch
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.next_pull import PullChoice
+from limber.estimation.virtual_cell import CellErrors
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
-from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import (
     GraspEntry,
@@ -62,18 +61,6 @@ class Truth:
         return np.array(self.branch.young)
 
 
-@dataclass(frozen=True)
-class Cell:
-    """Errors of one cell, which stay for all its pulls."""
-
-    calibration: CalibrationEntry
-    gripper_place: np.ndarray
-    gripper_turn: np.ndarray
-    gain: float
-    camera_place: np.ndarray
-    camera_turn: np.ndarray
-
-
 def drawn_truth(rng: np.random.Generator) -> Truth:
     """Draw a branch of wood, as long and thick as the paper's, softer outwards as those are."""
     length = rng.uniform(0.45, 0.75)
@@ -113,15 +100,6 @@ def log_field(form: str, mesh: TetMesh, branch: PaperBranch, rng: np.random.Gene
     return inside(np.clip(along, places[0], places[-1])) + beyond
 
 
-def drawn_cell(rng: np.random.Generator, calibration: CalibrationEntry) -> Cell:
-    """Draw the errors that a calibration leaves."""
-    return Cell(calibration, calibration.pose_sigma_m * rng.standard_normal(3),
-                calibration.pose_sigma_rad * rng.standard_normal(3),
-                1 + calibration.force_gain_sigma * rng.standard_normal(),
-                calibration.camera_sigma_m * rng.standard_normal(3),
-                calibration.camera_sigma_rad * rng.standard_normal(3))
-
-
 def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0) -> Pull:
     """What happens in one pull, without any error of measurement; its force turns by ``turn``."""
     branch = truth.branch
@@ -148,33 +126,14 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0)
                 Observations(times, positions))
 
 
-def recorded(pull: Pull, cell: Cell, rng: np.random.Generator) -> Pull:
+def recorded(pull: Pull, cell: CellErrors, rng: np.random.Generator) -> Pull:
     """What the cell records of a pull: its own errors, the sensor's drifting zero, and noise."""
-    known, times = cell.calibration, pull.times
-    share = times / times[-1]
+    seen = cell.recorded(pull, rng)
     peak = float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max())
-    zero = known.force_bias_sigma_n * rng.standard_normal(3)
-    # A sensor that warms up: the drift is not straight.
-    slowing = rng.uniform(0.3, 3.0)
-    course = (1 - np.exp(-share / slowing)) / (1 - np.exp(-1 / slowing))
-    drift = known.force_drift_sigma_n * rng.standard_normal(3) * course[:, None]
-    wrenches = pull.wrenches.copy()
-    wrenches[:, :3] = (cell.gain * wrenches[:, :3] + zero + drift
-                       + FORCE_NOISE * peak * rng.standard_normal((len(times), 3)))
-    point = np.array(pull.entry.grasp.point_m)
-    poses = pull.poses.copy()
-    turn = Rotation.from_rotvec(cell.gripper_turn)
-    poses[:, :3] = (point + cell.gripper_place + turn.apply(poses[:, :3] - point)
-                    + known.pose_noise_m * rng.standard_normal((len(times), 3)))
-    poses[:, 3:] = (turn * Rotation.from_rotvec(poses[:, 3:])).as_rotvec()
-    seen = pull.observations.positions
-    middle = seen.mean(axis=(0, 1))
-    turn = Rotation.from_rotvec(cell.camera_turn)
-    late = known.clock_sigma_s * rng.standard_normal()
-    positions = CubicSpline(times, seen)(np.clip(times + late, 0.0, times[-1]))
-    positions = (middle + turn.apply((positions - middle).reshape(-1, 3)).reshape(positions.shape)
-                 + cell.camera_place + POSITION_NOISE_M * rng.standard_normal(positions.shape))
+    wrenches, positions = seen.wrenches.copy(), seen.observations.positions
+    wrenches[:, :3] += FORCE_NOISE * peak * rng.standard_normal((len(wrenches), 3))
     sensor = SensorEntry(position_sigma_m=POSITION_NOISE_M, force_sigma_n=FORCE_NOISE * peak)
-    entry = pull.entry.model_copy(update={"sensor": sensor, "calibration": known})
-    return replace(pull, entry=entry, poses=poses, wrenches=wrenches,
-                   observations=Observations(times, positions))
+    return replace(
+        seen, entry=seen.entry.model_copy(update={"sensor": sensor}), wrenches=wrenches,
+        observations=Observations(pull.times, positions + POSITION_NOISE_M * rng.standard_normal(
+            positions.shape)))

@@ -16,11 +16,12 @@ import numpy as np
 from benchmarks import truth_branch
 from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
-from benchmarks.truth_branch import drawn_cell, recorded
+from benchmarks.truth_branch import recorded
 from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import simulate_pull
 from limber.estimation.uncertainty.bending_stiffness import SectionMean
+from limber.estimation.virtual_cell import CellErrors
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.mechanics.materials.young_field import young_weights
@@ -178,7 +179,7 @@ def _estimated(folder: Path, made: object, rng: np.random.Generator) -> dict:
                                    force_noise=0.0, frames=60, reach=0.3,
                                    seed=int(rng.integers(2**31)))
     exact = simulate_pull(load_truth(Branch.open(branch), settings), "pull-1", settings)[0]
-    pull = recorded(exact, drawn_cell(rng, CalibrationEntry()), rng)
+    pull = recorded(exact, CellErrors.drawn(CalibrationEntry(), rng), rng)
     write_pull(folder / "recorded", pull)
     entry = pull.entry
     import_pull(branch, folder / "recorded" / "markers.csv", "pull-1", ImportSettings(

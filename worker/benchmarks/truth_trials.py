@@ -20,7 +20,6 @@ from benchmarks.truth_branch import (
     FRACTIONS,
     POISSON,
     Truth,
-    drawn_cell,
     drawn_truth,
     exact_pull,
     recorded,
@@ -39,6 +38,7 @@ from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.model_error import total_interval
+from limber.estimation.virtual_cell import CellErrors
 from limber.geometry.skeleton.control_points import control_points
 from limber.mechanics.materials.young_field import young_weights
 from limber.mechanics.model import BranchModel
@@ -92,7 +92,7 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
     """Draw a branch and a cell, pull, fit, and compare with the truth."""
     rng = np.random.default_rng(seed)
     truth = drawn_truth(rng)
-    cell = drawn_cell(rng, calibration)
+    cell = CellErrors.drawn(calibration, rng)
     first = replace(FIRST_PULL, phase=rng.uniform(0, 2 * np.pi))
     pulls = [recorded(exact_pull(truth, 0, first, FIRST_TURN), cell, rng)]
     started = time.perf_counter()

@@ -9,6 +9,8 @@ from limber.core.settings import GraspMode, Groups, Settings
 if TYPE_CHECKING:
     import numpy as np
 
+    from limber.recordings.cell_errors import CalibrationEntry
+
 
 class EstimateSettings(Settings):
     """How Young's modulus is found from pulls."""
@@ -111,8 +113,11 @@ class VirtualPullSettings(Settings):
         "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
             "reach", "turn", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
+        "errors of the cell": ("cell_errors", "pose_sigma", "pose_turn_sigma", "force_gain_sigma",
+            "force_bias_sigma", "force_drift_sigma", "torque_bias_sigma", "camera_sigma",
+            "camera_turn_sigma", "clock_sigma"),
     }
-    common = ("seed",)
+    common = ("cell_errors", "seed")
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
@@ -167,7 +172,45 @@ class VirtualPullSettings(Settings):
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Fraction of points displaced by 5 cm.")
+    cell_errors: Literal["none", "realistic"] = Field(
+        "none", description="Errors of the cell that stay during the recording, drawn from the "
+        "seed. realistic: those of a cell that was set up with care and not measured since "
+        "(gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, camera 1 mm). The pull "
+        "states their standard deviations as its calibration. Each can be set by its own option.")
+    pose_sigma: float | None = Field(
+        None, ge=0, description="Error of the position of the gripper's frame, each axis [m].")
+    pose_turn_sigma: float | None = Field(
+        None, ge=0, description="Error of the rotation of the gripper's frame, each axis [rad].")
+    force_gain_sigma: float | None = Field(None, ge=0, description="Relative error of the force.")
+    force_bias_sigma: float | None = Field(
+        None, ge=0, description="Zero offset of the force, each axis [N].")
+    force_drift_sigma: float | None = Field(
+        None, ge=0, description="Drift of the force's zero over the recording, each axis [N].")
+    torque_bias_sigma: float | None = Field(
+        None, ge=0, description="Zero offset of the torque, each axis [N m].")
+    camera_sigma: float | None = Field(
+        None, ge=0, description="Error of the position of the observer's frame, each axis [m].")
+    camera_turn_sigma: float | None = Field(
+        None, ge=0, description="Error of the rotation of the observer's frame, each axis [rad].")
+    clock_sigma: float | None = Field(
+        None, ge=0, description="Offset of the observer's clock from the robot's [s].")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
+
+    @property
+    def calibration(self) -> "CalibrationEntry":
+        """Standard deviations of the cell's errors; what was not asked for is exact."""
+        from limber.recordings.cell_errors import EXACT, CalibrationEntry
+
+        begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT
+        given = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
+                 "force_gain_sigma": self.force_gain_sigma,
+                 "force_bias_sigma_n": self.force_bias_sigma,
+                 "force_drift_sigma_n": self.force_drift_sigma,
+                 "torque_bias_sigma_nm": self.torque_bias_sigma,
+                 "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
+                 "clock_sigma_s": self.clock_sigma}
+        return begun.model_copy(update={
+            name: value for name, value in given.items() if value is not None})
 
     @property
     def frame_count(self) -> int:

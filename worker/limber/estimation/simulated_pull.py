@@ -14,10 +14,12 @@ import numpy as np
 
 from limber.core.constants import GRAVITY
 from limber.core.errors import InputError, WorkError
+from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.uncertainty.model_error import refined
+from limber.estimation.virtual_cell import CellErrors
 from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
@@ -147,7 +149,11 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
              for part in (slice(0, 3), slice(3, 6))]
     wrenches = made.wrenches.copy()
-    count = len(wrenches)
+    count, poses = len(wrenches), made.poses
+    if settings.calibration != EXACT:
+        exact = Pull(name, entry, settings.times, poses, wrenches,
+                     Observations(settings.times, positions))
+        entry, poses, wrenches, positions = _misread(exact, settings)
     wrenches[:, :3] += settings.force_noise * sizes[0] * rng.standard_normal((count, 3))
     positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
     stray = rng.random(positions.shape[:2]) < settings.outliers
@@ -159,8 +165,24 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
         force_sigma_n=max(settings.force_noise, 2e-3) * sizes[0],
         torque_sigma_nm=torque_sigma if settings.mode == "clamped" and torque_sigma > 0 else None)})
     observations = None if settings.camera else Observations(settings.times, positions)
-    pull = Pull(name, entry, settings.times, made.poses, wrenches, observations)
+    pull = Pull(name, entry, settings.times, poses, wrenches, observations)
     return pull, made.displacements
+
+
+def _misread(exact: Pull, settings: VirtualPullSettings,
+             ) -> tuple[PullEntry, np.ndarray, np.ndarray, np.ndarray]:
+    """Return entry, poses, wrenches and positions as a cell with errors records them."""
+    if settings.camera:
+        raise InputError("--camera cannot be combined with errors of the cell.",
+                         "Depth images are rendered by a camera whose position is known.",
+                         "Omit --camera, or the errors of the cell.")
+    rng = np.random.default_rng([settings.seed, 3])
+    errors = CellErrors.drawn(settings.calibration, rng)
+    seen = errors.recorded(exact, rng)
+    observed = present(seen.observations, "observed points")
+    entry = seen.entry.model_copy(update={
+        "truth": {**(exact.entry.truth or {}), "cell_errors": errors.truth}})
+    return entry, seen.poses, seen.wrenches, observed.positions
 
 
 def _model(truth: TrueBranch, settings: VirtualPullSettings,

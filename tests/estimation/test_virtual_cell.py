@@ -1,0 +1,82 @@
+"""What a cell with errors records of a pull, and what a virtual pull states of them."""
+
+
+import numpy as np
+import pytest
+
+from limber.core.errors import InputError
+from limber.core.numerics.rigid import rotated
+from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.virtual_cell import CellErrors
+from limber.recordings.cell_errors import EXACT, CalibrationEntry
+from limber.recordings.recording import GraspEntry, Observations, Pull, PullEntry, read_pull
+from limber.stages.pulls.virtual_pull import virtual_pull
+
+POINT = (0.0, 0.0, 0.3)
+
+
+def drawn(seed: int = 0, **known: float) -> tuple[Pull, CellErrors, Pull]:
+    """An exact pull, the errors of a cell, and what it records."""
+    rng = np.random.default_rng(seed)
+    times = np.linspace(0.0, 3.0, 13)
+    poses = np.hstack([POINT + 0.01 * np.c_[times, 0 * times, 0 * times],
+                       0.1 * np.c_[0 * times, times, 0 * times]])
+    wrenches = np.c_[times, -times, 0 * times, np.zeros((13, 3))]
+    points = np.tile([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]], (13, 1, 1)) + 0.003 * (
+        times[:, None, None] * [1.0, 0.0, 0.0])
+    exact = Pull("a", PullEntry(source="here", grasp=GraspEntry(point_m=POINT, radius_m=0.01)),
+                 times, poses, wrenches, Observations(times, points))
+    exactly = EXACT.model_copy(update={"pose_noise_m": 1e-12, **known})
+    errors = CellErrors.drawn(exactly, rng)
+    return exact, errors, errors.recorded(exact, rng)
+
+
+def test_an_exact_cell_records_what_happens():
+    exact, _, seen = drawn()
+    np.testing.assert_allclose(seen.poses, exact.poses, atol=1e-9)
+    np.testing.assert_allclose(seen.wrenches, exact.wrenches, atol=1e-12)
+    np.testing.assert_allclose(seen.observations.positions, exact.observations.positions,
+                               atol=1e-12)
+
+
+def test_a_gripper_frame_turns_about_the_grasp():
+    exact, errors, seen = drawn(pose_sigma_m=1e-3, pose_sigma_rad=0.02)
+    moved = exact.poses[:, :3] - POINT
+    np.testing.assert_allclose(
+        seen.poses[:, :3], POINT + errors.gripper_place + rotated(errors.gripper_turn, moved),
+        atol=1e-9)
+    assert np.linalg.norm(errors.gripper_turn) > 0.005
+
+
+def test_gain_zero_and_drift_of_the_force():
+    """At the first frame the zero alone is off, and the drift grows from there."""
+    exact, errors, seen = drawn(force_gain_sigma=0.1, force_bias_sigma_n=1.0,
+                                force_drift_sigma_n=2.0)
+    left = seen.wrenches[:, :3] - errors.force_gain * exact.wrenches[:, :3]
+    assert abs(errors.force_gain - 1) > 0.005 and np.linalg.norm(left[0]) > 0.1
+    drift = np.linalg.norm(left - left[0], axis=1)
+    assert (np.diff(drift) > 0).all() and drift[-1] > 0.1
+
+
+def test_errors_scatter_as_the_calibration_states():
+    places = np.array([CellErrors.drawn(CalibrationEntry(), np.random.default_rng(seed)
+                                        ).gripper_place for seed in range(400)])
+    assert places.std() == pytest.approx(1e-3, rel=0.1)
+
+
+def test_a_virtual_pull_states_what_was_drawn(branch_folder):
+    """The calibration goes into the fit's prior, the drawn errors into the truth alone."""
+    settings = VirtualPullSettings(frames=4, cell_errors="realistic", force_bias_sigma=0.0, seed=2)
+    virtual_pull(branch_folder, "real", settings)
+    entry = read_pull(branch_folder / "pulls" / "real").entry
+    assert entry.calibration == CalibrationEntry().model_copy(update={"force_bias_sigma_n": 0.0})
+    known = entry.truth["cell_errors"]
+    assert abs(known["force_gain"] - 1) < 0.1 and np.linalg.norm(known["gripper_place_m"]) > 1e-4
+    other = read_pull(branch_folder / "pulls" / "pull-1").entry
+    assert other.calibration == EXACT and "cell_errors" not in other.truth
+
+
+def test_depth_images_have_no_such_errors(branch_folder):
+    with pytest.raises(InputError, match="--camera cannot be combined"):
+        virtual_pull(branch_folder, "seen", VirtualPullSettings(
+            frames=4, camera=True, cell_errors="realistic"))
