@@ -1,21 +1,31 @@
 """The door for files of others: what is not finite, too deep, too large or no number stays out."""
 
+import errno
 import io
+import os
 import struct
+import time
 import zipfile
 
 import numpy as np
 import pytest
 
-from limber.core.errors import InputError
+from limber.batch.jobs.toml_positions import toml_lines
+from limber.core.errors import InputError, WorkError
+from limber.core.files.atomic import file_digest, require_file
 from limber.core.files.reading import (
+    MOST_TOML_BYTES,
+    csv_records,
     read_arrays,
     read_columns,
     read_json,
     read_json_as,
+    read_text,
     read_toml,
     require_shapes,
+    toml_content,
 )
+from limber.core.machine_errors import machine_error
 
 
 @pytest.mark.parametrize("text", [
@@ -48,6 +58,76 @@ def test_toml_that_is_refused(tmp_path, text):
     path.write_text("a = nan")
     with pytest.raises(InputError):
         read_toml(path, "settings")
+
+
+@pytest.mark.parametrize("key", [
+    ".".join(["a"] * 60_000), "[" + " . ".join(["a", "'b c'", '"d.e"'] * 20) + "]",
+    "x = {" + ".".join(["a-1"] * 40) + " = 1}"])
+def test_endless_keys_are_refused_at_once(tmp_path, key):
+    """The parser would take 21 s and 5.8 GB for the first; depth is counted before it begins."""
+    path = tmp_path / "a.toml"
+    path.write_text(f"b = 1\n{key} = 1\n")
+    begun = time.process_time()
+    with pytest.raises(InputError, match=r"a\.toml.*line 2: a key has more than 32 parts"):
+        read_toml(path, "settings")
+    assert time.process_time() - begun < 1.0
+
+
+def test_what_only_looks_like_a_long_key_is_read(tmp_path):
+    """Rows of numbers, texts with dots, and keys of some parts."""
+    path = tmp_path / "a.toml"
+    text = f"a = [{', '.join(['0.25'] * 100)}]\nb = '{'x. ' * 30}'\nc.d.'e.f' = 1\n"
+    path.write_text(text)
+    assert read_toml(path, "settings") == {"a": [0.25] * 100, "b": "x. " * 30,
+                                           "c": {"d": {"e.f": 1}}}
+
+
+def test_a_toml_file_has_a_size(tmp_path):
+    """Also a text that came in a bag."""
+    path = tmp_path / "a.toml"
+    path.write_text("#" * (MOST_TOML_BYTES + 1))
+    with pytest.raises(InputError, match="at most 2 MB"):
+        read_toml(path, "settings")
+    with pytest.raises(InputError, match="2097153 characters"):
+        toml_content(path.read_text(), path, "settings")
+
+
+def test_lines_of_toml_take_no_time_for_blanks():
+    """A line of blanks in a text of several lines looks like the start of a table."""
+    begun = time.process_time()
+    lines = toml_lines("x = '''\n[" + " " * 50_000 + "\n'''\n[ a . b ]\n c = 1")
+    assert lines[("a", "b", "c")] == 5
+    assert time.process_time() - begun < 1.0
+
+
+def test_a_long_field_of_a_table_is_refused(tmp_path):
+    """Python's reader takes 131,072 characters at most, and raises an error of its own."""
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n" + "x" * 140_000 + ",1\n")
+    for read in (lambda: read_columns(path, ("b",), "numbers"), lambda: csv_records(path, "rows")):
+        with pytest.raises(InputError, match=r"a\.csv.*field"):
+            read()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
+def test_pipes_and_devices_are_refused(tmp_path):
+    """Nobody writes to this pipe: to open it would wait for ever. A device has no end."""
+    pipe = tmp_path / "cloud.ply"
+    os.mkfifo(pipe)
+    for place in (pipe, "/dev/zero"):
+        for read in (lambda p: read_text(p, "text"), lambda p: read_json(p, "numbers"), file_digest,
+                     lambda p: read_arrays(p, "arrays"), lambda p: require_file(p, "A scan")):
+            with pytest.raises(InputError, match="is a pipe or a device"):
+                read(place)
+
+
+@pytest.mark.parametrize(("code", "kind"), [
+    (errno.ENAMETOOLONG, InputError), (errno.EISDIR, InputError), (errno.EFBIG, WorkError),
+    (errno.EMFILE, WorkError), (errno.ENOSPC, WorkError), (errno.EROFS, InputError)])
+def test_what_the_system_refuses_is_told(code, kind):
+    """Each with the file, what it means and what to do."""
+    told = machine_error(OSError(code, os.strerror(code), "x.ply"))
+    assert type(told) is kind and "x.ply" in told.seen and told.why and told.fix
 
 
 def test_arrays_come_as_they_were_saved(tmp_path):

@@ -174,6 +174,7 @@ def call(arguments: list[str] | None = None) -> int:
         end_with_parent_pipe()
     try:
         main.main(args=arguments, prog_name="limber", standalone_mode=False)
+        sys.stdout.flush()
     except click.ClickException as error:
         error.show()
         return error.exit_code
@@ -184,7 +185,20 @@ def call(arguments: list[str] | None = None) -> int:
         return error.exit_code
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except OSError as error:
+        return _output_lost(error)
     return 0
+
+
+def _output_lost(error: OSError) -> int:
+    """Say that standard output takes no more; what a command wrote elsewhere is complete."""
+    with contextlib.suppress(OSError, ValueError):
+        # Python flushes it once more at the end, and would report that as a fault of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if not isinstance(error, BrokenPipeError):
+        click.echo(f"error: Standard output cannot be written ({error.strerror or error}).",
+                   err=True)
+    return 3
 
 
 def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,

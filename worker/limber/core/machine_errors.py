@@ -22,6 +22,9 @@ _LOST_ON_WINDOWS = frozenset((53, 55, 59, 64, 67, 121, 1231))
 _FULL_IN_WORDS = re.compile(r"no space left|not enough free space|requested and \d+ written", re.I)
 """As numpy and HDF5 say it, without a number."""
 _FORBIDDEN = _codes("EROFS", "EACCES", "EPERM")
+_NO_SUCH_NAME = _codes("ENAMETOOLONG", "ELOOP", "ENOTDIR", "EISDIR", "EILSEQ")
+_TOO_LARGE = _codes("EFBIG", "EOVERFLOW")
+_TOO_MANY = _codes("EMFILE", "ENFILE")
 
 
 def machine_error(error: BaseException, place: Path | None = None) -> LimberError | None:
@@ -47,6 +50,18 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
         return WorkError(f"{name} does not answer ({told}).",
                          "The connection to its disk or network folder was lost.",
                          "Restore the connection, and run this again. Earlier results are kept.")
+    if error.errno in _NO_SUCH_NAME:
+        return InputError(f"{str(name)[:300]} cannot be used ({told}).",
+                          "No file can have this name or be in this place.",
+                          "Give a shorter name, or another place.")
+    if error.errno in _TOO_LARGE:
+        return WorkError(f"{name} cannot be written ({told}).",
+                         "The disk, or a limit of your account (ulimit -f), allows no file of this "
+                         "size.", "Raise the limit, or use another disk.")
+    if error.errno in _TOO_MANY:
+        return WorkError(f"{name} cannot be opened ({told}).",
+                         "Too many files are open on this computer or in this program.",
+                         "Close other programs, or raise the limit (ulimit -n).")
     if error.errno in _FORBIDDEN:
         return InputError(f"{name} cannot be used ({told}).",
                           "It is read-only, or belongs to another user.",

@@ -4,7 +4,6 @@ Not every branch is round, and a beam made for a test is drawn, not scanned: a t
 at each place the width and the height of the ellipse across it, and what hangs there.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.reading import read_text
+from limber.core.files.reading import csv_records
 from limber.geometry.io.formats import Format
 from limber.geometry.mesh_surface import MeshedBody, aligned_body, numbers_of
 from limber.geometry.settings import MeshSurfaceSettings
@@ -63,8 +62,7 @@ def read_sections(path: Path, unit: str) -> Sections:
     Raises:
         InputError: a column is missing, a value is not a number, or a size is not positive.
     """
-    text = read_text(path, "a table of sections")
-    rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+    rows = csv_records(path, "a table of sections", comment="#")
     titles = [title.strip() for title in rows[0] if title] if rows else []
     found = {}
     for title in titles:

@@ -5,14 +5,13 @@ The trees: a row a node with its planner, its position, and the row of that tree
 certificate, which covers the whole sampled region.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from limber.core.errors import BranchFolderError
-from limber.core.files.reading import read_arrays, read_text, require_shapes
+from limber.core.files.reading import csv_records, read_arrays, require_shapes
 
 _POSITION = ("x_m", "y_m", "z_m")
 _WHAT = "the bound of a plan"
@@ -75,7 +74,7 @@ def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     Raises:
         BranchFolderError: the file is damaged.
     """
-    rows = list(csv.DictReader(read_text(path, "search trees").splitlines()))
+    rows = csv_records(path, "search trees")
     found = {}
     for planner in dict.fromkeys(row.get("planner") or "" for row in rows):
         own = [row for row in rows if row.get("planner") == planner]

@@ -14,7 +14,7 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_toml
+from limber.core.files.reading import read_toml, toml_content
 from limber.core.json_values import plain
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.time_series import Stream, read_stream, write_stream
@@ -201,11 +201,7 @@ def entry_of_text(text: str, where: str) -> PullEntry:
     Raises:
         InputError: as :func:`read_entry`.
     """
-    try:
-        content = tomlkit.parse(text).unwrap()
-    except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
-        raise InputError(f"{where} is not valid TOML ({error}).", "", "Export it again.") from error
-    return _checked(content, where)
+    return _checked(toml_content(text, where, "the description of a pull"), where)
 
 
 def _checked(content: dict[str, Any], where: str) -> PullEntry:

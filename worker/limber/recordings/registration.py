@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.reading import read_text
 from limber.core.numerics.rigid import rigid_fit
 from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split_title
 
@@ -53,13 +54,8 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
         InputError: the file cannot be read as that.
     """
     path = Path(path)
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines()
-                 if line.strip() and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).",
-                         "The markers' nominal positions were expected.",
-                         "Check the path.") from error
+    lines = [line for line in read_text(path, "a table of the markers' nominal positions")
+             .splitlines() if line.strip() and not line.startswith("#")]
     sign = next((sign for sign in ("\t", ";", ",") if lines and sign in lines[0]), ",")
     rows = [[part.strip().strip('"') for part in line.split(sign)] for line in lines]
     try:

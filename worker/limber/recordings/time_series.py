@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.reading import read_text
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
@@ -143,11 +144,7 @@ def _long_runs(flags: np.ndarray, run_length: int) -> np.ndarray:
 
 
 def _read_rows(path: Path) -> _Rows:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
-                         "Check the path and the file.") from error
+    text = read_text(path, "a CSV file of a recording")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputError(f"{path} is empty.", "A header and rows of numbers were expected.",

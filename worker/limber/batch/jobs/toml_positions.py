@@ -4,9 +4,9 @@ import re
 
 Place = tuple[str | int, ...]
 
-_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\]]+?)\s*\]")
+_HEADER = re.compile(r"(\[\[?)([^\]]+)\]")
 _PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
-_KEY = re.compile(rf"^\s*({_PART}(?:\s*\.\s*{_PART})*)\s*=")
+_KEY = re.compile(rf"({_PART}(?:\s*\.\s*{_PART})*)\s*=")
 
 
 def toml_lines(text: str) -> dict[Place, int]:
@@ -17,7 +17,7 @@ def toml_lines(text: str) -> dict[Place, int]:
     found: dict[Place, int] = {(): 1}
     counts: dict[Place, int] = {}
     table: Place = ()
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(map(str.strip, text.splitlines()), 1):
         if header := _HEADER.match(line):
             table = ()
             parts = _parts(header.group(2))

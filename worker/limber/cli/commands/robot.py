@@ -1,6 +1,5 @@
 """Check and calibrate a robot: `limber robot check`, `limber robot calibrate`."""
 
-import csv
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -193,15 +192,15 @@ def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, posit
 
 def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
     from limber.core.errors import InputError
+    from limber.core.files.reading import csv_rows
 
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row]
+        rows = [row for row in csv_rows(path, "a table of points") if row]
         if rows and not _is_number(rows[0][1]):
             rows = rows[1:]
         names = [row[0] for row in rows]
         numbers = np.array([[float(part) for part in row[1:]] for row in rows])
-    except (OSError, ValueError, IndexError) as error:
+    except (ValueError, IndexError) as error:
         raise InputError(f"{path} cannot be read as points ({error}).",
                          "A line has name,x_m,y_m,z_m.", "Correct the file.") from error
     if not np.isfinite(numbers).all():

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -56,9 +57,31 @@ def flush_tree(folder: Path) -> None:
 
 
 def file_digest(path: str | os.PathLike) -> str:
-    """Return the sha256 of a file's bytes, in hexadecimal."""
+    """Return the sha256 of a file's bytes, in hexadecimal.
+
+    Raises:
+        InputError: it is a pipe or a device.
+    """
+    require_no_pipe(path)
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def require_no_pipe(path: str | os.PathLike) -> None:
+    """Refuse a pipe, a socket or a device. A path without anything passes.
+
+    Raises:
+        InputError: it is one. It may never end, and it cannot be read twice.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        # Whoever opens it says so in terms of what was expected there.
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise InputError(f"{path} is a pipe or a device, not a file.",
+                         "Limber reads its inputs more than once, and a pipe may never end.",
+                         "Write the content to a file, and give that file.")
 
 
 def require_file(path: Path, what: str) -> Path:
@@ -67,6 +90,7 @@ def require_file(path: Path, what: str) -> Path:
     Raises:
         InputError: it is not.
     """
+    require_no_pipe(path)
     if not Path(path).is_file():
         raise InputError(f"There is no file {path}.", f"{what} was expected.", "Check the path.")
     return Path(path)

@@ -1,4 +1,4 @@
-"""The door through which files of others, and of branch folders, come in: JSON, TOML and arrays.
+"""The door through which files of others, and of branch folders, come in: JSON, TOML, CSV, arrays.
 
 Whoever wrote them, they may be cut short, mangled or made to harm. So: numbers are finite, what a
 header announces is compared with the file's size before memory is taken, nothing is unpickled, and
@@ -10,6 +10,7 @@ import csv
 import json
 import math
 import os
+import re
 import tokenize
 import tomllib
 import zipfile
@@ -22,6 +23,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from limber.core.errors import InputError
+from limber.core.files.atomic import require_no_pipe
 
 Content = TypeVar("Content")
 
@@ -29,6 +31,13 @@ LARGEST_EXPANSION = 100.0
 """Array bytes for a byte of a compressed file, from which on ``HARMLESS_BYTES`` is the limit:
 real measurements compress ten times at best."""
 HARMLESS_BYTES = 256e6
+MOST_TOML_BYTES = 2 << 20
+"""People write TOML by hand; its parser takes two seconds for a megabyte of tables."""
+MOST_JSON_BYTES = 512 << 20
+_MOST_KEY_PARTS = 32
+_LONG_KEY = re.compile(r"""(?<![\w.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+)"""
+                       f"{{{_MOST_KEY_PARTS}}}")
+"""A dotted key; the parser's time and memory grow with the square of the number of its parts."""
 
 
 class FileContent(BaseModel):
@@ -43,10 +52,20 @@ def read_text(path: str | os.PathLike, what: str) -> str:
     Raises:
         InputError: it cannot be read, or is not text.
     """
+    require_no_pipe(path)
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise _unreadable(path, what, error) from error
+
+
+def _require_modest_text(path: str | os.PathLike, most_bytes: int, what: str) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        size = os.stat(path).st_size
+        if size > most_bytes:
+            raise InputError(f"{path} has {size / 1e6:.0f} MB.",
+                             f"{what[0].upper()}{what[1:]} was expected; it has at most "
+                             f"{most_bytes / 1e6:.0f} MB.", "Check that this is the right file.")
 
 
 def read_json(path: str | os.PathLike, what: str) -> Any:
@@ -55,6 +74,7 @@ def read_json(path: str | os.PathLike, what: str) -> Any:
     Raises:
         InputError: it is not JSON, or a number in it is not finite.
     """
+    _require_modest_text(path, MOST_JSON_BYTES, what)
     text = read_text(path, what)
     try:
         return json.loads(text, parse_constant=_refused, parse_float=_finite, parse_int=_integer)
@@ -97,8 +117,23 @@ def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dic
     Raises:
         InputError: it is not TOML (the line is named), or a number in it is not finite.
     """
-    text = read_text(path, what)
+    _require_modest_text(path, MOST_TOML_BYTES, what)
+    return toml_content(read_text(path, what), path, what, finite=finite)
+
+
+def toml_content(text: str, path: str | os.PathLike, what: str, *, finite: bool = True,
+                 ) -> dict[str, Any]:
+    """Return the content of a TOML text that was read from ``path``, as :func:`read_toml` does.
+
+    Raises:
+        InputError: as :func:`read_toml`; or a key is nested too deeply.
+    """
     try:
+        if len(text) > MOST_TOML_BYTES:
+            raise ValueError(f"it has {len(text)} characters")
+        if (long := _LONG_KEY.search(text)) is not None:
+            raise ValueError(f"line {text.count(chr(10), 0, long.start()) + 1}: a key has more "
+                             f"than {_MOST_KEY_PARTS} parts")
         return tomllib.loads(text, parse_float=_finite if finite else float)
     except (ValueError, RecursionError) as error:
         raise _unreadable(path, what, error) from error
@@ -110,6 +145,7 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
     Raises:
         InputError: it is damaged, holds objects, or announces more than it can hold.
     """
+    require_no_pipe(path)
     try:
         with open(path, "rb") as stream:
             if stream.read(6) == np.lib.format.MAGIC_PREFIX:
@@ -131,6 +167,37 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
         raise _unreadable(path, what, error) from error
 
 
+def csv_rows(path: str | os.PathLike, what: str) -> list[list[str]]:
+    """Return the fields of each line of a CSV file, also of empty lines.
+
+    Raises:
+        InputError: it cannot be read, or a field has more than 131,072 characters.
+    """
+    try:
+        return list(csv.reader(read_text(path, what).splitlines()))
+    except csv.Error as error:
+        raise _unreadable(path, what, error) from error
+
+
+def csv_records(path: str | os.PathLike, what: str, comment: str = "") -> list[dict[str, Any]]:
+    """Return the fields of each line of a CSV file by the titles in its first line.
+
+    A field that its line lacks is None; those beyond the titles are listed under None.
+
+    Args:
+        comment: Lines that begin with it are omitted.
+
+    Raises:
+        InputError: as :func:`csv_rows`.
+    """
+    lines = [line for line in read_text(path, what).splitlines()
+             if not (comment and line.startswith(comment))]
+    try:
+        return list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise _unreadable(path, what, error) from error
+
+
 def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
                  ) -> dict[str, np.ndarray]:
     """Return the columns of a CSV file with a header that hold finite numbers throughout.
@@ -138,7 +205,7 @@ def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
     Raises:
         InputError: it cannot be read, has no rows, or one of ``needed`` is not among them.
     """
-    rows = [row for row in csv.reader(read_text(path, what).splitlines()) if row]
+    rows = [row for row in csv_rows(path, what) if row]
     columns = {}
     for name, *values in zip(*rows, strict=False):
         with contextlib.suppress(ValueError):
@@ -254,6 +321,6 @@ def _refused(text: str) -> NoReturn:
 
 def _unreadable(path: str | os.PathLike, what: str, error: Exception) -> InputError:
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return InputError(f"{path} cannot be read ({reason or type(error).__name__}).",
+    return InputError(f"{path} cannot be read ({reason[:300] or type(error).__name__}).",
                       f"{what[0].upper()}{what[1:]} was expected.",
                       "It is missing, damaged or of another type.")

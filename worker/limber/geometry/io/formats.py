@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from limber.core.errors import InputError, LimberError, MissingDependencyError
+from limber.core.files.atomic import require_no_pipe
 from limber.core.lazy import loaded
 from limber.core.machine_errors import machine_error
 from limber.geometry.io.isolated_readers import read_apart
@@ -150,8 +151,9 @@ def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
     not look at the content takes what no other recognises.
 
     Raises:
-        InputError: none is known.
+        InputError: none is known, or it is a pipe or a device.
     """
+    require_no_pipe(path)
     named = [one for one in formats if path.suffix.lower() in one.suffixes]
     plain = [one for one in named if one.recognises is None or len(named) == 1]
     if len(named) != 1 and path.exists():

@@ -8,6 +8,7 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
+from limber.core.files.reading import csv_records, read_text
 from limber.geometry.io.cylinder_models import (
     read_treeqsm,
     write_rtwig,
@@ -48,7 +49,7 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
         InputError: not an SWC tree; see :meth:`Skeleton.from_edges`.
     """
     rows, header_scale = [], 1.0
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(read_text(path, "a skeleton (SWC)").splitlines(), start=1):
         if line.startswith("#"):
             header_scale = _header_unit(line, header_scale)
             continue
@@ -108,7 +109,7 @@ def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
     """
     rows = [{_ALIASES.get(name.strip().lower().replace("_", ""), name.strip()): value
              for name, value in row.items() if name is not None}
-            for row in csv.DictReader(_lines(path))]
+            for row in csv_records(path, "a cylinder model")]
     names = ("id", "parent", "sx", "sy", "sz", "ex", "ey", "ez", "radius")
     missing = [name for name in names if not rows or name not in rows[0]]
     if missing:
@@ -212,17 +213,6 @@ def _fitted_columns(path: Path, rows: Sequence[dict[str, str]], scale: float,
                          "Correct the file.")
     return {"radius_sigma": sigma * scale, "radius_state": state.astype(np.int8),
             "probability": probability}
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return Path(path).read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).", "", "Check the path.",
-                         ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file.", "A skeleton is an SWC or CSV text file.",
-                         "Choose another file.") from error
 
 
 def _header_unit(line: str, scale: float) -> float:

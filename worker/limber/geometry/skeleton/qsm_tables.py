@@ -1,6 +1,5 @@
 """Tables of a cylinder model (QSM): length, volume and taper by order, diameters at heights."""
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.reading import csv_records
 from limber.geometry.skeleton.skeleton import Skeleton
 
 HEIGHTS = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9)
@@ -98,11 +98,7 @@ def read_calipers(path: Path) -> list[Caliper]:
     Raises:
         InputError: a column is missing, or a value is no positive number.
     """
-    try:
-        rows = list(csv.DictReader(Path(path).read_text(encoding="utf-8").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
-                         "Check the path.") from error
+    rows = csv_records(path, "a CSV file of caliper values")
     if not rows:
         raise InputError(f"{path} has no values.",
                          "A header and one line for each diameter were expected.",

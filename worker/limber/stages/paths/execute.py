@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import time
@@ -14,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError, SafetyStop, WorkError
-from limber.core.files.reading import read_columns, read_text
+from limber.core.files.reading import csv_records, read_columns
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
@@ -264,7 +263,7 @@ def _planned(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
     nothing = np.full(len(table["x_m"]), np.nan)
     planned = np.column_stack([table.get(column, nothing) for column in POSE_COLUMNS])
     if whole:
-        rows = csv.DictReader(read_text(path, "the table of a motion").splitlines())
+        rows = csv_records(path, "the table of a motion")
         planned = planned[[row.get("phase") != "return" for row in rows]]
     if len(planned) < 2:
         raise InputError(f"{path} has {len(planned)} points.", "This is not a path.", "Plan again.")
