@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import tomlkit
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
@@ -80,6 +81,65 @@ def test_what_is_wrong_is_named(cell_file, old, new, told):
     cell_file.write_text(TEXT.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError, match=told):
         read_cell(cell_file)
+
+
+SLIPS = {
+    # an entry of the file, and what is wrong with it: the unit or the order, mostly
+    "base.pose": [[0.6, 0.1, 0, 0, 0, 90], [600, 100, 0, 0, 0, 1.2], [15, 2, 0, 0, 0, 0]],
+    "base.position_sigma_m": [2.0], "base.rotation_sigma_rad": [0.6], "base.residual_m": [3.0],
+    "robot.pose_sigma_m": [0.05], "robot.pose_sigma_rad": [0.3],
+    "robot.joint_limits_rad": [[[-180, 180]] * 6, [[1.0, -1.0]] * 6, [[0.0, 0.05]] * 6,
+                               [[7.0, 9.0]] * 6, [[-1, 1]] * 5],
+    "tool.grasp_pose": [[0, 0, 150, 0, 0, 0], [0, 0, 1.5, 0, 0, 0], [0, 0, 0.15, 0, 0, 45]],
+    "tool.mass_kg": [900, 9.0], "tool.centre_of_mass_m": [[0, 0, 40]],
+    "tool.parts": [[{"start_m": [0, 0, 0], "end_m": [0, 0, 100], "radius_m": 0.04}],
+                   [{"start_m": [0, 0, 0], "end_m": [0, 0, 0.1], "radius_m": 40}]],
+    "tool.compliance_m_per_n": [0.05], "tool.grip_seconds": [1000],
+    "approach.distance_m": [80], "approach.direction": [[0, 0, 0]],
+    "sensor.pose": [[0, 0, 80, 0, 0, 0], [0, 0, 0.04, 0, 0, 180]],
+    "sensor.force_range_n": [0.1, 1e5], "sensor.torque_range_nm": [1.0, 1e4],
+    "sensor.force_sigma_n": [150], "sensor.torque_sigma_nm": [20],
+    "sensor.drift_n_per_minute": [800],
+    "limits.hard_force_n": [1e4, 15000, 0.015], "limits.hard_torque_nm": [3000],
+    "limits.soft_force_n": [20.0, 1e4], "limits.unexpected_force_n": [3000],
+    "limits.speed_m_s": [50], "limits.acceleration_m_s2": [300], "limits.turn_speed_rad_s": [30],
+    "limits.singularity": [5], "limits.joint_margin_rad": [3],
+    "camera.pose": [[0, 800, 0, 0, 0, 0], [0, 0.8, 0, 0, 0, 90]],
+    "camera.range_m": [[200, 2000], [2.0, 0.2]], "camera.focal_px": [[1.93, 1.93]],
+    "camera.centre_px": [[3200, 2400]], "camera.width": [10**9],
+    "second_arm.base_pose": [[800, 0, 0, 0, 0, 0], [0.8, 0, 0, 0, 0, 180]],
+    "workspace.high_m": [[500, 500, 1000], [-1, -1, -1]],
+    "workspace": [{"low_m": [5.0, 5.0, 0.0], "high_m": [6.0, 6.0, 1.0]}],
+    "obstacles.0.pose": [[300, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 45]],
+    "obstacles.0.size_m": [[1000, 1000, 20], [1, 1, -0.1]]}
+
+
+def _content():
+    return {"branch": "0d5a", "robot": {"model": "ur5e"},
+            "base": {"pose": [0.6, 0.1, 0.0, 0.0, 0.0, 1.2]},
+            "tool": {"grasp_pose": [0, 0, 0.15, 0, 0, 0], "mass_kg": 0.9}, "approach": {},
+            "sensor": {}, "limits": {"hard_force_n": 15.0},
+            "camera": {"pose": [0, -0.8, 0.3, -1.57, 0, 0]},
+            "second_arm": {"model": "ur3e", "base_pose": [-0.6, 0.1, 0, 0, 0, 0]},
+            "workspace": {"low_m": [-0.5, -0.5, 0.0], "high_m": [0.5, 0.5, 1.0]},
+            "obstacles": [{"size_m": [1, 1, 0.02], "pose": [0, 0, -0.01, 0, 0, 0], "kind": "box"}]}
+
+
+@pytest.mark.parametrize(("place", "value"),
+                         [(place, value) for place, values in SLIPS.items() for value in values])
+def test_a_slip_is_refused_and_its_entry_named(tmp_path, place, value):
+    """Millimetres, degrees, grams, millinewtons, and what comes in the wrong order."""
+    content = _content()
+    Cell.model_validate(content)
+    table = content
+    *folders, last = place.split(".")
+    for part in folders:
+        table = table[int(part) if part.isdigit() else part]
+    table[last] = value
+    path = tmp_path / "cell.toml"
+    path.write_text(tomlkit.dumps(content))
+    with pytest.raises(InputError, match=rf"cell\.toml, line \d+: .*{last}"):
+        read_cell(path)
 
 
 def test_a_missing_file_is_told(tmp_path):

@@ -387,3 +387,30 @@ def test_a_retreat_needs_a_force_that_is_known_and_an_arm_that_stands():
     bench.guard.event("test")
     with pytest.raises(SafetyStop, match="unknown"):
         bench.guard.begin_retreat(np.r_[np.inf, np.zeros(5)])
+
+
+@pytest.mark.parametrize("name", ["ur3e", "ur5e", "ur10", "ur16e"])
+def test_the_guard_keeps_to_the_arms_table(name):
+    """Limits that passed no check of a file, as of a program, are none: the arm's own hold."""
+    arm = ARMS[name]
+    wild = LIMITS.model_copy(update={
+        "soft_force_n": 1e4, "hard_force_n": 1e4, "hard_torque_nm": 3000.0,
+        "unexpected_force_n": 1e4, "speed_m_s": 50.0, "turn_speed_rad_s": 30.0})
+    bench = Bench()
+    bench.guard = Guard(arm, GuardSettings(wild, np.tile([-900.0, 900.0], (6, 1))), 500.0)
+    bench.guard.tared()
+    bench.guard.begin()
+    target = bench.guard.permit(np.zeros(6), np.array([1.0, 0, 0, 0, 0, 0]), 0.1)
+    assert target[0] == pytest.approx(0.025)
+    turned = bench.guard.permit(np.zeros(6), np.array([0, 0, 0, 3.0, 0, 0]), 0.1)
+    assert turned[3] == pytest.approx(0.15)
+    assert bench.run().verdict == Verdict.GO
+    force = min(140.0, 2 * 9.81 * arm.payload)
+    assert bench.look(force=(0, 0, force - 1)).verdict == Verdict.GO
+    assert "hard force limit" in bench.look(force=(0, 0, force + 1)).reason
+    for changed, reason in (({"torque": (0, 0, 0.15 * force + 1)}, "hard torque limit"),
+                            ({"joints": np.r_[7.0, JOINTS[1:]]}, "joint 1 at its limit"),
+                            ({"speed": np.r_[0.5, np.zeros(5)]}, "speed")):
+        bench.guard.acknowledge()
+        bench.guard.begin()
+        assert reason in bench.look(**changed).reason

@@ -188,6 +188,31 @@ def test_a_bug_report_takes_nothing_through_links(folder, tmp_path):
         assert not json.loads(archive.read("report.json"))["opens"]
 
 
+def test_a_second_name_of_a_file_elsewhere_is_left_alone(folder, tmp_path):
+    """An archive may make one: a stream goes on with a copy, a bug report keeps it at home."""
+    for name in (".streams/pulls/p/robot.csv", "pulls/p/note.txt"):
+        (folder / name).parent.mkdir(parents=True)
+        os.link(tmp_path / "victim.txt", folder / name)
+    branch = Branch.open(folder)
+    with branch.stream("pulls/p/robot.csv") as stream:
+        stream.append("1,2")
+    assert (folder / ".streams/pulls/p/robot.csv").read_text() == "1,2\n"
+    assert (tmp_path / "victim.txt").read_text() == "precious"
+    report = tmp_path / "bug.zip"
+    assert call(["bug-report", str(folder), "-o", str(report), "--data"]) == 0
+    with zipfile.ZipFile(report) as archive:
+        assert "branch/pulls/p/note.txt" not in archive.namelist()
+        assert json.loads(archive.read("report.json"))["not_packed"] == ["pulls/p/note.txt"]
+
+
+def test_endless_folders_are_refused(folder):
+    """Links that no path can name any more could hide in them."""
+    (folder / "/".join("d" * 40)).mkdir(parents=True)
+    for opened in (Branch.open, Branch.read, Branch.create):
+        with pytest.raises(BranchFolderError, match="nested more than 32 deep"):
+            opened(folder)
+
+
 def test_a_recording_with_links_is_not_imported(folder, tmp_path, capsys):
     """The files that they lead to would come into the branch, and from there to others."""
     (tmp_path / "pull").mkdir()

@@ -21,6 +21,7 @@ from benchmarks.worker_batches import (
 )
 from benchmarks.worker_exports import EXPORT_ROWS, exported
 from benchmarks.worker_fuzz import fuzz
+from benchmarks.worker_hostile import HOSTILE_ROWS, hostile
 from benchmarks.worker_kills import KILLS_ROW, killed
 from benchmarks.worker_readers import READERS
 from benchmarks.worker_readme import README_ROW, run_readme
@@ -65,6 +66,10 @@ def _start_up(_setting: Setting) -> list[Row]:
     return found
 
 
+def _hostile(setting: Setting) -> list[Row]:
+    return hostile(setting, TEMPLATE)
+
+
 def _fuzzed(setting: Setting, names: tuple[str, ...] = tuple(READERS)) -> list[Row]:
     """One row for all readers, and one for each."""
     found = fuzz(list(names), setting, TEMPLATE, _harmful(setting))
@@ -83,6 +88,7 @@ def _fuzzed(setting: Setting, names: tuple[str, ...] = tuple(READERS)) -> list[R
 
 
 PARTS = {
+    "hostile": Part(_hostile, 60, HOSTILE_ROWS, grows=True),
     "fuzz": Part(_fuzzed, 60, (_FUZZED, *map(_fuzz_asked, READERS)), grows=True),
     "start-up": Part(_start_up, 15, tuple(_START_UP.values())),
     "exports": Part(exported, 60, EXPORT_ROWS, grows=True),

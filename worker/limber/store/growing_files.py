@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 
 from limber.core.errors import BranchFolderError, InputError, WorkError
 from limber.core.files.atomic import flush_folder, write_atomically
+from limber.core.files.safe_names import has_other_names
 from limber.core.machine_errors import machine_error
 
 _WRITE_SECONDS = 0.25
@@ -44,6 +45,9 @@ class Stream:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
+            if self.path.exists() and has_other_names(self.path):
+                # An archive can bring a second name of a file elsewhere: that one must not grow.
+                write_atomically(self.path, self.path.read_bytes())
             self.cut_bytes = _cut_torn_line(self.path)
             kept = shorten(stream_lines(self.path)) if shorten and self.path.exists() else None
             if kept is not None:

@@ -27,7 +27,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     """
     from limber.cli.commands.doctor import report
     from limber.core.errors import InputError
-    from limber.core.files.safe_names import is_link
+    from limber.core.files.safe_names import has_other_names, is_link
     from limber.core.json_values import plain
     from limber.store.manifest import MANIFEST
 
@@ -46,12 +46,16 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
         files, names = [source], {source: source.name}
     told["files"] = {names[path]: {"bytes": path.stat().st_size, "sha256": _digest(path)}
                      for path in files}
+    # Neither may what has a second name elsewhere be one of the branch's.
+    kept = {path for path in files if source.is_dir() and has_other_names(path)}
+    told["not_packed"] = sorted(names[path] for path in kept)
     count = 0
     try:
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("report.json", json.dumps(plain(told), indent=1, default=str))
             for path, name in names.items():
-                if name == MANIFEST or (data and path.resolve() != Path(output).resolve()):
+                if path not in kept and (name == MANIFEST or (
+                        data and path.resolve() != Path(output).resolve())):
                     run.progress(count / len(files), name)
                     archive.write(path, f"branch/{name}" if source.is_dir() else name)
                     count += 1

@@ -14,6 +14,7 @@ from limber.core.errors import InputError
 
 _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_. +-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_. +-]*)*")
 """Names that need no closer look: manifests list thousands of them."""
+_MOST_LEVELS = 32
 
 
 def relative_name(name: str) -> str:
@@ -60,9 +61,15 @@ def refuse_links(folder: Path) -> None:
     """Refuse a folder with a link anywhere in it; ``folder`` itself may be one.
 
     Raises:
-        InputError: there is a link; names it.
+        InputError: there is a link, or a folder that is nested too deeply to look for links in it;
+            names it.
     """
+    top = len(Path(folder).parts)
     for place, folders, files in os.walk(folder):
+        if folders and len(Path(place).parts) - top >= _MOST_LEVELS:
+            raise InputError(f"{folder} has folders that are nested more than {_MOST_LEVELS} deep, "
+                             f"as {Path(place).relative_to(folder).as_posix()[:100]}.",
+                             "Limber writes no such folder.", "Remove it.")
         for name in folders + files:
             if is_link(path := Path(place, name)):
                 raise _link_error(path)
@@ -77,6 +84,16 @@ def is_link(path: Path) -> bool:
     junction = getattr(stat, "IO_REPARSE_TAG_MOUNT_POINT", None)
     return stat.S_ISLNK(about.st_mode) or (
         junction is not None and getattr(about, "st_reparse_tag", 0) == junction)
+
+
+def has_other_names(path: Path) -> bool:
+    """Whether a file has a second name (a hard link), which may be outside its folder.
+
+    What replaces a file leaves the other name alone; what changes it in place, or gives it away,
+    must ask first.
+    """
+    about = os.lstat(path)
+    return stat.S_ISREG(about.st_mode) and about.st_nlink > 1
 
 
 def _link_error(path: Path) -> InputError:

@@ -4,6 +4,7 @@
 angles in radians, masses in kilograms. The branch's frame is that of its folder (z up).
 """
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,19 +17,18 @@ from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
 from limber.core.json_values import plain
 from limber.core.numerics.rigid import inverted, matrices
+from limber.robot.cell.plausibility import FAR, slips
 from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
+from limber.robot.ratings import MOST_SPEED, MOST_TURN_SPEED
 from limber.robot.urdf.chain_arm import ENDING
 
 Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]
 
-# Farther than this from anything an arm can do: the number is in another unit.
-_FAR = 20.0
-
 
 def _in_metres(value: tuple[float, ...]) -> tuple[float, ...]:
-    if max(abs(part) for part in value[:3]) > _FAR:
+    if max(abs(part) for part in value[:3]) > FAR:
         raise ValueError(f"is {max(abs(part) for part in value[:3]):g} m away; it may have been "
                          "given in millimetres")
     return value
@@ -69,7 +69,8 @@ class BaseEntry(_Entry):
     pose: Pose = Field(description="Position [m] and rotation vector [rad].")
     position_sigma_m: float = Field(0.005, ge=0, le=0.5)
     rotation_sigma_rad: float = Field(0.01, ge=0, le=0.5)
-    residual_m: float | None = Field(None, ge=0, description="Residual of the calibration [m].")
+    residual_m: float | None = Field(None, ge=0, le=0.5,
+                                     description="Residual of the calibration [m].")
 
     _near = field_validator("pose")(_in_metres)
 
@@ -141,9 +142,9 @@ class SensorEntry(_Entry):
 class LimitsEntry(_Entry):
     """What no motion may exceed; clamped far below what the robot itself allows."""
 
-    speed_m_s: float = Field(0.05, gt=0, le=0.25)
+    speed_m_s: float = Field(0.05, gt=0, le=MOST_SPEED)
     acceleration_m_s2: float = Field(0.3, gt=0, le=2.0)
-    turn_speed_rad_s: float = Field(0.5, gt=0, le=1.5)
+    turn_speed_rad_s: float = Field(0.5, gt=0, le=MOST_TURN_SPEED)
     soft_force_n: float = Field(10.0, gt=0, description="Motion pauses.")
     hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
     hard_torque_nm: float = Field(3.0, gt=0)
@@ -166,8 +167,8 @@ class CameraEntry(_Entry):
 
     pose: Pose
     mount: Literal["branch", "flange"] = Field("branch", description="Frame of the pose.")
-    width: int = Field(640, gt=0)
-    height: int = Field(480, gt=0)
+    width: int = Field(640, gt=0, le=20_000)
+    height: int = Field(480, gt=0, le=20_000)
     focal_px: tuple[float, float] = (600.0, 600.0)
     centre_px: tuple[float, float] = (320.0, 240.0)
     range_m: tuple[float, float] = (0.2, 2.0)
@@ -212,7 +213,7 @@ class BoxEntry(_Entry):
     @field_validator("size_m")
     @classmethod
     def _solid(cls, value: Vector) -> Vector:
-        if min(value) <= 0 or max(value) > _FAR:
+        if min(value) <= 0 or max(value) > FAR:
             raise ValueError("edge lengths must be positive and in metres")
         return value
 
@@ -260,6 +261,12 @@ class Cell(_Entry):
         if limits is not None and len(limits) != count:
             raise ValueError(f"robot.joint_limits_rad has {len(limits)} rows, but a "
                              f"{self.arm.name} has {count} joints")
+        return self
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> "Cell":
+        if told := list(slips(self)):
+            raise ValueError("; ".join(told))
         return self
 
     @property
@@ -329,9 +336,11 @@ def write_cell(path: str | Path, cell: Cell) -> None:
 
 def _told(path: Path, item: dict) -> str:
     place = ".".join(str(part) for part in item["loc"])
-    line = _line_of(path, item["loc"])
-    where = f"{path}, line {line}" if line else f"{path}"
     message = item["msg"].removeprefix("Value error, ")
+    # What several entries together make wrong begins with the name of one.
+    named = tuple(re.match(r"[\w.]+", message)[0].split(".")) if not item["loc"] else item["loc"]
+    line = _line_of(path, named)
+    where = f"{path}, line {line}" if line else f"{path}"
     return f"{where}: {place}: {message}" if place else f"{where}: {message}"
 
 

@@ -8,7 +8,7 @@ safety function and claims no standard: the controller's own limits and the butt
 are what protects people.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -17,6 +17,7 @@ from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
 from limber.robot.interface import Arm, Sample
+from limber.robot.ratings import within_ratings
 
 _RUNNING, _NORMAL, PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
@@ -71,7 +72,7 @@ class GuardSettings:
     """Limits of the guard.
 
     Attributes:
-        limits: The cell's.
+        limits: The cell's. The guard takes what the arm's table allows of them, whoever set them.
         workspace: Box that the grasp stays in, branch frame, or None.
         joint_limits: [rad], shape [6, 2].
         longest_silence: Age at which data is lost [s].
@@ -146,7 +147,12 @@ class Guard:
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings, rate: float):
-        self._arm, self._settings, self._step = arm, settings, 1.0 / rate
+        self._arm, self._step = arm, 1.0 / rate
+        own = np.asarray(arm.joint_limits, float)
+        joints = np.column_stack([np.maximum(settings.joint_limits[:, 0], own[:, 0]),
+                                  np.minimum(settings.joint_limits[:, 1], own[:, 1])])
+        self._settings = replace(settings, limits=within_ratings(arm, settings.limits),
+                                 joint_limits=joints)
         self.state = State.IDLE
         self.reason = ""
         self._memory = _Memory()

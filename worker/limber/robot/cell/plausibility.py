@@ -1,0 +1,150 @@
+"""Slips in a cell file: numbers that no arm and no bench can have, and the slip that is likely.
+
+A number in millimetres, degrees, grams or millinewtons is valid TOML and often still within what
+one entry allows. Held against the arm and against each other most of them show.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.core.numerics.rigid import matrices
+from limber.robot.ratings import greatest_force, greatest_torque
+
+if TYPE_CHECKING:
+    from limber.robot.cell.cell import Cell, SensorEntry
+
+FAR = 20.0
+"""Farther [m] than this from the branch nothing is that an arm works with."""
+_FAR_FROM_ARM = 10.0  # m that the branch's origin may be beyond the arm's reach
+_AT_FLANGE = 1.0  # m; what an arm carries is nearer to its flange
+_WHOLE_TURN = 2 * math.pi + 1e-6
+_DEGREES = 4 * math.pi  # no joint's limit is beyond; in degrees nearly all are
+_LARGEST_RANGE = {"force": 1e4, "torque": 1e3}  # [N], [N m]
+_READABLE = 3.0  # deviations of the force that a limit must be above
+
+
+def slips(cell: "Cell") -> Iterator[str]:
+    """Yield what cannot be in a cell whose entries are valid each: "limits.hard_force_n is ..."."""
+    yield from _joint_slips(cell)
+    yield from _pose_slips(cell)
+    yield from _limit_slips(cell)
+    if cell.sensor.kind != "none":
+        yield from _sensor_slips(cell.sensor, cell.limits.hard_force_n, cell.limits.hard_torque_nm)
+    yield from _camera_slips(cell)
+    yield from _place_slips(cell)
+
+
+def _joint_slips(cell: "Cell") -> Iterator[str]:
+    own = cell.robot.joint_limits_rad
+    if own is None:
+        return
+    for number, (low, high) in enumerate(own):
+        where = f"robot.joint_limits_rad, row {number + 1},"
+        if max(abs(low), abs(high)) > _DEGREES:
+            yield (f"{where} has {low:g} to {high:g} rad, which is over two turns; was it given in "
+                   "degrees?")
+        elif low >= high:
+            yield f"{where} has {low:g} to {high:g} rad; the lower limit comes first"
+        elif (np.diff(cell.joint_limits[number]) <= 2 * cell.limits.joint_margin_rad).any():
+            yield (f"{where} has {low:g} to {high:g} rad, which leaves the joint no angle within "
+                   f"the arm's own limits and the margin of {cell.limits.joint_margin_rad:g} rad")
+
+
+def _pose_slips(cell: "Cell") -> Iterator[str]:
+    reach = cell.arm.reach + _FAR_FROM_ARM
+    poses: list[tuple[str, Any, float]] = [
+        ("base.pose", cell.base.pose, reach), ("tool.grasp_pose", cell.tool.grasp_pose, _AT_FLANGE),
+        ("sensor.pose", cell.sensor.pose, _AT_FLANGE)]
+    if cell.camera is not None:
+        most = _AT_FLANGE if cell.camera.mount == "flange" else FAR
+        poses.append(("camera.pose", cell.camera.pose, most))
+    if cell.second_arm is not None:
+        poses += [("second_arm.base_pose", cell.second_arm.base_pose, reach),
+                  ("second_arm.grasp_pose", cell.second_arm.grasp_pose, _AT_FLANGE)]
+    poses += [(f"obstacles.{number}.pose", one.pose, FAR)
+              for number, one in enumerate(cell.obstacles) if one.kind == "box"]
+    for name, pose, most in poses:
+        yield from _far(name, pose[:3], most)
+        turn = math.hypot(*pose[3:])
+        if turn > _WHOLE_TURN:
+            yield (f"{name} is turned by {turn:g} rad, more than a whole turn; was the rotation "
+                   "given in degrees?")
+    yield from _far("tool.centre_of_mass_m", cell.tool.centre_of_mass_m, _AT_FLANGE)
+    for number, part in enumerate(cell.tool.parts):
+        for end in ("start_m", "end_m"):
+            yield from _far(f"tool.parts.{number}.{end}", getattr(part, end), _AT_FLANGE)
+
+
+def _far(name: str, place: Any, most: float) -> Iterator[str]:
+    distance = math.hypot(*place)
+    if distance > most:
+        yield (f"{name} is {distance:g} m away, farther than the {most:g} m that are possible; "
+               f"{distance / 1000:g} m? Was it given in millimetres?")
+
+
+def _limit_slips(cell: "Cell") -> Iterator[str]:
+    limits, arm = cell.limits, cell.arm
+    for name, value, most, unit in (
+            ("hard_force_n", limits.hard_force_n, greatest_force(arm), "N"),
+            ("hard_torque_nm", limits.hard_torque_nm, greatest_torque(arm), "N m")):
+        if value > most:
+            yield (f"limits.{name} is {value:g}, but a {arm.name} may exert at most {most:.3g} "
+                   f"{unit}; {value / 1000:g} {unit}?")
+    if limits.unexpected_force_n > limits.hard_force_n:
+        yield (f"limits.unexpected_force_n is {limits.unexpected_force_n:g}, more than "
+               f"hard_force_n ({limits.hard_force_n:g}): it would never stop a motion")
+
+
+def _sensor_slips(sensor: "SensorEntry", hard_force: float, hard_torque: float) -> Iterator[str]:
+    for what, unit, hard, spread, span in (
+            ("force", "n", hard_force, sensor.force_sigma_n, sensor.force_range_n),
+            ("torque", "nm", hard_torque, sensor.torque_sigma_nm, sensor.torque_range_nm)):
+        if hard < _READABLE * spread:
+            yield (f"sensor.{what}_sigma_{unit} is {spread:g}, so that limits.hard_{what}_{unit} "
+                   f"({hard:g}) is within its noise; was one of them given in another unit?")
+        if span <= hard:
+            yield (f"sensor.{what}_range_{unit} is {span:g}, but limits.hard_{what}_{unit} is "
+                   f"{hard:g}: the sensor would be at the end of its range before the motion "
+                   "stops")
+        if span > _LARGEST_RANGE[what]:
+            yield (f"sensor.{what}_range_{unit} is {span:g}, which no sensor at a flange has; "
+                   f"{span / 1000:g}?")
+    if sensor.drift_n_per_minute > hard_force:
+        yield (f"sensor.drift_n_per_minute is {sensor.drift_n_per_minute:g}, more than the hard "
+               f"force limit ({hard_force:g} N) in a minute")
+
+
+def _camera_slips(cell: "Cell") -> Iterator[str]:
+    camera = cell.camera
+    if camera is None:
+        return
+    near, far = camera.range_m
+    if not 0 <= near < far <= FAR:
+        yield (f"camera.range_m is {near:g} to {far:g} m; it must rise, from 0 to at most {FAR:g} "
+               "m. Was it given in millimetres?")
+    if not all(0.1 * size < focal < 100 * size for focal, size in
+               zip(camera.focal_px, (camera.width, camera.height), strict=True)):
+        yield (f"camera.focal_px is {camera.focal_px}, which is no focal length of an image of "
+               f"{camera.width} x {camera.height} pixels; was it given in millimetres?")
+    if not all(0 <= at <= size for at, size in
+               zip(camera.centre_px, (camera.width, camera.height), strict=True)):
+        yield (f"camera.centre_px is {camera.centre_px}, outside the image of {camera.width} x "
+               f"{camera.height} pixels")
+
+
+def _place_slips(cell: "Cell") -> Iterator[str]:
+    """What the arm is to reach, against what it reaches from its base."""
+    if cell.workspace is None:
+        return
+    low, high = np.array(cell.workspace.low_m), np.array(cell.workspace.high_m)
+    shoulder = matrices(cell.base.pose) @ np.r_[cell.arm.shoulder, 1.0]
+    away = float(np.linalg.norm(shoulder[:3] - np.clip(shoulder[:3], low, high)))
+    grasp = math.hypot(*cell.tool.grasp_pose[:3])
+    # The flange is beyond the wrist by less than the reach of any arm.
+    most = 1.5 * cell.arm.reach + grasp
+    if away > most:
+        yield (f"workspace is {away:.3g} m from the arm's shoulder, but a {cell.arm.name} reaches "
+               f"{most:.3g} m at most; are base.pose and workspace both in the branch's frame?")
