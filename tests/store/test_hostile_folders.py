@@ -205,6 +205,26 @@ def test_a_second_name_of_a_file_elsewhere_is_left_alone(folder, tmp_path):
         assert json.loads(archive.read("report.json"))["not_packed"] == ["pulls/p/note.txt"]
 
 
+@pytest.mark.parametrize("way", ["folder for a file", "file for a folder"])
+def test_what_is_in_the_way_of_a_commit_stops_it_before_it_begins(folder, way):
+    """An interrupted one stays as it is, a new one leaves no trace."""
+    _interrupt(folder, **{"a.txt": "new", "pulls/p": "new", "z.txt": "new"})
+    if way == "folder for a file":
+        (folder / "pulls/p").mkdir(parents=True)
+    else:
+        (folder / "pulls").write_text("x")
+    before = _state(folder)
+    assert call(["verify", str(folder), "--finish"]) == 2
+    before[str(folder)] = before[str(folder / ".lock")] = None
+    assert {**_state(folder), str(folder): None, str(folder / ".lock"): None} == before
+    shutil.rmtree(folder / ".commit")
+    branch = Branch.open(folder)
+    with pytest.raises(BranchFolderError, match="in the way of the file pulls/p"), \
+            branch.stage("b") as stage:
+        stage.path("pulls/p").write_text("new")
+    assert not (folder / ".commit").exists() and "b" not in Branch.read(folder).manifest.stages
+
+
 def test_endless_folders_are_refused(folder):
     """Links that no path can name any more could hide in them."""
     (folder / "/".join("d" * 40)).mkdir(parents=True)

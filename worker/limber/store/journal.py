@@ -8,6 +8,7 @@ which the stage counts. Then its files are moved into place, the manifest last. 
 import os
 import shlex
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 from limber.core.errors import BranchFolderError
@@ -55,7 +56,12 @@ def commit(folder: Path, work: Path, manifest: Manifest) -> None:
         folder: The branch folder, without a pending commit.
         work: A folder in it with the new files under their names.
         manifest: What ``branch.json`` shall be.
+
+    Raises:
+        BranchFolderError: something that is no file of a branch is in the way; nothing was entered.
     """
+    _require_places(folder, (path.relative_to(work).as_posix() for path in work.rglob("*")
+                             if path.is_file()))
     (work / MANIFEST).write_text(manifest.text(), encoding="utf-8")
     flush_tree(work)
     os.replace(work, folder / _COMMIT)
@@ -67,7 +73,7 @@ def roll_forward(folder: Path) -> None:
     """Finish a pending commit, if any; under the commit lock. Safe to repeat from any point.
 
     Raises:
-        BranchFolderError: a file cannot be replaced.
+        BranchFolderError: a file cannot be replaced, or something else is in its place.
     """
     pending = folder / _COMMIT
     if not pending.is_dir():
@@ -90,6 +96,7 @@ def _move_into_place(folder: Path, pending: Path) -> None:
     new = read_manifest(pending)
     old = read_manifest(folder) if (folder / MANIFEST).exists() else None
     touched = {folder}
+    _require_places(folder, (name for name in new.files if inside(pending, name).is_file()))
     for name in sorted(new.files):
         path = inside(pending, name)
         if not path.is_file():
@@ -100,8 +107,26 @@ def _move_into_place(folder: Path, pending: Path) -> None:
         os.replace(path, target)
         touched |= {place for place in target.parents if place.is_relative_to(folder)}
     for name in set(old.files if old else ()) - set(new.files):
-        inside(folder, name).unlink(missing_ok=True)
+        if (gone := inside(folder, name)).is_file():
+            gone.unlink(missing_ok=True)
     for place in touched:
         flush_folder(place)
     os.replace(pending / MANIFEST, folder / MANIFEST)
     flush_folder(folder)
+
+
+def _require_places(folder: Path, names: Iterable[str]) -> None:
+    """Refuse to enter files where a folder, or a pipe or file in place of a folder, is in the way.
+
+    Asked before the first of them is moved: a commit that stops halfway would never end.
+    """
+    for name in names:
+        path = inside(folder, name)
+        above = [place for place in path.parents if place.is_relative_to(folder)]
+        way = path if path.is_dir() else next(
+            (place for place in above if place.exists() and not place.is_dir()), None)
+        if way is not None:
+            raise BranchFolderError(
+                f"{way} is in the way of the file {name}.",
+                "A branch folder has a file in the place of a folder there, or the reverse.",
+                "Remove it, or get the folder from its source again. Then run this again.")
