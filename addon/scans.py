@@ -22,6 +22,7 @@ class Scan:
         colours: Red, green, blue, alpha from 0 to 1 as on a screen, float32, [n, 4], if it has any.
         extent: Its longest side, in its own unit.
         sha256: Of the file. folder: The branch folder that is, or would be, its own.
+        unit: That the file states, if it does.
     """
 
     points: np.ndarray
@@ -30,11 +31,12 @@ class Scan:
     sha256: str
     folder: Path
     colours: np.ndarray | None = None
+    unit: str | None = None
 
 
 def read_scan(path: Path) -> Scan:
     """Read what is shown of a scan; ValueError as :func:`.clouds.read_points`."""
-    points = clouds.read_points(path)
+    points, unit = clouds.read_points(path)
     low, high = points.min(axis=0), points.max(axis=0)
     middle = np.round((low + high) / 2)
     is_far = np.abs(middle).max() > 100 * max((high - low).max(), 1e-9)
@@ -44,7 +46,7 @@ def read_scan(path: Path) -> Scan:
         colours = np.column_stack([colours / np.float32(255), np.ones(len(colours), np.float32)])
     return Scan((points - offset).astype(np.float32), offset, float((high - low).max()),
                 branch_folder.file_sha256(path),
-                branch_folder.folder_for(path), colours)
+                branch_folder.folder_for(path), colours, unit)
 
 
 class Reading:

@@ -88,6 +88,13 @@ def test_addon_computes_nothing():
     assert not {str(path) for path, names in modules.items() if names & numerical}
 
 
+def test_addon_reads_tables_as_the_worker_does():
+    """Its copy of the file that reads them is the worker's (scripts/make_addon_schema)."""
+    name = "text_columns.py"
+    assert (ROOT / "addon" / name).read_bytes() == (
+        CORE / "core" / "files" / name).read_bytes()
+
+
 def test_benches_need_no_tests():
     """They measure where no tests are; tests may take their subjects."""
     modules = imported_modules(ROOT / "worker" / "benchmarks")

@@ -81,9 +81,11 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         cloud[SCAN_KEY] = scan.sha256
         if scan.offset.any():
             cloud[OFFSET_KEY] = [float(value) for value in scan.offset]
-        guessed = scan.extent > _LONGEST_PLANT_M and (
+        guessed = scan.extent > _LONGEST_PLANT_M and scan.unit is None and (
             not settings.reconstruct.is_property_set("unit"))
-        if guessed:
+        if scan.unit in _METRES:
+            settings.reconstruct.unit = scan.unit
+        elif guessed:
             settings.reconstruct.unit = "mm"
         cloud.scale = [_METRES[settings.reconstruct.unit]] * 3
         settings.reconstruct.cloud = str(path)

@@ -69,18 +69,35 @@ def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, te
     """Coordinates by the header's names, in whatever order; no other column, no unit guessed."""
     path = tmp_path / "scan.csv"
     path.write_text(text, encoding="utf-8")
-    points = importlib.import_module("limber_addon.clouds").read_points(path)
+    points, _ = importlib.import_module("limber_addon.clouds").read_points(path)
     np.testing.assert_allclose(points, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     np.testing.assert_allclose(points, read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
     assert bpy.context.scene.limber.reconstruct.unit == "m"
 
 
+@pytest.mark.parametrize(("name", "text", "unit"), [
+    ("a.csv", "x_mm,y_mm,z_mm\n100,200,300\n400,500,600\n", "mm"),
+    ("a.ply", "ply\nformat ascii 1.0\ncomment unit: mm\nelement vertex 2\nproperty float z\n"
+              "property float x\nproperty float y\nend_header\n300 100 200\n600 400 500\n", "mm"),
+    ("points3D.txt", "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n7 .1 .2 .3 9 8 7 .4 1 5\n"
+                     "9 .4 .5 .6 9 8 7 .4\n", "m"),
+    ("a.asc", "//X Y Z R G B\n2\n.1 .2 .3 9 8 7\n.4 .5 .6 9 8 7\n", "m")])
+def test_the_units_and_files_of_other_programs(bpy, registered, tmp_path, name, text, unit):
+    """A unit that the file states is set, and the points are the worker's."""
+    path = tmp_path / name
+    path.write_text(text)
+    points, _ = importlib.import_module("limber_addon.clouds").read_points(path)
+    np.testing.assert_allclose(points * {"m": 1.0, "mm": 1e-3}[unit], read_cloud(path).points)
+    bpy.ops.limber.import_cloud(filepath=str(path))
+    assert bpy.context.scene.limber.reconstruct.unit == unit
+
+
 def test_lines_of_different_length_are_refused(bpy, registered, tmp_path):
     """COLMAP's points have a track behind them, and their number first: no x."""
     path = tmp_path / "points3D.txt"
     path.write_text("# POINT3D_ID, X, Y, Z, TRACK[]\n7 0.1 0.2 0.3 1 5\n900 0.4 0.5 0.6 1\n")
-    with pytest.raises(RuntimeError, match="a line has 5 values, but the first line has 6"):
+    with pytest.raises(RuntimeError, match="line 3 has 5 values, but the first line has 6"):
         bpy.ops.limber.import_cloud(filepath=str(path))
 
 
@@ -88,7 +105,7 @@ def test_a_header_without_coordinates_is_refused(bpy, registered, tmp_path):
     """No other column is taken for one."""
     path = tmp_path / "scan.csv"
     path.write_text("id,row,column\n0,1,2\n1,2,3\n")
-    with pytest.raises(RuntimeError, match=r"its columns are id, row, column: x, y and z"):
+    with pytest.raises(RuntimeError, match=r"has the columns id, row, column\. x, y and z"):
         bpy.ops.limber.import_cloud(filepath=str(path))
     assert not bpy.data.objects
 

@@ -77,8 +77,8 @@ def _texts(_template: Path, folder: Path) -> list[Path]:
 def _meshes(suffix: str, _template: Path, folder: Path) -> list[Path]:
     import trimesh
 
-    path = folder / f"box{suffix}"
-    trimesh.creation.box((0.1, 0.1, 0.4)).export(path)
+    path = folder / f"ball{suffix}"
+    trimesh.creation.icosphere(subdivisions=3, radius=0.1).export(path)
     return [path]
 
 
@@ -356,15 +356,15 @@ def _read(registry: Registry, _template: Path, path: Path) -> Any:
 
 @cache
 def _addon(name: str) -> Any:
-    """A module of the add-on that needs no Blender."""
-    import importlib.util
+    """A module of the add-on that needs no Blender; its package's own file would need it."""
+    import importlib
     import sys
+    import types
 
-    place = Path(__file__).parents[2] / "addon" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(f"addon_{name}", place)
-    sys.modules[spec.name] = module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    if "addon_files" not in sys.modules:
+        sys.modules["addon_files"] = package = types.ModuleType("addon_files")
+        package.__path__ = [str(Path(__file__).parents[2] / "addon")]
+    return importlib.import_module(f"addon_files.{name}")
 
 
 def _addon_read(module: str, function: str, _template: Path, path: Path) -> Any:

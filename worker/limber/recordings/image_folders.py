@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as, read_json, read_text
 from limber.core.files.safe_names import inside
@@ -14,8 +15,7 @@ from limber.core.numerics.rigid import composed, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.cloud.pixels import read_pixels
-from limber.geometry.io.clouds import read_points
-from limber.recordings.tables import LENGTH_UNITS_M
+from limber.geometry.io.clouds import read_points, unit_of
 
 TUM_DEPTH_SCALE = 5000.0
 CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
@@ -52,17 +52,18 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
         raise InputError(f"{source} has {len(files)} PLY files.",
                          "A folder of frames was expected.", "Give the folder that contains the "
                                                              "frames.")
-    scale, broken = LENGTH_UNITS_M[settings.unit or "m"], []
+    broken = []
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     for index, file in enumerate(files):
         progress(index / len(files), "copying clouds")
         try:
-            read = read_points(file).points
+            read = read_points(file)
         except InputError:
             # A frame that was being written when the recorder stopped.
             broken.append(file.name)
             continue
-        write_frame(folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply", read * scale)
+        write_frame(folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply",
+                    read.points * UNIT_METRES[unit_of(read, settings.unit)[0]])
     if len(files) - len(broken) < 2:
         raise InputError(f"{source}: {len(broken)} of {len(files)} PLY files cannot be read.",
                          "At least two frames are needed.", "Record it again.")

@@ -7,14 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.geometry.cloud.columns import ply_columns, valid_columns
+from limber.core.files.text_columns import three_of
+from limber.geometry.cloud.columns import PARTS, ply_columns, valid_columns
 
 POINTS = "\0points"
 """Name of the coordinates [n, 3] among columns of any name."""
-_AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("X", "Y", "Z"),
-         ("//X", "Y", "Z"))
-_THREE = {"normal": (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("Nx", "Ny", "Nz")),
-          "color": (("red", "green", "blue"), ("r", "g", "b"), ("R", "G", "B"))}
 _LONGEST_TITLE = 1000  # characters of a title that a file's header repeats
 
 
@@ -28,12 +25,16 @@ class Cloud:
             0..255, and whatever scalars the file had.
         not_finite: Number of discarded points whose coordinates are not finite.
         titles: What the file calls an attribute, where its name is another.
+        unit: Of the points, if the file states it: m, cm, mm, um or in.
+        notes: What the user should know of the file.
     """
 
     points: np.ndarray
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
     not_finite: int = 0
     titles: dict[str, str] = field(default_factory=dict)
+    unit: str | None = None
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def from_columns(cls, columns: dict[str, np.ndarray], titles: dict[str, str] | None = None,
@@ -43,19 +44,20 @@ class Cloud:
         Raises:
             InputError: none are called x, y and z.
         """
-        axes = _first(_AXES, columns)
+        names = list(columns)
+        axes = three_of("position", names)
         if axes is None:
             raise InputError(f"The columns are {', '.join(columns)}.", "x, y and z are missing.",
                              "Name the coordinates x, y, z.")
-        used = set(axes)
+        used = {names[k] for k in axes}
         attributes: dict[str, np.ndarray] = {}
-        for target, choices in _THREE.items():
-            if found := _first(choices, columns):
-                attributes[target] = np.stack([columns[name] for name in found], axis=1)
-                used |= set(found)
+        for target in PARTS:
+            if found := three_of(target, names):
+                attributes[target] = np.stack([columns[names[k]] for k in found], axis=1)
+                used |= {names[k] for k in found}
         attributes |= {name: np.ascontiguousarray(values) for name, values in columns.items()
                        if name not in used}
-        points = np.stack([np.asarray(columns[name], np.float64) for name in axes], axis=1)
+        points = np.stack([np.asarray(columns[names[k]], np.float64) for k in axes], axis=1)
         return cls(points, attributes, titles=titles or {})
 
     def __len__(self) -> int:
@@ -96,7 +98,3 @@ class Cloud:
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<",
                 comments=["unit: m", *titles]).write(str(path))
 
-
-def _first(choices: tuple[tuple[str, ...], ...], columns: dict[str, np.ndarray],
-           ) -> tuple[str, ...] | None:
-    return next((names for names in choices if all(name in columns for name in names)), None)

@@ -13,13 +13,16 @@ from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
 from limber.core.files.reading import read_arrays
+from limber.core.files.text_columns import ColumnsError, read_columns, stated_unit
 from limber.geometry.cloud.cloud import POINTS, Cloud
 from limber.geometry.cloud.columns import property_names
-from limber.geometry.io.formats import Format, Registry, starts_with
+from limber.geometry.io.e57 import read_e57
+from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.las import is_packed, las_columns
+from limber.geometry.io.mesh_as_cloud import mesh_notes
 from limber.geometry.io.pcd import read_pcd
 from limber.geometry.io.ply import read_ply
-from limber.geometry.io.text_clouds import read_table
+from limber.geometry.io.ptx import read_ptx
 
 _FARTHEST = 1e15
 """No coordinate lies beyond, whatever its unit."""
@@ -65,34 +68,62 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
 
 
 def read_cloud(path: Path, unit: str = "m") -> Cloud:
-    """Read a cloud of any known format, in metres."""
+    """Read a cloud of any known format, in metres; ``unit`` as for :func:`unit_of`."""
     cloud = read_points(path)
-    return cloud.with_points(cloud.points * UNIT_METRES[unit])
+    return cloud.with_points(cloud.points * UNIT_METRES[unit_of(cloud, unit)[0]])
+
+
+def unit_of(cloud: Cloud, given: str | None) -> tuple[str, list[str]]:
+    """Return the unit of a file's points, and what the user should know of it.
+
+    Args:
+        cloud: As read; its file may state a unit.
+        given: By the user. None and m, which nobody has to give, leave it to the file.
+    """
+    if cloud.unit is None or cloud.unit == given:
+        return given or "m", []
+    if given in (None, "m"):
+        return cloud.unit, [f"The file states that its coordinates are in {cloud.unit}."]
+    return given, [f"The file states that its coordinates are in {cloud.unit}, but --unit {given} "
+                   "was used."]
 
 
 def _read_text(path: Path) -> Cloud:
-    """XYZ, TXT, CSV; see :mod:`limber.geometry.io.text_clouds`."""
-    names, titles, table = read_table(path)
+    """XYZ, TXT, CSV; see :mod:`limber.core.files.text_columns`."""
+    try:
+        read = read_columns(path)
+    except ColumnsError as error:
+        raise InputError(error.seen, error.why, error.fix) from error
     # A column of the same name as one before would take its place.
-    names = property_names(names)
-    return Cloud.from_columns(dict(zip(names, table.T, strict=True)),
-                              dict(zip(names, titles, strict=True)))
+    names = property_names(read.names)
+    cloud = Cloud.from_columns(dict(zip(names, read.values.T, strict=True)),
+                               dict(zip(names, read.titles, strict=True)))
+    return replace(cloud, unit=read.unit, notes=read.notes)
 
 
 def _read_vertices(path: Path) -> Cloud:
     import trimesh
 
     mesh: Any = trimesh.load(path, process=False)
-    if isinstance(mesh, trimesh.Scene):
-        parts = [part.vertices for part in mesh.geometry.values()]
-        points = np.vstack(parts or [np.empty((0, 3))]).astype(float)
-    else:
-        points = np.asarray(mesh.vertices, np.float64)
+    parts = list(mesh.geometry.values()) if isinstance(mesh, trimesh.Scene) else [mesh]
+    points = np.vstack([np.asarray(part.vertices, np.float64) for part in parts]
+                       or [np.empty((0, 3))])
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{path} has vertices of {points.shape[-1]} coordinates.",
                          "A vertex has three coordinates.", "Export it again.")
+    notes = [note for part in parts if isinstance(part, trimesh.Trimesh)
+             for note in mesh_notes(path, part.vertices, part.faces)]
     # STL repeats a vertex in each of its triangles.
-    return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points)
+    return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points,
+                 unit=_commented_unit(path), notes=tuple(notes[:1]))
+
+
+def _commented_unit(path: Path) -> str | None:
+    """The unit that the comments above an OBJ file's vertices state."""
+    if path.suffix.lower() != ".obj":
+        return None
+    lines = head_of(path, 10_000).decode("utf-8", "replace").splitlines()
+    return stated_unit("\n".join(line for line in lines if line.startswith("#")))
 
 
 def _read_arrays(path: Path) -> Cloud:
@@ -118,7 +149,9 @@ CLOUDS = Registry("point cloud", "limber.clouds", [
     Format("PLY", (".ply",), read_ply, check=check_ply, recognises=starts_with(b"ply")),
     Format("PCD", (".pcd",), read_pcd, check=check_pcd,
            recognises=starts_with(b"# .PCD", b"VERSION")),
-    Format("text", (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzrgb"), _read_text),
+    Format("text", (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzrgb", ".tsv"), _read_text),
+    Format("PTX", (".ptx",), read_ptx),
+    Format("E57", (".e57",), read_e57, recognises=starts_with(b"ASTM-E57")),
     Format("LAS", (".las", ".laz"), las_columns, check=check_las, isolated=is_packed,
            recognises=starts_with(b"LASF")),
     Format("vertices of a mesh", (".obj", ".stl", ".off"), _read_vertices),

@@ -1,6 +1,7 @@
 """Clouds as PCD files, of all versions."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.files.declared_sizes import header_bytes
+from limber.core.files.text_columns import stated_unit
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
 
@@ -26,7 +28,9 @@ def read_pcd(path: Path) -> Cloud:
         packed = columns.pop("rgb")
         packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
         columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
-    return Cloud.from_columns(columns, titles)
+    comments = [line for line in header_bytes(path, b"\nDATA")[0].decode(
+        "utf-8", "replace").splitlines() if line.startswith("#")]
+    return replace(Cloud.from_columns(columns, titles), unit=stated_unit("\n".join(comments)))
 
 
 def _stream(path: Path) -> tuple[Any, dict[str, str]]:

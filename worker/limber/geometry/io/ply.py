@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,10 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.files.declared_sizes import header_bytes
+from limber.core.files.text_columns import stated_unit
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
+from limber.geometry.io.mesh_as_cloud import mesh_notes
 
 
 def read_ply(path: Path) -> Cloud:
@@ -21,8 +24,21 @@ def read_ply(path: Path) -> Cloud:
                          "Export it again.")
     table = content["vertex"].data
     names = list(table.dtype.names)
-    return Cloud.from_columns({name: np.asarray(table[name]) for name in names
-                               if table.dtype[name].kind in "iuf"}, titles)
+    cloud = Cloud.from_columns({name: np.asarray(table[name]) for name in names
+                                if table.dtype[name].kind in "iuf"}, titles)
+    comments = "\n".join([*content.comments, *content.obj_info])
+    return replace(cloud, unit=stated_unit(comments),
+                   notes=tuple(mesh_notes(path, cloud.points, _triangles(content))))
+
+
+def _triangles(content: Any) -> np.ndarray:
+    """The first three corners of each face, shape [m, 3]."""
+    if "face" not in content:
+        return np.empty((0, 3), int)
+    faces = content["face"].data
+    lists: Any = next((faces[name] for name in ("vertex_indices", "vertex_index")
+                  if name in (faces.dtype.names or ())), [])
+    return np.array([face[:3] for face in lists if len(face) >= 3], int).reshape(-1, 3)
 
 
 def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:

@@ -16,7 +16,7 @@ from limber.core.errors import Cancelled, InputError, LimberError, WorkError
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
-from limber.geometry.io.clouds import CLOUDS, read_points
+from limber.geometry.io.clouds import CLOUDS, read_points, unit_of
 from limber.geometry.io.formats import listed, suffixes_of
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, write_cylinders
 from limber.geometry.settings import ReconstructSettings
@@ -104,6 +104,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     settings = settings or ReconstructSettings()
     raw = read_points(cloud_path) if camera_path is None else read_depth(
         cloud_path, camera_path, mask_path)
+    unit, unit_notes = unit_of(raw, settings.unit)
+    settings = settings.model_copy(update={"unit": unit})
     branch = Branch.create(folder)
     digests = {"cloud": file_digest(cloud_path)}
     for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
@@ -117,6 +119,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     if not force and branch.is_current("reconstruct", settings, digests=digests):
         return branch.manifest.stages["reconstruct"].result
     warnings: list[str] = []
+    for text in (*raw.notes, *unit_notes):
+        progress.keeping(warnings).warn(text)
     if edits_path is None and not edits and branch.has(EDITS):
         progress.keeping(warnings).warn(
             "The edits in edits.json were not applied, because a skeleton was given.")

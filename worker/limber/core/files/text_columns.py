@@ -1,0 +1,387 @@
+"""Tables of points as text: what their columns are called, in which unit, and their numbers.
+
+Numpy and nothing of Limber: ``addon/text_columns.py`` is a copy, so that worker and add-on read
+alike. ``scripts/make_addon_schema`` makes the copy; a test compares the two.
+"""
+
+import codecs
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+LENGTHS = {**{unit: unit for unit in ("m", "cm", "mm", "um", "in")},
+           **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+           **dict.fromkeys(("centimeter", "centimeters", "centimetre", "centimetres"), "cm"),
+           **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
+           **dict.fromkeys(("micron", "microns", "micrometer", "micrometers", "micrometre",
+                            "micrometres"), "um"), **dict.fromkeys(("inch", "inches"), "in")}
+"""Units of length, by what files call them in small letters."""
+_UNKNOWN_LENGTHS = ("ft", "feet", "foot", "usft", "yd", "km", "dm", "nm", "px", "pixel", "voxel")
+_FORMS = ("{}", "{}coordinate", "{}coord", "coordinate{}", "coord{}", "{}koordinate",
+          "koordinate{}", "{}pos", "{}position", "pos{}", "position{}", "p{}", "point{}",
+          "points{}", "scan{}", "world{}", "local{}")
+_PLANES = (("easting", "northing"), ("east", "north"), ("e", "n"), ("rechtswert", "hochwert"),
+           ("ostwert", "nordwert"), ("ost", "nord"))
+_HEIGHTS = ("height", "elevation", "altitude", "z", "h", "hohe", "hoehe", "alt", "up", "elev")
+ROLES = {
+    "position": (*(tuple(form.format(axis) for axis in "xyz") for form in _FORMS),
+                 *(tuple(f"{word}{k}" for k in range(3)) for word in ("points", "point",
+                                                                     "position", "pos", "xyz")),
+                 *((*plane, height) for plane in _PLANES for height in _HEIGHTS)),
+    "normal": (*(tuple(form.format(axis) for axis in "xyz") for form in ("n{}", "normal{}",
+                                                                        "{}normal", "norm{}")),
+               *(tuple(f"{word}{k}" for k in range(3)) for word in ("normals", "normal"))),
+    "color": (*(tuple(form.format(name) for name in ("red", "green", "blue"))
+                for form in ("{}", "color{}", "colour{}", "diffuse{}")),
+              *(tuple(form.format(name) for name in "rgb") for form in ("{}", "color{}", "col{}")),
+              ("rot", "grun", "blau"), ("rot", "gruen", "blau"), ("rgb0", "rgb1", "rgb2"))}
+"""What three columns of one meaning are called, in :func:`plain` letters; the first that are
+there count."""
+_COUNTERS = ("id", "index", "idx", "nr", "no", "number", "row", "point", "pointid", "pointnumber")
+_MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
+_COLMAP, _HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_STATED = re.compile(r"\b(?:units?|einheit(?:en)?)\b\W{0,3}(?:(?:are|is|in|sind|ist)\b\W{1,2})?"
+                     r"([^\W\d_]+)", re.IGNORECASE)
+_LINES = 20_000
+"""Lines that are read at a stretch: numpy holds the interpreter meanwhile."""
+_MOST_HEAD = 60
+"""Lines above the numbers that are looked at."""
+
+
+class ColumnsError(ValueError):
+    """A table cannot be read: what was ``seen``, ``why`` it is wrong, how to ``fix`` it."""
+
+    def __init__(self, seen: str, why: str, fix: str):
+        self.seen, self.why, self.fix = seen, why, fix
+        super().__init__(f"{seen} {why} {fix}")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A table of points.
+
+    Attributes:
+        names: In lower case, without units; coordinates are x, y, z.
+        titles: As the file has them.
+        values: Shape [n, columns].
+        unit: Of the coordinates, one of the values of :data:`LENGTHS`, if the file states it.
+        notes: What of the file was not used.
+    """
+
+    names: list[str]
+    titles: list[str]
+    values: np.ndarray
+    unit: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+def plain(name: str) -> str:
+    """Return the small letters and digits of a name, without accents."""
+    letters = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]", "", letters)
+
+
+def split_title(title: str, units: Iterable[str]) -> tuple[str, str | None]:
+    """Take the unit off a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``.
+
+    Args:
+        title: Of a column.
+        units: Those that need no brackets at the end, in small letters.
+    """
+    text = title.strip().replace("\u00b5", "u").replace("\u03bc", "u")
+    bracket = re.search(r"[(\[]\s*([^)\]]*?)\s*[)\]]", text)
+    if bracket and bracket.end() == len(text):
+        return text[:bracket.start()].strip(" _"), bracket.group(1) or None
+    if bracket and bracket.group(1).lower() in units:
+        return f"{text[:bracket.start()].strip()} {text[bracket.end():].strip()}", bracket.group(1)
+    end = re.fullmatch(r"(.+?)\s*(?:_|,|(?<!^)/|\s+in\s)\s*([A-Za-z]+)", text, re.DOTALL) or (
+        re.fullmatch(r"(.+)\s([A-Za-z]{2,})", text, re.DOTALL))
+    if end and end.group(2).lower() in units and not text.startswith("/"):
+        return end.group(1).strip(), end.group(2)
+    head, _, tail = text.rpartition("_")
+    return (head, tail) if head and tail.lower() in units else (text, None)
+
+
+def three_of(role: str, names: Sequence[str]) -> tuple[int, int, int] | None:
+    """Return which columns have a role of :data:`ROLES`; None if not all three are there."""
+    for spelt in ([name.lower().lstrip("/#").strip() for name in names],
+                  [plain(name) for name in names]):
+        for one, two, three in ROLES[role]:
+            if one in spelt and two in spelt and three in spelt:
+                return spelt.index(one), spelt.index(two), spelt.index(three)
+    return None
+
+
+def stated_unit(text: str) -> str | None:
+    """Return the unit of length that a comment or a preamble states, if any."""
+    return next((LENGTHS[word.lower()] for word in _STATED.findall(text)
+                 if word.lower() in LENGTHS), None)
+
+
+def decoded(raw: bytes) -> str:
+    """Return the text of a file in UTF-8 or UTF-16; other letters become question marks."""
+    for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+                         (codecs.BOM_UTF16_BE, "utf-16")):
+        if raw.startswith(mark):
+            return raw.decode(coding, errors="replace")
+    return raw.decode("utf-8", errors="replace")
+
+
+def read_columns(path: Path) -> Columns:
+    """Read the columns of a text file.
+
+    Numbers stand between blanks, tabs, commas or semicolons; lines above them may name the columns
+    and state a unit; the number of points may come before the points of each scan; decimals may be
+    commas where commas do not separate.
+
+    Raises:
+        ColumnsError: no numbers, too few columns, coordinates of several or unknown units, or a
+            line that does not fit, which is named.
+    """
+    text = decoded(path.read_bytes()).replace('"', "")
+    if _COLMAP in text[:_HEAD]:
+        return _colmap(path, text)
+    every = [line for line in text.splitlines() if line.strip()]
+    lines = [line for line in every if not _is_comment(line)]
+    if not lines:
+        raise ColumnsError(f"{path} has no lines with numbers.", "A point cloud was expected.",
+                           "Export it again.")
+    comments = [line.lstrip(" #/") for line in every[:_MOST_HEAD] if _is_comment(line)]
+    lines = _without_counts(lines)
+    # What stands above says little of how numbers are written.
+    separator = _separator(lines[len(lines) // 2])
+    first = _first_row(lines, separator)
+    head, lines = lines[:first], lines[first:]
+    if not lines:
+        raise ColumnsError(f"{path} has a header but no points.", "A point cloud was expected.",
+                           "Export it again.")
+    titles = _titles(path, head, lines, separator)
+    used, values, notes = _numbers(path, lines, separator, text, titles)
+    if values.shape[1] < 3:
+        raise ColumnsError(f"{path} has {values.shape[1]} columns.",
+                           "Coordinates need three columns.", "Export it again.")
+    if len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0]):
+        # R's write.table gives no title to its row names.
+        titles = ["", *titles]
+    titles = [titles[k] for k in used] if len(titles) > max(used) else []
+    titles = titles or _commented(comments, separator, values)
+    if len(titles) != values.shape[1]:
+        titles = ["x", "y", "z", *_guessed(values[:, 3:], path.suffix.lower() == ".pts")]
+    names, unit = _named(path, titles)
+    return Columns(names, titles, values, unit or stated_unit("\n".join([*comments, *head])),
+                   notes)
+
+
+def _colmap(path: Path, text: str) -> Columns:
+    """COLMAP's points3D.txt, without the images that saw each point: as many as did."""
+    names = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
+    cut = [" ".join(line.split()[:len(names)]) for line in text.splitlines()]
+    lines = [line for line in cut if line and not _is_comment(line)]
+    if not lines:
+        raise ColumnsError(f"{path} has no points.", "A COLMAP reconstruction was expected.",
+                           "Export it again.")
+    return Columns(names, names, _numbers(path, lines, None, "\n".join(cut), names)[1])
+
+
+def _without_counts(lines: list[str]) -> list[str]:
+    """Lines without those that say how many points follow: first, below titles, at each scan."""
+    start = next((k for k, line in enumerate(lines[:2]) if line.strip().isdigit()), None)
+    if start is None or start + 1 == len(lines):
+        return lines
+    kept = lines[:start]
+    while start < len(lines) and lines[start].strip().isdigit():
+        stop = start + 1 + int(lines[start])
+        kept += lines[start + 1:stop]
+        start = stop
+    return kept + lines[start:]
+
+
+def _counts_up(column: np.ndarray) -> bool:
+    return column[0] in (0, 1) and bool((np.diff(column) == 1).all())
+
+
+def _is_comment(line: str) -> bool:
+    start = line.lstrip()
+    return start.startswith(("#", "%")) or (start.startswith("//") and not start[2:3].isalpha())
+
+
+def _separator(line: str) -> str | None:
+    for mark in (";", "\t"):
+        if mark in line:
+            return mark
+    blanks = line.split()
+    if len(blanks) > 2 and all(_DECIMAL_COMMA.fullmatch(part) for part in blanks):
+        return None
+    return "," if "," in line else None
+
+
+def _parts(line: str, separator: str | None) -> list[str]:
+    parts = [part.strip() for part in line.split(separator)]
+    # Some programs end each line with a separator.
+    return parts[:-1] if len(parts) > 3 and parts[-1] == "" else parts
+
+
+def _number(part: str, commas: bool) -> float | None:
+    """A number of a table, NaN of a word for a missing one, None of another word."""
+    if part.lower() in _MISSING:
+        return float("nan")
+    try:
+        return float(part.replace(",", ".") if commas else part)
+    except ValueError:
+        return None
+
+
+def _first_row(lines: list[str], separator: str | None) -> int:
+    """Index of the first line of numbers."""
+    for index, line in enumerate(lines[:_MOST_HEAD]):
+        parts = _parts(line, separator)
+        numbers = [_number(part, separator != ",") for part in parts]
+        known = [number for number in numbers if number is not None]
+        # In a row of a table a word may stand beside the numbers, never in most places.
+        if len(known) >= max(3, (len(parts) + 1) // 2) and not all(np.isnan(known)):
+            return index
+    return int(any(part[:1].isalpha() for part in _parts(lines[0], separator)))
+
+
+def _titles(path: Path, head: list[str], lines: list[str], separator: str | None) -> list[str]:
+    """Titles of the columns; none where no line above the numbers names coordinates."""
+    for index in reversed(range(len(head))):
+        line = head[index]
+        other = separator if separator is None or separator in line else _separator(line)
+        titles = _parts(line, other)
+        if three_of("position", _bare(titles)) is None:
+            continue
+        units = [part.strip("()[] ") for part in _parts(head[index + 1], other)] if (
+            index + 1 < len(head)) else []
+        if len(units) == len(titles) and any(unit.lower() in LENGTHS for unit in units):
+            return [f"{title} ({unit})" if unit else title
+                    for title, unit in zip(titles, units, strict=True)]
+        return titles
+    last = _parts(head[-1], separator) if head else []
+    if last and len(last) == len(_parts(lines[0], separator)):
+        raise ColumnsError(f"{path} has the columns {', '.join(_bare(last))[:200]}.",
+                           "x, y and z are missing.", "Name the coordinates x, y, z.")
+    return []
+
+
+def _commented(comments: list[str], separator: str | None, values: np.ndarray) -> list[str]:
+    """Titles of a comment that names coordinates and as many columns as there are."""
+    for comment in reversed(comments):
+        for mark in (separator, _separator(comment)):
+            titles = _parts(comment, mark)
+            counts = [k for k, title in enumerate(titles) if plain(title) in _COUNTERS]
+            if len(titles) == values.shape[1] and three_of("position", _bare(titles)) and (
+                    (values[:, counts] % 1 == 0).all()):
+                return titles
+    return []
+
+
+def _bare(titles: Iterable[str]) -> list[str]:
+    """Titles without units of length, in small letters."""
+    found = []
+    for title in titles:
+        name, unit = split_title(title.lower().lstrip("/#").strip(), LENGTHS)
+        is_length = unit is not None and unit in (*LENGTHS, *_UNKNOWN_LENGTHS)
+        found.append(name if is_length else title.lower().lstrip("/#").strip())
+    return found
+
+
+def _named(path: Path, titles: list[str]) -> tuple[list[str], str | None]:
+    """Names of columns, and the unit of the coordinates if their titles state it."""
+    names = _bare(titles)
+    axes = three_of("position", names)
+    if axes is None:
+        return names, None
+    units = {split_title(titles[k].lower(), LENGTHS)[1] for k in axes}
+    for k, axis in zip(axes, "xyz", strict=True):
+        names[k] = axis
+    if units == {None}:
+        return names, None
+    found = {LENGTHS.get(unit or "") for unit in units}
+    if len(found) > 1 or None in found:
+        raise ColumnsError(f"{path}: the coordinates are called "
+                           f"{', '.join(titles[k] for k in axes)}.",
+                           "They must have one unit, out of m, cm, mm, um and in.",
+                           "Convert the columns, or correct their titles.")
+    return names, found.pop()
+
+
+def _numbers(path: Path, lines: list[str], separator: str | None, text: str,
+             titles: Sequence[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
+    """Which columns are numbers, those, and what the others are."""
+    commas = separator != ","
+    ending = separator is not None and lines[0].rstrip().endswith(separator)
+    parts = []
+    try:
+        # A part at a time: copies of all would take several times the file's size.
+        for start in range(0, len(lines), _LINES):
+            rows = lines[start:start + _LINES]
+            clean = (line.replace(",", ".") for line in rows) if commas else iter(rows)
+            if ending:
+                clean = (line.rstrip().removesuffix(separator or "") for line in clean)
+            parts.append(np.loadtxt(clean, delimiter=separator, ndmin=2))
+        values = np.concatenate(parts)
+        return list(range(values.shape[1])), values, ()
+    except ValueError:
+        pass
+    return _with_words(path, lines, separator, text, titles)
+
+
+def _with_words(path: Path, lines: list[str], separator: str | None, text: str,
+                titles: Sequence[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
+    """The numbers of a table that has missing ones, or columns of words beside named ones."""
+    width = len(_parts(lines[0], separator))
+    rows = [[_number(part, separator != ",") for part in _parts(line, separator)]
+            for line in lines]
+    sample = [row for row in rows[:_MOST_HEAD] if len(row) == width]
+    axes = three_of("position", _bare(titles)) if len(titles) == width else None
+    words = [k for k in range(width) if axes is not None and k not in axes
+             and all(row[k] is None for row in sample)]
+    for line, row in zip(lines, rows, strict=True):
+        parts = _parts(line, separator)
+        if len(row) != width:
+            raise ColumnsError(f"{path}, line {_place(text, line)} has {len(row)} values, but the "
+                               f"first line has {width}.", "The file may be truncated.",
+                               "Export it again, or correct that line.")
+        bad = next((k for k in range(width) if k not in words and row[k] is None), None)
+        if bad is not None:
+            raise ColumnsError(f"{path}, line {_place(text, line)}: {parts[bad].strip()[:30]!r} is "
+                               "not a number.",
+                               "Each line of a cloud holds the numbers of one point.",
+                               "Correct that line.")
+    used = [k for k in range(width) if k not in words]
+    notes = tuple(f"Column {titles[k]!r} holds words and was not read." for k in words)
+    return used, np.array([[row[k] for k in used] for row in rows], float), notes
+
+
+def _place(text: str, line: str) -> int:
+    return text.splitlines().index(line) + 1
+
+
+def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:
+    """Names of unnamed columns [n, k] after x, y, z, as scanners and CloudCompare order them.
+
+    Of four, a scanner writes intensity and colour, CloudCompare colour and a scalar: where their
+    values do not tell, ``intensity_first`` does.
+    """
+    count = extra.shape[1]
+    if count == 3:
+        return ["red", "green", "blue"]
+    if count == 4:
+        before, after = _are_bytes(extra[:, :3]), _are_bytes(extra[:, 1:])
+        if after and (intensity_first or not before):
+            return ["intensity", "red", "green", "blue"]
+        if before:
+            return ["red", "green", "blue", "scalar_0"]
+    if count == 6:
+        return ["red", "green", "blue", "nx", "ny", "nz"]
+    return [f"scalar_{k}" for k in range(count)]
+
+
+def _are_bytes(columns: np.ndarray) -> bool:
+    return bool(((columns >= 0) & (columns <= 255) & (columns % 1 == 0)).all())
