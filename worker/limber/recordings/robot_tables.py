@@ -31,6 +31,11 @@ _ALIASES = {
        for k, a in enumerate("xyz")},
     **{f"t{a}_nm": (f"t{a}", f"m{a}", f"torque{a}", f"actualtcpforce{k}")
        for k, a in enumerate("xyz", 3)}}
+_QUATERNION = {f"q{a}": f"orientation{a}" for a in "xyzw"}
+_IN_TOPICS = {**{f"{a}_m": f"position{a}" for a in "xyz"},
+              **{f"f{a}_n": f"force{a}" for a in "xyz"},
+              **{f"t{a}_nm": f"torque{a}" for a in "xyz"}}
+"""How the names of ROS messages end, whatever topic stands before them."""
 _UNITS = {"m": (LENGTH_UNITS_M, "m"), "rad": (ANGLE_UNITS_RAD, "rad"),
           "n": (FORCE_NAMES_N, "N"), "nm": (TORQUE_UNITS_NM, "Nm")}
 
@@ -52,7 +57,7 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
     """
     table = read_table(path)
     stream = time_stream(table, rate_hz)
-    titles = [split_title(title) for title in stream.columns]
+    titles = _known([split_title(title) for title in stream.columns])
     values, warnings = {}, list(stream.warnings)
     for name, aliases in _ALIASES.items():
         at = next((k for k, title in enumerate(titles) if title.plain in aliases), None)
@@ -71,9 +76,30 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
 
 def is_robot_table(titles: list[Title]) -> bool:
     """Return whether the columns hold a gripper's position and force, as a robot's log does."""
-    plain = {title.plain for title in titles}
+    plain = {title.plain for title in _known(titles)}
     return all(plain & set(_ALIASES[name]) for name in (*POSE_COLUMNS[:3],
                                                              *WRENCH_COLUMNS[:3]))
+
+
+def _known(titles: list[Title]) -> list[Title]:
+    """Titles of ROS topics and of TUM's trajectories by our names."""
+    plain = [title.plain for title in titles]
+    if {"tx", "ty", "tz", "qx", "qy", "qz", "qw"} <= set(plain) and not {"x", "px"} & set(plain):
+        # TUM's translation; with no quaternion it is a torque.
+        ours = {f"t{a}": f"p{a}" for a in "xyz"}
+        return [Title(ours.get(title.plain, title.name), title.unit) for title in titles]
+    renamed = list(titles)
+    for name, aliases in _ALIASES.items():
+        end = _IN_TOPICS.get(name)
+        if end and not set(aliases) & set(plain):
+            at = next((k for k, letters in enumerate(plain) if letters.endswith(end)), None)
+            if at is not None:
+                renamed[at] = Title(aliases[0], titles[at].unit)
+    for ours, end in _QUATERNION.items():
+        at = next((k for k, letters in enumerate(plain) if letters.endswith(end)), None)
+        if at is not None and ours not in plain:
+            renamed[at] = Title(ours, None)
+    return renamed
 
 
 def _scale(name: str, title: Title, force_unit: str | None, path: Path) -> float:

@@ -7,30 +7,45 @@ Stamp" and count it in milliseconds; here they become streams in SI units, at th
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from limber.core.constants import FORCE_UNITS_N
+from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
 from limber.core.errors import InputError
+from limber.core.files import text_columns
+from limber.core.files.text_columns import LENGTHS, plain
+from limber.recordings.table_parts.capture_titles import capture_preamble
+from limber.recordings.table_parts.clocks import (
+    TIME_UNITS_S,
+    in_seconds,
+    is_time,
+    unit_in_name,
+)
+from limber.recordings.table_parts.rows import (
+    fields_of,
+    first_numbers,
+    is_clock,
+    number_of,
+    section_of,
+    separator_of,
+    text_of,
+    words_in,
+)
 from limber.recordings.time_series import Stream, in_order
 
-LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "metres": 1.0,
-                  "meters": 1.0, "millimetres": 1e-3, "millimeters": 1e-3, "inch": 0.0254}
+LENGTH_UNITS_M = {spelt: UNIT_METRES[unit] for spelt, unit in LENGTHS.items()}
 FORCE_NAMES_N = FORCE_UNITS_N | {
     "newton": 1.0, "newtons": 1.0, "lb": FORCE_UNITS_N["lbf"], "kg": FORCE_UNITS_N["kgf"],
     **dict.fromkeys(("g", "gram", "grams"), FORCE_UNITS_N["gf"])}
 """Also what titles call them."""
-TIME_UNITS_S = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3,
-                "msec": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 ANGLE_UNITS_RAD = {"rad": 1.0, "deg": np.pi / 180}
 TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
 
 _UNITS = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
                                     *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
-_TIME_NAME = r"t|time|times|timestamp|timestamps|elapsed|elapsedtime|clock"
-_EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
+_COUNTERS = r"frames?|samples?|index|framenumber"
 
 
 @dataclass
@@ -40,14 +55,21 @@ class Table:
     Attributes:
         path: The file.
         titles: Of the columns, as written (a row of units below them is joined in brackets).
-        values: Shape [n, columns]; NaN in cells without a number.
+        values: Shape [n, columns]; NaN in cells without a number. Dates and times of day are
+            seconds.
         warnings: What was wrong.
+        clocks: Columns that were dates or times of day.
+        rate_hz: Frames per second, if the file states it.
+        unit: Of lengths whose titles have none, if the file states it.
     """
 
     path: Path
     titles: list[str]
     values: np.ndarray
     warnings: list[str] = field(default_factory=list)
+    clocks: tuple[int, ...] = ()
+    rate_hz: float | None = None
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -60,7 +82,7 @@ class Title:
     @property
     def plain(self) -> str:
         """Lower-case letters and digits alone."""
-        return re.sub(r"[^a-z0-9]", "", self.name.lower())
+        return plain(self.name)
 
 
 def read_table(path: str | Path) -> Table:
@@ -70,32 +92,41 @@ def read_table(path: str | Path) -> Table:
         InputError: it cannot be read, has no row of numbers, or no header above them.
     """
     path = Path(path)
-    text = _text(path)
-    lines = [line for line in text.splitlines() if line.strip()]
+    text = text_of(path)
+    lines = section_of(text.splitlines())
     bare = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
     comments = [line.lstrip()[1:].strip() for line in lines if line not in bare]
-    separator = _separator(bare)
-    rows = [_fields(line, separator) for line in bare]
-    first, width = _first_numbers(path, rows)
-    titles = _titles(rows[:first], comments, width, separator)
+    separator = separator_of(bare)
+    rows = [fields_of(line, separator) for line in bare]
+    first, width = first_numbers(path, rows)
+    capture = capture_preamble(rows[:first], width)
+    titles = capture.titles or _titles(rows[:first], comments, width, separator)
     if titles is None:
         raise InputError(f"{path} has no header line with {width} column names.",
                          "The columns cannot be identified without names.",
                          "Add a first line such as t_s,x_m,y_m,z_m.")
-    table = Table(path, titles, np.empty((0, width)))
-    table.values = _numbers(table, bare[first:], rows[first:], text.endswith(("\n", "\r")))
-    return table
+    table = Table(path, titles, np.empty((0, width)), rate_hz=capture.rate_hz,
+                  unit=capture.unit or text_columns.stated_unit("\n".join(comments)))
+    words = words_in(rows[first])
+    table.clocks = tuple(k for k, part in enumerate(rows[first]) if is_clock(part))
+    table.values = _numbers(table, bare[first:], rows[first:], text.endswith(("\n", "\r")), words)
+    return _without_words(table, words)
+
+
+def _without_words(table: Table, words: list[int]) -> Table:
+    """The table without its columns of words."""
+    if not words:
+        return table
+    kept = [k for k in range(len(table.titles)) if k not in words]
+    table.warnings.append(f"{table.path.name}: columns of words are not used: "
+                          f"{', '.join(table.titles[k] for k in words)}.")
+    return replace(table, titles=[table.titles[k] for k in kept], values=table.values[:, kept],
+                   clocks=tuple(kept.index(k) for k in table.clocks))
 
 
 def split_title(title: str) -> Title:
-    """Take the unit off a column's name: ``Force (N)``, ``x [mm]``, ``tip1_x_m``, ``Time_ms``."""
-    bracket = re.search(r"[(\[]\s*([^)\]]*)\s*[)\]]\s*$", title)
-    if bracket:
-        return Title(title[:bracket.start()].strip(), bracket.group(1).strip() or None)
-    head, _, tail = title.strip().rpartition("_")
-    if head and tail.lower() in _UNITS:
-        return Title(head, tail)
-    return Title(title.strip(), None)
+    """Take the unit off a column's name, see :func:`limber.core.files.text_columns.split_title`."""
+    return Title(*text_columns.split_title(title, _UNITS))
 
 
 def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -> float:
@@ -117,8 +148,8 @@ def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -
 
 def time_column(table: Table) -> int | None:
     """Return which column holds times, if any."""
-    return next((k for k, title in enumerate(table.titles)
-                 if re.fullmatch(_TIME_NAME, split_title(title).plain)), None)
+    return next((k for k, title in enumerate(table.titles) if is_time(split_title(title).name)),
+                None)
 
 
 def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
@@ -130,13 +161,18 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
     titles = [split_title(title) for title in table.titles]
     at = time_column(table)
     warnings = list(table.warnings)
-    if at is not None:
-        times = table.values[:, at] * scale_of(titles[at], TIME_UNITS_S, "s", table.path)
-        if titles[at].unit is None:
-            warnings += _suspicious_clock(table.path, times)
+    rate_hz = rate_hz or table.rate_hz
+    used: tuple[int, ...] = ()
+    if (parts := _split_stamps(titles)) and (at is None or at in parts):
+        used = parts
+        times = table.values[:, parts[0]] + 1e-9 * table.values[:, parts[1]]
+    elif at is not None:
+        times, notes, used = _stamps(table, titles, at)
+        warnings += notes
     elif rate_hz is not None:
-        at = next((k for k, title in enumerate(titles)
-                   if re.fullmatch(r"frames?|samples?|index|framenumber", title.plain)), None)
+        at = next((k for k, title in enumerate(titles) if re.fullmatch(_COUNTERS, title.plain)),
+                  None)
+        used = () if at is None else (at,)
         count = np.arange(len(table.values)) if at is None else table.values[:, at]
         times = (count - np.nanmin(count)) / rate_hz
     else:
@@ -144,12 +180,36 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
             f"{table.path} has the columns {', '.join(table.titles)}.",
             "No column is named time (t_s, Time (ms), timestamp, ...).",
             "Rename the column of time stamps, or give --rate-hz.")
-    kept = [k for k in range(len(titles)) if k != at]
+    kept = [k for k in range(len(titles)) if k not in used]
     times, values = in_order(table.path, times, table.values[:, kept], warnings)
     if len(times) < 2:
         raise InputError(f"{table.path} has {len(times)} complete rows.",
                          "A pull needs at least two samples.", "Record it again.")
     return Stream(times, values, tuple(table.titles[k] for k in kept), tuple(warnings))
+
+
+def _stamps(table: Table, titles: list[Title], at: int,
+            ) -> tuple[np.ndarray, list[str], tuple[int, ...]]:
+    """Times [s] of a column of stamps, what was assumed of them, and which columns they are."""
+    title, values = titles[at], table.values[:, at]
+    other = next((k for k in table.clocks if k != at and is_time(titles[k].name)), None)
+    if at in table.clocks and other is not None:
+        # A date and the time of that day.
+        return values + table.values[:, other], [], (at, other)
+    unit = title.unit or unit_in_name(title.name)
+    if unit is not None and at not in table.clocks:
+        scale_of(title, TIME_UNITS_S, unit, table.path)
+    times, notes = in_seconds(f"{table.path}: the column {title.name!r}", values,
+                              unit.lower() if unit else None, at in table.clocks)
+    return times, notes, (at,)
+
+
+def _split_stamps(titles: list[Title]) -> tuple[int, int] | None:
+    """The columns of a ROS stamp: seconds, and nanoseconds beside them."""
+    names = [title.plain for title in titles]
+    whole = next((k for k, name in enumerate(names) if re.search(r"stampsecs?$", name)), None)
+    part = next((k for k, name in enumerate(names) if re.search(r"stampn(ano)?secs?$", name)), None)
+    return None if whole is None or part is None else (whole, part)
 
 
 def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | None = None,
@@ -167,7 +227,8 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     Raises:
         InputError: no marker has all three coordinates.
     """
-    stream = time_stream(read_table(path), rate_hz)
+    table = read_table(path)
+    stream = time_stream(table, rate_hz)
     places = _places(stream.columns)
     whole = {label: at for label, at in places.items() if set(at) == set("xyz")}
     if not whole:
@@ -176,8 +237,8 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
                          "Name them LABEL_x_m, LABEL_y_m, LABEL_z_m.")
     used = [at[letter] for at in whole.values() for letter in "xyz"]
     scales = [LENGTH_UNITS_M[unit] if unit else
-              scale_of(split_title(stream.columns[k]), LENGTH_UNITS_M, "m", Path(path))
-              for k in used]
+              scale_of(split_title(stream.columns[k]), LENGTH_UNITS_M, table.unit or "m",
+                       Path(path)) for k in used]
     halves = [k for label, at in places.items() if label not in whole for k in at.values()]
     named = {k for at in places.values() for k in at.values()}
     ignored = [title for k, title in enumerate(stream.columns) if k not in named]
@@ -228,73 +289,13 @@ def _bare(label: str) -> str:
     return re.sub(r"[^a-z0-9]", "", label.rsplit(":", 1)[-1].lower())
 
 
-def _text(path: Path) -> str:
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
-                         "Check the path and the file.") from error
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return raw.decode("utf-16", errors="replace")
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    if "\x00" in text:
-        raise InputError(f"{path} is not a text file.", "A table of numbers was expected.",
-                         "Export it as CSV.")
-    return text
-
-
-def _separator(lines: list[str]) -> str | None:
-    """The sign between fields; None is white space."""
-    sample = lines[-20:]
-    for sign in ("\t", ";", ","):
-        counts = [line.count(sign) for line in sample]
-        # The last line may be cut short.
-        if counts and np.median(counts) >= 1 and (
-                np.mean(np.array(counts[:-1] or counts) == np.median(counts)) > 0.6):
-            return sign
-    return None
-
-
-def _fields(line: str, separator: str | None) -> list[str]:
-    parts = line.split(separator) if separator else line.split()
-    return [part.strip().strip('"').strip() for part in parts]
-
-
-def _number(text: str, comma: bool) -> float | None:
-    if text.lower() in _EMPTY:
-        return np.nan
-    try:
-        number = float(text.replace(",", ".") if comma else text)
-    except ValueError:
-        return None
-    return None if np.isinf(number) else number
-
-
-def _first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
-    """Index of the first row of numbers, and how many fields the rows have."""
-    for index, row in enumerate(rows):
-        parsed = [_number(part, True) for part in row]
-        known = [value for value in parsed if value is not None and np.isfinite(value)]
-        follows = rows[index + 1] if index + 1 < len(rows) else row
-        # A preamble (NO_OF_FRAMES 600) has numbers too, but never two rows of several alike.
-        if len(row) > 1 and None not in parsed and len(known) > len(row) // 2 and (
-                len(follows) == len(row) or index + 2 >= len(rows)):
-            return index, len(row)
-    raise InputError(f"{path} has no row of numbers." if rows else f"{path} is empty.",
-                     "A header and rows of numbers were expected.",
-                     "Check the file, or export it again.")
-
-
 def _titles(above: list[list[str]], comments: list[str], width: int, separator: str | None,
             ) -> list[str] | None:
     """The lowest line above the numbers with as many names; a line of units below it joins in."""
     fitting = [row for row in above if len(row) == width and _is_named(row)]
     if not fitting:
         fitting = [row for comment in comments
-                   if len(row := _fields(comment, separator)) == width and _is_named(row)]
+                   if len(row := fields_of(comment, separator)) == width and _is_named(row)]
     if not fitting:
         return None
     units = _units(fitting[-1]) if len(fitting) > 1 else None
@@ -305,7 +306,7 @@ def _titles(above: list[list[str]], comments: list[str], width: int, separator: 
 
 
 def _is_named(row: list[str]) -> bool:
-    words = [part for part in row if part and _number(part, True) is None]
+    words = [part for part in row if part and number_of(part, True) is None]
     return len(words) >= max(1, (len(row) + 1) // 2)
 
 
@@ -314,12 +315,13 @@ def _units(row: list[str]) -> list[str] | None:
     return bare if all(not part or part.lower() in _UNITS for part in bare) else None
 
 
-def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool) -> np.ndarray:
+def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool,
+             words: list[int]) -> np.ndarray:
     name, width = table.path.name, len(table.titles)
     comma = any(re.fullmatch(r"-?\d+,\d+", part) for row in rows[:50] for part in row)
     kept, bad = [], []
     for index, row in enumerate(rows):
-        numbers = [_number(part, comma) for part in row]
+        numbers = [np.nan if k in words else number_of(part, comma) for k, part in enumerate(row)]
         # A separator at the line's end makes an empty field.
         if len(numbers) == width + 1 and row[-1] == "":
             numbers = numbers[:-1]
@@ -340,11 +342,3 @@ def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bo
         table.warnings.append(f"{name}: {len(bad)} row(s) without {width} numbers were discarded. "
                               f"The first is {lines[bad[0]][:40]!r}.")
     return np.array(kept, float).reshape(-1, width)
-
-
-def _suspicious_clock(path: Path, times: np.ndarray) -> list[str]:
-    step = float(np.median(np.diff(times[np.isfinite(times)]))) if len(times) > 2 else 0.0
-    if step < 1.0 or np.any(times != np.round(times)):
-        return []
-    return [f"{path.name}: the time column does not state a unit and has steps of {step:g}. "
-            "Seconds are assumed. If it is in milliseconds, rename the column to t_ms."]

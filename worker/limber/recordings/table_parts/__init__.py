@@ -1,0 +1,1 @@
+"""What tables of other programs need beside their numbers: clocks, and titles of several rows."""
