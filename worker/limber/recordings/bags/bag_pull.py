@@ -12,6 +12,7 @@ from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, write_camera
 from limber.recordings.bags.bag_reader import Bag, Topic
+from limber.recordings.bags.stamps import stamped
 from limber.recordings.bags.transforms import Frames, Motion
 from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into, write_frame
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, Observations
@@ -60,10 +61,11 @@ def pull_of_bag(bag: Bag, folder: Path, settings: ImportSettings,
             no moment in common.
     """
     clock = "stamps" if settings.bag_clock == "header" else "logged"
+    warnings: list[str] = []
+    bag = stamped(bag, clock, warnings)
     frames = Frames(bag.of("transform"), clock)
     wrench = _chosen(bag, "wrench", settings.wrench_topic, "--wrench-topic",
                      "Stiffness cannot be estimated without a measured force.")
-    warnings: list[str] = []
     if bag.broken:
         warnings.append(f"{bag.path.name}: {bag.broken} messages could not be decoded and were "
                         "discarded.")
