@@ -93,6 +93,42 @@ def test_servo_follows_its_target_a_lookahead_behind(registers, lookahead):
     assert not np.any(controller.speeds)
 
 
+def stream(registers, slider, seconds=2.0, speed=0.1, every=1):
+    """A stream of joint targets that move steadily; returns how far the arm came [rad]."""
+    controller = registers.controller
+    controller.slider = slider(0.0) if callable(slider) else slider
+    home, target = np.array(ARMS["ur5e"].home), 0.0
+    for k in range(round(seconds / controller.seconds)):
+        if callable(slider):
+            controller.slider = slider(k * controller.seconds)
+        if k % every == 0:
+            target = speed * (k + every) * controller.seconds
+            registers.write(SERVO_JOINTS, *(home + [target, 0, 0, 0, 0, 0]), 0, 0, 0.002, 0.1, 300)
+            controller.write_inputs({"input_int_register_0": 0})
+        controller.step()
+    return controller.joints[0] - home[0]
+
+
+@pytest.mark.parametrize(("slider", "speed", "every", "way"), [
+    (1.0, 0.1, 1, 0.19), (0.5, 0.1, 1, 0.095), (0.0, 0.1, 1, 0.0), (0.25, -0.2, 1, -0.095),
+    (0.5, 0.1, 4, 0.095)])
+def test_the_slider_slows_a_stream_of_targets(registers, slider, speed, every, way):
+    """servoj goes at that fraction of the targets' speed, as the drivers of ROS report."""
+    assert stream(registers, slider, speed=speed, every=every) == pytest.approx(
+        way, abs=2e-3 if way else 1e-12)
+
+
+def test_the_slider_in_the_middle_of_a_stream(registers):
+    """At 0 the arm stays; at 1 again it makes up for what it lost."""
+    halted = stream(registers, lambda now: 1.0 if now < 1.0 else 0.0)
+    assert halted == pytest.approx(0.1, abs=2e-3)
+
+
+def test_a_slowed_arm_makes_up_for_its_lag(registers):
+    caught = stream(registers, lambda now: 0.5 if now < 1.0 else 1.0)
+    assert caught == pytest.approx(0.19, abs=2e-3)
+
+
 def test_speed_motion_ramps_up_and_stays(registers):
     registers.write(SPEED, 0, 0.05, 0, 0, 0, 0.1, 0.5, 0)
     registers.controller.write_inputs({"input_int_register_0": 0})

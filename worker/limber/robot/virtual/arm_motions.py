@@ -146,18 +146,43 @@ class Braking:
 
 
 class Servo:
-    """Follows a target that is set anew at any rate (servoj)."""
+    """Follows a target that is set anew at any rate (servoj).
+
+    The controller scales the time of its own motion by the speed slider, so below 1 the arm goes
+    after the target at that fraction of the target's speed and falls behind; it makes up for that
+    as soon as the slider is at 1 again.
+    """
 
     def __init__(self) -> None:
         self.finished = False
         self.target = np.zeros(6)
         self.gain, self.lookahead = 300.0, 0.1
+        self._last: np.ndarray | None = None
+        self._led, self._since, self._pace = np.zeros(6), 0.0, 0.0
 
     def step(self, joints: np.ndarray, speeds: np.ndarray, seconds: float, scale: float,
              ) -> tuple[np.ndarray, np.ndarray]:
-        # The slider does not slow servoj down: its targets carry their own time.
-        return servo_step(joints, speeds, self.target, self.gain, self.lookahead, seconds,
-                          JOINT_ACCELERATION)
+        return servo_step(joints, speeds, self._goal(joints, seconds, scale), self.gain,
+                          self.lookahead, seconds, JOINT_ACCELERATION)
+
+    def _goal(self, joints: np.ndarray, seconds: float, scale: float) -> np.ndarray:
+        """Where the arm is led to now [rad], with the slider at ``scale``."""
+        if self._last is None:
+            self._last = self._led = joints.copy()
+        self._since += seconds
+        moved = float(np.abs(self.target - self._last).max())
+        if moved > 0.0:
+            # Targets may come less often than steps.
+            self._pace, self._since = moved / self._since, 0.0
+            self._last = self.target.copy()
+        if scale >= 1.0:
+            self._led = self.target.copy()
+            return self._led
+        way = self.target - self._led
+        farthest = float(np.abs(way).max())
+        if farthest > 0.0:
+            self._led = self._led + way * min(1.0, scale * self._pace * seconds / farthest)
+        return self._led
 
 
 class SpeedMotion:
