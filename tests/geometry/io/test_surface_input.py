@@ -130,3 +130,44 @@ def test_refused_surfaces_leave_no_folder(tmp_path, capsys):
         mesh_surface(tmp_path / "text.stl", tmp_path / "b.branch")
     with pytest.raises(InputError, match="no file"):
         mesh_surface(tmp_path / "none.stl", tmp_path / "b.branch", MeshSurfaceSettings())
+
+
+REPORTED = Path(__file__).parents[4] / "shared" / "data" / "reports"
+
+
+def test_the_reported_bar_of_blender():
+    """A closed bar whose vertices are split by their normals: 0.4 x 0.02 x 0.02 m."""
+    path = REPORTED / "15-blender-cylinder-open-edges" / "blender_bar.obj"
+    if not path.exists():
+        pytest.skip("the reports are not beside this checkout")
+    surface, _ = usable_surface(Surface.read(path), path)
+    assert surface.volume == pytest.approx(1.6e-4)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("shape", [trimesh.creation.cylinder(0.01, 0.4, sections=32),
+                                   trimesh.creation.icosphere(2, 0.1)])
+def test_vertices_split_by_normals_and_textures_are_one(tmp_path, shape, smooth):
+    """Programs write a corner once for each normal and texture coordinate that it has."""
+    lines = ["o Part", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in shape.vertices[
+        shape.faces.ravel()])]
+    for k, normal in enumerate(shape.face_normals):
+        lines += [f"vn {normal[0]:.4f} {normal[1]:.4f} {normal[2]:.4f}", f"vt 0.{k % 10} 0.5"]
+    lines.append("s 1" if smooth else "s off")
+    lines += ["f " + " ".join(f"{3 * k + c + 1}/{k + 1}/{k + 1}" for c in range(3))
+              for k in range(len(shape.faces))]
+    (tmp_path / "a.obj").write_text("\n".join(lines) + "\n")
+    surface, _ = usable_surface(Surface.read(tmp_path / "a.obj"), FILE)
+    assert surface.volume == pytest.approx(shape.volume, rel=1e-3)
+    assert len(surface.vertices) == len(shape.vertices)
+
+
+def test_vertices_that_few_digits_moved_apart_are_united(tmp_path):
+    """An STL of six digits: each triangle has its own corners, a little off the others'."""
+    shape = trimesh.creation.cylinder(0.01, 0.4, sections=32)
+    corners = shape.vertices[shape.faces.ravel()]
+    corners = corners + np.random.default_rng(2).uniform(-4e-7, 4e-7, corners.shape)
+    surface, warnings = usable_surface(
+        Surface(corners, np.arange(len(corners)).reshape(-1, 3)), FILE)
+    assert surface.volume == pytest.approx(shape.volume, rel=1e-3)
+    assert any("were united" in text for text in warnings)

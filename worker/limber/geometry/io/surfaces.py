@@ -15,6 +15,8 @@ SURFACES = Registry("surface", "limber.surfaces", [
     Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])
 """Readers take ``scale``, the metres per unit."""
 _LONG, _SHORT = 60.0, 0.01  # [m]: no branch is longer or shorter
+_ROUNDED = 1e-5
+"""Of the extent: numbers of five or six digits part vertices by as much."""
 
 
 def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
@@ -35,6 +37,8 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
     if flat.any():
         surface = Surface(surface.vertices, corner[~flat])
         warnings.append(f"{int(flat.sum())} faces without area were discarded.")
+    surface, welded = _welded(surface)
+    warnings += welded
     _check_edges(surface, path)
     surface, turned = _one_body(surface, path)
     warnings += turned
@@ -46,6 +50,37 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
                          "Unite its parts (in Blender: a Boolean modifier with Self), then mesh "
                          "the surface again.")
     return surface, warnings + _unit_warnings(surface)
+
+
+def _welded(surface: Surface) -> tuple[Surface, list[str]]:
+    """Unite vertices that few digits have moved apart, if that closes the surface."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    if not _open_edges(surface.faces):
+        return surface, []
+    reach = _ROUNDED * float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    pairs = cKDTree(surface.vertices).query_pairs(reach, output_type="ndarray")
+    if not len(pairs):
+        return surface, []
+    count = len(surface.vertices)
+    links = coo_array((np.ones(len(pairs)), pairs.T), (count, count))
+    _, label = connected_components(links, directed=False)
+    _, first = np.unique(label, return_index=True)
+    faces = label[surface.faces]
+    faces = faces[(np.diff(faces[:, [0, 1, 2, 0]], axis=1) != 0).all(axis=1)]
+    if _open_edges(faces):
+        return surface, []
+    return Surface(surface.vertices[first], faces), [
+        f"{count - len(first)} vertices that lie less than {1e3 * reach:.2g} mm from another were "
+        "united with it."]
+
+
+def _open_edges(faces: np.ndarray) -> int:
+    """Edges of a single face."""
+    edges = np.sort(np.vstack([faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    return int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
 
 
 def _check_edges(surface: Surface, path: Path) -> None:

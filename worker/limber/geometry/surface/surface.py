@@ -71,6 +71,9 @@ class Surface:
             if path.suffix.lower() == ".ply":
                 check_ply(path)
             mesh = trimesh.load_mesh(path, process=True)
+            # Programs write a vertex once for each of its normals and texture coordinates.
+            if isinstance(mesh, trimesh.Trimesh):
+                mesh.merge_vertices(merge_tex=True, merge_norm=True)
         except Exception as error:  # trimesh's readers raise whatever their parsers raise
             raise InputError(f"{path} cannot be read as a surface ({error}).",
                              "STL, PLY, OBJ or OFF was expected.", "Export it again.") from error
