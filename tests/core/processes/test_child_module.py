@@ -18,6 +18,11 @@ print("first", parent, sep="\\n", file=sys.stderr, flush=True)
 if how == "hang":
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     time.sleep(60)
+if how == "busy":
+    while True:
+        pass
+if how == "slow":
+    time.sleep(1.0)
 if how == "greedy":
     kept = b"x" * 300_000_000
     time.sleep(60)
@@ -50,12 +55,19 @@ def test_its_code_and_last_line_come_back(folder):
 
 @pytest.mark.parametrize(("how", "limits", "said"), [
     ("hang", Limits(seconds=0.6), "it was stopped after 1 s"),
+    ("busy", Limits(computed_seconds=0.4), "s of processor time"),
+    ("hang", Limits(computed_seconds=60, idle_seconds=0.4), "did nothing for 0 s"),
     ("greedy", Limits(seconds=60, memory_mb=200.0), "Its limit is 200 MB")])
 def test_over_its_limits_it_and_its_children_are_killed(folder, how, limits, said):
     with pytest.raises(WorkError) as caught:
         run_module("limber_child", [how], "it", limits, folder=folder)
     assert said in str(caught.value)
     assert not left_alive(_started_from(folder), 5.0)
+
+
+def test_time_that_others_take_is_not_its_own(folder):
+    """A machine that is busy makes it late, but does not use up its processor time."""
+    assert run_module("limber_child", ["slow"], "it", Limits(computed_seconds=0.9))[0] == 3
 
 
 def test_who_waits_may_end_it(folder):

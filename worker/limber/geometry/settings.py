@@ -105,7 +105,8 @@ class MeshSettings(Settings):
             "sweep uses 6.")
     mesh_spacing: float = Field(
         2.5, gt=0.3, le=8, description="Distance between cross-sections in local radii.")
-    mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's time limit [s].")
+    mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's limit of processor time "
+                                   "[s].")
     mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
 
 
@@ -174,7 +175,8 @@ class MeshSurfaceSettings(Settings):
     upright: bool = Field(True, description="Turn the long axis to z, and gravity with it.")
     elements_across: float = Field(
         3.0, gt=0.2, le=20, description="Number of elements across the body's thickness.")
-    mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's time limit [s].")
+    mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's limit of processor time "
+                                   "[s].")
     mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")

@@ -18,6 +18,11 @@ def computed_seconds(process_id: int) -> float:
                for times in _of_each(process_id, lambda each: each.cpu_times()) for kind in kinds)
 
 
+def is_ready(process_id: int) -> bool:
+    """Return whether a process, or one that it has started, computes or waits for a processor."""
+    return "running" in _of_each(process_id, lambda each: each.status())
+
+
 def kill_tree(process_id: int) -> None:
     """Kill a process and all that it has started."""
     _of_each(process_id, lambda each: each.kill())

@@ -19,6 +19,7 @@ from limber.core.processes.ending import end_by_kernel
 from limber.core.processes.process_limits import Limits
 
 _LEAST_SECONDS, _SECONDS_PER_MB = 8.0, 2.0
+_IDLE_SECONDS = 120.0
 _LEAST_MB, _MB_PER_MB = 1500.0, 60.0
 _REFUSED = 2
 
@@ -39,14 +40,15 @@ def read_apart(reader: Callable[[Path], dict[str, np.ndarray]], path: Path,
                 "limber.geometry.io.isolated_readers",
                 [f"{reader.__module__}:{reader.__qualname__}", str(Path(path).resolve()),
                  str(target)], "its reader",
-                Limits(_LEAST_SECONDS + _SECONDS_PER_MB * size_mb,
-                       _LEAST_MB + _MB_PER_MB * size_mb))
+                Limits(computed_seconds=_LEAST_SECONDS + _SECONDS_PER_MB * size_mb,
+                       idle_seconds=_IDLE_SECONDS, memory_mb=_LEAST_MB + _MB_PER_MB * size_mb))
         except WorkError as error:
-            trouble = error.seen.rstrip(".")
-        else:
-            if code == 0 and target.exists():
-                return _unpacked(read_arrays(target, "points"))
-            trouble = last[:200] or f"the reader ended with code {code}"
+            raise InputError(f"{path} cannot be read: {error.seen}", "A file of this size does "
+                             f"not need that. {error.why}",
+                             "Export it again, or in another format.") from error
+        if code == 0 and target.exists():
+            return _unpacked(read_arrays(target, "points"))
+        trouble = last[:200] or f"the reader ended with code {code}"
         raise InputError(f"{path} cannot be read ({trouble}).",
                          "The file is damaged, truncated, or does not have the format of its "
                          "suffix.", "Export it again.")

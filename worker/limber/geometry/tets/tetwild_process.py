@@ -31,7 +31,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
         epsilon: How far the result may be from the surface [m].
         stop_energy: Quality at which it stops improving (fTetWild's AMIPS energy; 3 is best).
         coarsen: Merge elements as far as quality allows, which takes longer.
-        time_limit: Seconds after which it is stopped.
+        time_limit: Processor time [s] after which it is stopped.
         memory_limit_mb: Memory after which it is stopped.
         progress: Called while waiting; cancelling stops the process.
 
@@ -56,7 +56,8 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
         try:
             # It also writes a file of its own (__tracked_surface.stl) where it runs.
             code, last = run_module(__name__, [str(source), str(target)], "fTetWild",
-                                    Limits(time_limit, memory_limit_mb), folder=Path(folder),
+                                    Limits(computed_seconds=time_limit,
+                                           memory_mb=memory_limit_mb), folder=Path(folder),
                                     waiting=waiting)
         except WorkError as error:
             raise MeshingError(error.seen, error.why, "Raise --mesh-time-limit or "
