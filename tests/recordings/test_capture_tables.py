@@ -89,7 +89,7 @@ def clocked(stamps, title="time"):
 
 
 DAY = "2024-05-01"
-STEPS = [k for k in range(30)]
+STEPS = list(range(30))
 CLOCKS = {
     "micros": (clocked([19202812 + 1875 * k for k in STEPS], "Time Stamp"), 1.875e-3),
     "millis that began anew": (clocked([(2**32 - 50 + 10 * k) % 2**32 for k in STEPS], "millis"),

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
 from limber.core.files.reading import require_size
@@ -168,6 +167,8 @@ def _values(path: Path, field: _Field, stream: bytes, count: int) -> np.ndarray:
 
 
 def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element) -> Cloud:
+    from scipy.spatial.transform import Rotation
+
     if set(_CARTESIAN) <= columns.keys():
         points = np.stack([columns[name] for name in _CARTESIAN], axis=1).astype(float)
         state = columns.get("cartesianInvalidState")
