@@ -15,6 +15,7 @@ import numpy as np
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.present import present
 from limber.core.progress import SILENT, Progress
+from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.chance import Risk, YoungUncertainty
 from limber.planning.constraints.full_model_check import broken_on_full_model, field_error, learnt
 from limber.planning.constraints.limits import Limits
@@ -168,7 +169,11 @@ class _Rounds:
         return False
 
     def _planned(self, ahead: Progress, is_last: bool) -> PathPair | None:
-        """Return paths on the field; None where poses were added instead."""
+        """Return paths on the field; None where poses were added instead.
+
+        Raises:
+            NoWayError: none was found, or none exists and the full model bears it out.
+        """
         try:
             return plan_within(self.field, self.start, self.aim, self.settings,
                                self.planned_limits, asked=self.limits, before=self.pair,
@@ -177,16 +182,36 @@ class _Rounds:
             found = None if is_last else asked_in_doubt(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
                 ahead.part(0.3, 1.0))
-            if found is None and self.passages:
-                raise said_after(none, len(self.passages), self.passages[-1].told) from none
             if found is None:
-                raise
+                return self._closed(none, is_last, ahead.part(0.3, 1.0))
             self.passages.append(found)
             self.progress.warn(
                 f"{none.seen} The energy field's error makes this uncertain, so poses are added: "
                 f"{found.told}.")
             self.field = refit(self.field, found.learnt)
             return None
+
+    def _closed(self, none: NoWayError, is_last: bool, ahead: Progress) -> None:
+        """Pass on that there is no way, or learn what speaks against it.
+
+        Raises:
+            NoWayError: nothing does, or there is no round left.
+        """
+        if none.is_proven:
+            ahead(0.0, "checking on the full model where the way is closed")
+            check = checked_wall(self.field, self.grasp_model, self.limits, none,
+                                 workers=self.workers, progress=ahead)
+            if check.learnt is not None and not is_last and len(check.learnt.poses):
+                self.progress.warn(
+                    "No path exists by the energy field, but the full model differs from it where "
+                    f"the way is closed: {len(check.learnt.poses)} poses are added.")
+                self.field = refit(self.field, check.learnt)
+                return
+            none = confirmed(none, check) if check.learnt is None else not_confirmed(
+                none, self.limits.in_words())
+        if self.passages:
+            none = said_after(none, len(self.passages), self.passages[-1].told)
+        raise none
 
     def _solved(self, before: PathPair | None, pair: PathPair, ahead: Progress) -> ResolvedPath:
         """Return the plan on the full model, and keep the baseline there."""
@@ -207,6 +232,7 @@ class _Rounds:
         broken = broken_on_full_model(plan, self.limits, self.goal, self.grasp_model.mesh.nodes)
         if plan.is_whole:
             self.aim = self.aim.drawn_in(plan.solved)
+            broken += self._unfit_end(plan)
         if self.uncertainty is not None and not broken:
             risk = self.uncertainty.risk(
                 self.grasp_model, plan, self.limits, self.settings.confidence
@@ -222,6 +248,14 @@ class _Rounds:
             broken = self.moving.broken
             self._tighten(self.moving.excess)
         return broken
+
+    def _unfit_end(self, plan: ResolvedPath) -> list[str]:
+        """Return why the plan's end does not do, where it does not: the next ends elsewhere."""
+        try:
+            self.goal.require_end(self.grasp_model, plan.solved)
+        except NoPathError as error:
+            return [error.seen.rstrip(".")]
+        return []
 
     def _tighten(self, excess: dict[str, float]) -> None:
         self.planned_limits = self.planned_limits.tightened(

@@ -1,6 +1,7 @@
 """One planning problem: where from, where to, what a metre costs and what is not allowed."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from limber.core.errors import NoPathError
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.limited_quantities import limited
+from limber.planning.field.local_error import LocalError
 from limber.planning.goals.goal import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
@@ -18,7 +20,23 @@ UNPROVEN = "but it is not proven that none exists"
 
 
 class NoWayError(NoPathError):
-    """No path from the start to the goal keeps the limits on the field: proven, or none found."""
+    """No path from the start to the goal keeps the limits on the field: proven, or none found.
+
+    ``wall`` are grasp positions where the way is closed by limits, those first that are least over
+    them [m], shape [k, 3].
+    """
+
+    wall: np.ndarray = np.empty((0, 3))
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether the field, its error counted, leaves no way."""
+        return UNPROVEN not in self.seen
+
+    def behind(self, wall: np.ndarray) -> "NoWayError":
+        """Return the error with the places where the way is closed."""
+        self.wall = wall
+        return self
 
 
 @dataclass(frozen=True)
@@ -31,7 +49,8 @@ class GentleProblem:
 
     ``beyond`` are limits that the field exceeds only where the branch exceeds those that were
     asked for (:meth:`~limber.planning.constraints.limits.Limits.beyond`). Bounds and proofs count
-    on them alone; without them no limit proves anything.
+    on them alone; without them no limit proves anything. They allow for the field's largest error
+    anywhere; ``errors``, by limit, say how much smaller it is at a place.
     """
 
     energy_field: EnergyField
@@ -42,6 +61,14 @@ class GentleProblem:
     field_error: float = 0.0
     longest: float = np.inf
     beyond: FieldArrays | None = None
+    errors: Mapping[str, LocalError] = field(default_factory=dict)
+
+    def spare(self, name: str, points: np.ndarray) -> np.ndarray:
+        """Return by how much the limit ``beyond`` may be less at ``points`` [n, 3], shape [n]."""
+        error = self.errors.get(name)
+        if error is None or not np.isfinite(error.most):
+            return np.zeros(len(points))
+        return error.most - error.at(self.energy_field.region.chart.plain.map(points))
 
     @property
     def sure_limits(self) -> FieldArrays:
@@ -73,6 +100,14 @@ class GentleProblem:
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
         return float(self.goal.distance(self.energy_field, point[None])[0]) - self.goal.tolerance
+
+
+def least_over(problem: GentleProblem, points: np.ndarray) -> np.ndarray:
+    """Return ``points`` [n, 3] in the order of how far they are over a limit, the least first."""
+    worst = np.zeros(len(points))
+    for one in limited(problem.energy_field, problem.sure_limits):
+        worst = np.maximum(worst, one.size(points) / one.limit)
+    return points[np.argsort(worst, kind="stable")]
 
 
 def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:

@@ -1,5 +1,6 @@
 """Two paths to the same goal region on one field: the shortest, and the gentle one."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,10 +13,12 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.limited_quantities import UNITS
+from limber.planning.field.local_error import LocalError
 from limber.planning.goals.allowed_poses import (
     GoalOverLimitsError,
     allowed_points,
     goal_points,
+    with_near_side,
 )
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near
@@ -84,13 +87,15 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     check_start(field, start, limits.on(field))
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
+    errors = (asked or limits).errors(field)
     # A start near its limit leaves room for a part of the margins only.
     parts = [{name: share * value for name, value in margins.items()} for share in _SHARES]
     parts = [part for part in parts if allowed_points(start[None], limits.on(field, part))[0]]
     if any(margins.values()) and parts:
         try:
             found = plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
-                              beyond=surely, before=before, progress=progress.part(0.0, 0.5))
+                              beyond=surely, errors=errors, before=before,
+                              progress=progress.part(0.0, 0.5))
             return replace(found, margins=parts[0])
         except NoPathError:
             progress.warn("No path keeps the limits with margins for the energy field's error "
@@ -98,10 +103,10 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                           "model decides whether it is allowed.")
     try:
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
-                          before=before, progress=progress.part(0.5, 1.0))
+                          errors=errors, before=before, progress=progress.part(0.5, 1.0))
     except NoWayError as error:
         found = _in_doubt(error, field, start, goal, settings, limits, surely,
-                          before=before, progress=progress.part(0.5, 1.0))
+                          errors=errors, before=before, progress=progress.part(0.5, 1.0))
     return replace(found, margins=none)
 
 
@@ -135,11 +140,12 @@ def _told(margins: dict[str, float]) -> str:
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
               limits: FieldArrays | None = None, *, beyond: FieldArrays | None = None,
+              errors: Mapping[str, LocalError] | None = None,
               before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits, and bound the cost of any path from below.
 
-    ``limits`` are those of the settings where not given; ``beyond`` what the bound counts on
-    (:class:`~.problem.GentleProblem`).
+    ``limits`` are those of the settings where not given; ``beyond`` and ``errors`` what the bound
+    counts on (:class:`~.path_problem.GentleProblem`).
 
     Raises:
         InputError: the start is not allowed.
@@ -151,7 +157,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         return _staying(field, start, goal, settings, limits, beyond)
     nobody: GoalOverLimitsError | None = None
     try:
-        goals = goal_points(goal, field, limits, seed=settings.seed)
+        goals = with_near_side(goal_points(goal, field, limits, seed=settings.seed), start, goal,
+                               field, limits)
     except GoalOverLimitsError as error:
         # Drawn poses miss a narrow valley: cells find a way into it, or prove that there is none.
         goals, nobody = np.empty((0, 3)), error
@@ -159,7 +166,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
-    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond,
+                            errors=errors or {})
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
                    progress.part(0.0, 0.5)) if nobody is None else {}
     known = [path.points for path in trees.values()]
@@ -168,7 +176,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     except NoWayError as error:
         if nobody is None or UNPROVEN in error.seen:
             raise
-        raise NoWayError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix) from error
+        raise NoWayError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix).behind(
+            error.wall) from error
     if detour is not None:
         weighed = replace(weighed, distance=detour.weight * weighed.distance)
         problem = replace(problem, weights=weighed.weights)
@@ -287,7 +296,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
                                deformation=max(settings.deformation_weight, 1.0))
     there = near(start, _AT_START)
     way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there,
-                        beyond=problem.beyond)
+                        beyond=problem.beyond, errors=problem.errors)
     line = np.linspace(field.rest, start, 40)
     points, least = refine(line, way)
     if not np.isfinite(least):

@@ -15,19 +15,19 @@ by more than its error, and may hold a point of the goal where a target is as ne
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
 
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
 from limber.planning.field.chart import Chart
-from limber.planning.field.energy_field import FieldArrays
 from limber.planning.field.trust import nearest_of
 from limber.planning.goals.allowed_poses import allowed_points
-from limber.planning.path_problem import GentleProblem
+from limber.planning.path_problem import GentleProblem, least_over
 
 _ALONG, _ACROSS = 20, 40  # cells along the shell, each way, and off it
 _EVEN = 26  # each way where there is no shell
@@ -131,30 +131,33 @@ class _Cells:
 @dataclass(frozen=True)
 class Verdict:
     """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
-    there is no path; and a ``way`` [k, 3] by cells that keep all limits at their corners, if any.
+    there is no path; a ``way`` [k, 3] by cells that keep all limits at their corners, if any; and
+    the ``wall`` [k, 3], middles of the cells that close the way, those least over a limit first.
     """
 
     edges: np.ndarray
     proven: bool = False
     way: np.ndarray | None = None
+    wall: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
 
 def judge(problem: GentleProblem) -> Verdict:
     """Return a path on the field, or whether it is proven that none exists."""
-    on_field = _judged(problem, problem.limits, 0.0)
+    exact = replace(problem, beyond=problem.limits, errors={})
+    on_field = _judged(exact, 0.0)
     if not on_field.proven:
         return on_field
-    return _judged(problem, problem.sure_limits, problem.goal.uncertainty(problem.energy_field))
+    return _judged(problem, problem.goal.uncertainty(problem.energy_field))
 
 
-def _judged(problem: GentleProblem, limits: FieldArrays, goal_uncertainty: float) -> Verdict:
-    """Cut cells until they prove that no path keeps ``limits`` and comes as near as ``goal_doubt``
-    [m] to the goal, or a way leads by them, or there are too many."""
-    cells = _first(problem)
+def _judged(problem: GentleProblem, goal_uncertainty: float) -> Verdict:
+    """Cut cells until they prove that no path keeps the sure limits and comes as near as
+    ``goal_uncertainty`` [m] to the goal, or a way leads by them, or there are too many."""
+    cells, wall = _first(problem), _Wall(problem)
     while True:
         cells = cells.take(~_surely_outside(cells))
         positions, nodes = cells.nodes()
-        over, uncertainty = _surely_over(cells, limits, positions, nodes)
+        over, uncertainty = _surely_over(cells, positions, nodes)
         begin = cells.holding(problem.start)
         away = problem.goal.distance(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
@@ -162,12 +165,11 @@ def _judged(problem: GentleProblem, limits: FieldArrays, goal_uncertainty: float
         ends = ~over & (least <= tolerance + goal_uncertainty)
         kept = allowed_points(positions, problem.limits)[nodes]
         open_cells = np.flatnonzero(~over | begin)
+        wall.add(cells.take(np.flatnonzero(over & ~begin)))
         cells, begin, ends = cells.take(open_cells), begin[open_cells], ends[open_cells]
-        if not begin.any() or not ends.any():
-            return Verdict(cells.edges, proven=True)
-        prestress = cells.prestress(begin)
+        prestress = cells.prestress(begin) if begin.any() else begin
         if not (prestress & ends).any():
-            return Verdict(cells.edges, proven=True)
+            return Verdict(cells.edges, proven=True, wall=wall.about(cells.take(prestress)))
         free = kept[open_cells][:, _AT].all(axis=1)
         reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
         inner = cells.take(free)
@@ -186,6 +188,30 @@ def _judged(problem: GentleProblem, limits: FieldArrays, goal_uncertainty: float
         if prestress.sum() * parts.prod() > _MOST_CELLS:
             return Verdict(cells.edges)
         cells = cells.take(prestress).cut(parts)
+
+
+class _Wall:
+    """Cells that were closed by limits, of all sizes."""
+
+    def __init__(self, problem: GentleProblem):
+        self.problem = problem
+        self.closed: list[_Cells] = []
+
+    def add(self, cells: _Cells) -> None:
+        self.closed.append(cells)
+
+    def about(self, reached: _Cells) -> np.ndarray:
+        """Return the middles [k, 3] of those that touch any of the cells ``reached``."""
+        if not len(reached.numbers):
+            return np.empty((0, 3))
+        own = cKDTree(reached.middles()[0] / reached.edges)
+        found = [np.empty((0, 3))]
+        for cells in self.closed:
+            middles, points = cells.middles()
+            ahead = 0.5 * float((cells.edges / reached.edges).max()) + 0.6
+            away = own.query(middles / reached.edges, p=np.inf, distance_upper_bound=ahead)[0]
+            found.append(points[np.isfinite(away)])
+        return least_over(self.problem, np.concatenate(found))
 
 
 def _first(problem: GentleProblem) -> _Cells:
@@ -216,21 +242,24 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
     return outside
 
 
-def _surely_over(cells: _Cells, limits: FieldArrays, positions: np.ndarray, nodes: np.ndarray,
+def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Return in which cells no point keeps ``limits``, bool [n], and how much in doubt each axis
-    leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3]."""
+    """Return in which cells no point keeps the sure limits, bool [n], and how much in doubt each
+    axis leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3].
+    """
     over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
-    for values, slopes, limit in _limited(cells.problem, limits, positions):
+    for values, slopes, limits in _limited(cells.problem, positions):
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
+        limit = limits[nodes[:, _AT]].max(axis=1)
         over |= least > limit
-        uncertainty = np.maximum(uncertainty, bends / limit)
-    limit = limits.max_force
+        uncertainty = np.maximum(uncertainty, bends / limit[:, None])
+    limit = cells.problem.sure_limits.max_force
     if limit < np.inf:
+        spare = cells.problem.spare("force", positions)[nodes[:, _AT]].min(axis=1)
         force = cells.problem.energy_field.force(positions)[nodes]
         bends = _bends(force)
-        over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit
+        over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit - spare
         # Between corners it may be anything that lies between theirs.
         apart = force[:, _AT].reshape(-1, 2, 2, 2, 3)
         apart = np.stack([np.linalg.norm(np.diff(apart, axis=axis), axis=-1).max(axis=(1, 2, 3))
@@ -239,18 +268,19 @@ def _surely_over(cells: _Cells, limits: FieldArrays, positions: np.ndarray, node
     return over, uncertainty
 
 
-def _limited(problem: GentleProblem, limits: FieldArrays, positions: np.ndarray,
-             ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+def _limited(problem: GentleProblem, positions: np.ndarray,
+             ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield what is limited at ``positions`` [m, 3] besides the force, smooth, shape [m], its slope
-    to the position, [m, 3], and its limit."""
-    field = problem.energy_field
+    to the position, [m, 3], and its sure limit there, [m]."""
+    field, limits = problem.energy_field, problem.sure_limits
     if limits.max_energy < np.inf:
         yield (field.energy(positions), field.force(positions),
-               limits.max_energy + problem.field_error)
+               limits.max_energy + problem.field_error - problem.spare("energy", positions))
     for name, limit in zip(field.load_names, limits.max_loads, strict=True):
         if limit < np.inf:
             load = field.load(positions, name)
-            yield load**2, 2.0 * load[:, None] * field.load_gradient(positions, name), limit**2
+            yield (load**2, 2.0 * load[:, None] * field.load_gradient(positions, name),
+                   (limit - problem.spare(name, positions))**2)
 
 
 def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -26,6 +26,7 @@ from limber.planning.certificate.grid import CUT, Grid, descent, first_grid, ref
 from limber.planning.certificate.subsolution import (
     RIM,
     Terrain,
+    corner_values,
     corners_of,
     least_in_cells,
     spline_value,
@@ -33,7 +34,13 @@ from limber.planning.certificate.subsolution import (
     terrain,
     widened,
 )
-from limber.planning.path_problem import GentleProblem, NoWayError, no_way, not_found
+from limber.planning.path_problem import (
+    GentleProblem,
+    NoWayError,
+    least_over,
+    no_way,
+    not_found,
+)
 from limber.planning.search_files import CostToGo
 
 _MOST_CELLS = 800_000  # of any grid's tube; the next refinement is left away
@@ -196,9 +203,10 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     points = grid.points(corners)
     energy = grid.spread(corners, problem.energy_field.energy(points))
     force = grid.spread(corners, problem.energy_field.force(points))
-    open_cells &= ~_surely_over(problem, grid, open_cells, energy, force)
+    over = _surely_over(problem, grid, open_cells, energy, force)
+    open_cells &= ~over
     if not open_cells[tuple(cell)]:
-        raise _separated(problem, grid, open_cells)
+        raise _separated(problem, grid, open_cells, grid.points(cell[None] + 0.5))
     # Only what hangs together with the start, also by an edge or a corner of a cell.
     together = scipy.ndimage.label(open_cells, _NEAR)[0]
     open_cells = together == together[tuple(cell)]
@@ -211,7 +219,8 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
         if problem.goal.uncertainty(problem.energy_field) > 0.0:
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
                             "of reach, but by less than the error of the energy field.")
-        raise _separated(problem, grid, open_cells)
+        wall = over & scipy.ndimage.binary_dilation(open_cells, _NEAR)
+        raise _separated(problem, grid, open_cells, grid.points(np.argwhere(wall) + 0.5))
     to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
     lower = spline_value(to_goal, cell) - slack
@@ -247,24 +256,30 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: 
     """Return those of ``cells`` in which no point keeps the limits, the field's error counted;
     ``energy`` and ``force`` at their corners and next to them."""
     limits, field, over = problem.sure_limits, problem.energy_field, np.zeros(cells.shape, bool)
+    nodes = np.argwhere(corners_of(cells))
+
+    def spare(name: str) -> np.ndarray:
+        at_nodes = grid.spread(nodes, problem.spare(name, grid.points(nodes)))
+        return np.nan_to_num(corner_values(at_nodes).min(axis=0))
     if limits.max_energy < np.inf:
         over |= least_between(energy, grid.along_edges(force), cells) > (
-            limits.max_energy + problem.field_error)
+            limits.max_energy + problem.field_error - spare("energy"))
     for name, limit in zip(field.load_names, limits.max_loads, strict=True):
         if limit < np.inf:
-            nodes = np.argwhere(widened(corners_of(cells)))
-            points = grid.points(nodes)
+            beside = np.argwhere(widened(corners_of(cells)))
+            points = grid.points(beside)
             load = field.load(points, name)
             slopes = 2.0 * load[:, None] * grid.along_edges(field.load_gradient(points, name))
-            over |= least_between(grid.spread(nodes, load**2), grid.spread(nodes, slopes),
-                                  cells) > limit**2
+            over |= least_between(grid.spread(beside, load**2), grid.spread(beside, slopes),
+                                  cells) > (limit - spare(name))**2
     if limits.max_force < np.inf:
-        over |= least_size(force, cells) > limits.max_force
+        over |= least_size(force, cells) > limits.max_force - spare("force")
     return over
 
 
-def _separated(problem: GentleProblem, grid: Grid, open_cells: np.ndarray) -> NoWayError:
+def _separated(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, wall: np.ndarray,
+               ) -> NoWayError:
     share = 100.0 * open_cells.mean()
     return no_way(problem, f"This is proven on a grid of {1e3 * grid.spacing:.1f} mm: forbidden "
                   f"cells separate the start from the goal ({share:.0f} % of the region's box is "
-                  "open).")
+                  "open).").behind(least_over(problem, wall))

@@ -16,6 +16,7 @@ from limber.planning.constraints.constraint import Broken, Constraint
 from limber.planning.constraints.obstacles import Obstacle, Obstacles
 from limber.planning.field.energy_field import EnergyField, FieldArrays, GraspSamples
 from limber.planning.field.limited_quantities import UNITS
+from limber.planning.field.local_error import LocalError
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 
@@ -131,7 +132,7 @@ class Limits:
         missed = {"energy": known.missed[:, 0],
                   "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
                   **dict(zip(known.load_names, known.missed[:, 4:].T, strict=True))}
-        values, inner = _sampled(known.samples), ~known.region.is_face()
+        values, inner = sampled_sizes(known.samples), ~known.region.is_face()
         found = dict.fromkeys(UNITS, 0.0)
         for name, limit in self.asked().items():
             if values.get(name) is None:
@@ -154,7 +155,7 @@ class Limits:
         most poses keep, would do for a plan that is checked afterwards, and for no proof.
         """
         found = dict.fromkeys(UNITS, 0.0)
-        inner, values = ~known.region.is_face(), _sampled(known.samples)
+        inner, values = ~known.region.is_face(), sampled_sizes(known.samples)
         above = _above(known)
         for name, limit in self.asked().items():
             size = values.get(name)
@@ -167,6 +168,20 @@ class Limits:
             near = near if near.sum() >= _FEWEST else sure
             found[name] = float(more[near].max(initial=0.0)) if near.any() else np.inf
         return found
+
+    def in_words(self) -> str:
+        """Describe the limits that were asked for, or return an empty string."""
+        kept = [f"{name.replace('_', ' ')} {limit:.3g} {UNITS.get(name, '')}".rstrip()
+                for name, limit in self.asked().items()]
+        return (" at most " + " and ".join(kept)) if kept else ""
+
+    def errors(self, known: EnergyField) -> dict[str, LocalError]:
+        """Return by how much the field may say too much, as a function of the place in the plain
+        chart, by limit: at no sample left out it was more; nowhere more than :meth:`doubts`."""
+        inner, above = ~known.region.is_face(), _above(known)
+        places, doubts = known.region.chart.plain.map(known.samples.positions), self.doubts(known)
+        return {name: LocalError.of(places[inner], above[name][inner], 1.0, doubts[name])
+                for name in self.asked() if np.isfinite(doubts[name])}
 
     def beyond(self, known: EnergyField) -> FieldArrays:
         """Return the field with limits that it exceeds only where the branch exceeds these."""
@@ -198,7 +213,7 @@ class Limits:
                 & (places <= self.high + 1e-6).all(axis=1))
 
 
-def _sampled(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
+def sampled_sizes(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
     """Return what limits are on at samples, by the names of ``UNITS``, shape [m] each."""
     return {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
             **samples.loads}

@@ -10,6 +10,8 @@ from limber.planning.goals.goal import Goal
 
 _MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
 
+_HALVINGS = 20  # of a way into the goal
+
 
 class GoalOverLimitsError(NoPathError):
     """None of the poses drawn in the goal region keeps the limits."""
@@ -36,6 +38,19 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
             "Raise the limit (--max-energy, --max-force and others, the workspace), or choose a "
             "goal nearer to the rest pose.")
     return np.ascontiguousarray(allowed)
+
+
+def with_near_side(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField,
+                   limits: FieldArrays) -> np.ndarray:
+    """Return ``points`` [n, 3] of the goal, and where the straight ways to them from ``start`` [3]
+    enter it: in a large goal the near side is where short and gentle paths end."""
+    low, high = np.zeros(len(points)), np.ones(len(points))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        inside = goal.distance(field, start + middle[:, None] * (points - start)) <= goal.tolerance
+        low, high = np.where(inside, low, middle), np.where(inside, middle, high)
+    near = np.ascontiguousarray(start + high[:, None] * (points - start))
+    return np.concatenate([points, near[allowed_points(near, limits)]])
 
 
 def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:

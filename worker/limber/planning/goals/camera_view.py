@@ -70,6 +70,5 @@ class View(Convex):
         if self.hidden_by(triangles, place, _OWN):
             raise NoPathError(
                 f"At the end of the path the branch hides {what} from the camera.",
-                "Limber checks the line of sight at the end of a path, but cannot plan for it "
-                "yet.",
+                "The line of sight is checked on the full model at the end of each plan.",
                 "Choose a --target-box on the camera's side, or move the camera.")

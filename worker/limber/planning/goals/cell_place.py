@@ -1,24 +1,144 @@
-"""The target in a region that a robot's cell gives: ``--in-view``, ``--second-arm``."""
+"""The target in a region that a robot's cell gives: ``--in-view``, ``--second-arm``.
 
-from dataclasses import dataclass
+The region is an outer bound: within it the arm may not reach every place, and the branch may hide
+the target. Which grasp poses do is asked of poses of the field (of an arm, whose kinematics are of
+the target's place alone) or of the branch model (of a view, past the branch's own surface). Between
+them a pose counts as one that does where it is twice as near to one that does as to one that does
+not. Each planned path adds its own states, so that the border is refined where paths end.
+"""
 
-from limber.core.errors import InputError
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from limber.core.errors import InputError, NoPathError
+from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.sampling import solve_branch
+from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.trust import nearest_of
 from limber.planning.goals.goal import CellPlace, GoalKind, GoalRequest
 from limber.planning.goals.target_goal import TargetGoal, target_of
 from limber.planning.path_on_full_model import SolvedPoses
 
+_DRAWN = 2000  # poses of the field among which those in the region are looked for
+_ASKED = 150  # of these at most, where the target's place alone counts
+_SOLVED = 16  # states of the branch model at most, where its surface counts as well
+_NOWHERE = np.empty((0, 3))
+
 
 @dataclass(frozen=True, kw_only=True)
 class CellGoal(TargetGoal):
-    """A target in a region of the cell, at a place that does for it."""
+    """A target in a region of the cell, at a place that does for it.
+
+    Attributes:
+        cell_place: The region and its test.
+        grasp_model: Of the branch.
+        taken, refused: Positions of the grasp at which the target's place does, and at which it
+            lies in the region and does not [m], shapes [k, 3] and [q, 3].
+    """
 
     cell_place: CellPlace
+    grasp_model: GraspModel
+    taken: np.ndarray = field(default_factory=_NOWHERE.copy)
+    refused: np.ndarray = field(default_factory=_NOWHERE.copy)
+
+    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        within = super().distance(field, points)
+        if not len(self.refused) or not len(self.taken):
+            return within
+        points = np.ascontiguousarray(points, float).reshape(-1, 3)
+        nearer = 2.0 * nearest_of(points, self.taken)[0] - nearest_of(points, self.refused)[0]
+        return np.maximum(within, self.tolerance + nearer / 3.0)
+
+    def uncertainty(self, field: EnergyField) -> float:
+        # Between poses that do not do there may be one that does: then nothing is proven.
+        return np.inf if len(self.refused) else super().uncertainty(field)
+
+    def drawn_in(self, states: SolvedPoses) -> Self:
+        places = states.tips if self.target is None else states.targets[:, self.target]
+        return super().drawn_in(states)._asked(states.poses[:, :3], places, states.displacements)
 
     def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
-        nodes = grasp_model.mesh.nodes + states.displacements[-1]
         self.cell_place.require(self.what, self.place(states),
-                                nodes[grasp_model.mesh.surface_faces()])
+                                self._surface(states.displacements[-1]))
+
+    def learnt(self, field: EnergyField) -> Self:
+        """Return the goal with what poses of the field say of it.
+
+        Raises:
+            NoPathError: the target lies in the region at some of them, and does at none.
+        """
+        if self.cell_place.of_surface:
+            found = self._of_states(field)
+        else:
+            points = np.concatenate([field.rest[None], field.region.draw(
+                _DRAWN, np.random.default_rng(0))])
+            points = points[TargetGoal.distance(self, field, points) <= self.tolerance][:_ASKED]
+            found = self._asked(points, field.tip(points, self.target), None)
+        if len(found.refused) and not len(found.taken):
+            raise self._refusal(found, field)
+        return found
+
+    def _of_states(self, field: EnergyField) -> Self:
+        """Ask states of the branch model at samples of the field in the region, far apart."""
+        samples = field.samples
+        places = samples.tips if self.target is None or samples.targets is None else (
+            samples.targets[:, self.target])
+        inside = np.flatnonzero(self.region.distance(places) <= 0.0)
+        if not len(inside):
+            return self
+        chosen = inside[_far_apart(samples.positions[inside], _SOLVED)]
+        with SolverPool(self.grasp_model, 1) as solvers:
+            good, _ = solve_branch(solvers, samples.positions[chosen])
+        states = good[1:]
+        which = [chosen[one.target] for one in states]
+        return self._asked(samples.positions[which], places[which],
+                           np.array([one.displacement for one in states]))
+
+    def _asked(self, grasps: np.ndarray, places: np.ndarray, moved: np.ndarray | None) -> Self:
+        """Return the goal knowing poses [n, 3] with the target at ``places`` [n, 3] as well; the
+        nodes are displaced by ``moved`` [n, nodes, 3] there."""
+        inside = np.flatnonzero(self.region.distance(places) <= 0.0)
+        does = np.array([self._does(places[k], None if moved is None else moved[k])
+                         for k in inside], bool)
+        return replace(self, taken=np.concatenate([self.taken, grasps[inside[does]]]),
+                       refused=np.concatenate([self.refused, grasps[inside[~does]]]))
+
+    def _does(self, place: np.ndarray, moved: np.ndarray | None) -> bool:
+        surface = None
+        if self.cell_place.of_surface and moved is not None:
+            surface = self._surface(moved)
+        try:
+            self.cell_place.require(self.what, place, surface)
+        except NoPathError:
+            return False
+        return True
+
+    def _surface(self, moved: np.ndarray) -> np.ndarray:
+        """Return the surface's triangles [f, 3, 3] with nodes displaced by ``moved`` [n, 3]."""
+        mesh = self.grasp_model.mesh
+        return (mesh.nodes + moved)[mesh.surface_faces()]
+
+    def _refusal(self, found: "CellGoal", field: EnergyField) -> NoPathError:
+        count = len(found.refused)
+        return NoPathError(
+            f"{self.cell_place.refusal.format(what=self.what)} at any of the {count} poses that "
+            "were checked.", f"{self.what[0].upper()}{self.what[1:]} lies within the region there, "
+            f"{self.region.describe()}.",
+            "Move the camera or the second arm, or sample farther (`limber energy "
+            "--deflection`).")
+
+
+def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
+    """Return numbers of at most ``count`` of ``points`` [n, 3], each far from those before."""
+    chosen = [0]
+    away = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)) and away.max() > 0.0:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)
 
 
 def _kind(name: str, entry: str) -> GoalKind:
@@ -29,7 +149,8 @@ def _kind(name: str, entry: str) -> GoalKind:
                              "The cell file states its position.",
                              "Give --cell with such a file.")
         place = asked.cell[name]
-        return CellGoal(place.region, *target_of(asked), cell_place=place)
+        return CellGoal(place.region, *target_of(asked), cell_place=place,
+                        grasp_model=asked.grasp_model).learnt(asked.field)
     return GoalKind(name, made, is_of_target=True)
 
 

@@ -74,12 +74,18 @@ class Goal(Protocol):
 class CellPlace:
     """A region given by a robot's cell.
 
-    ``require`` raises NoPathError where it does not do for something, said in words, at a place [3]
-    in it, while the branch's surface is where triangles [f, 3, 3] are.
+    Attributes:
+        region: Holds every place that does.
+        require: Raises NoPathError where a place [3] in it does not do for something, said in
+            words, while the branch's surface is where triangles [f, 3, 3] are; None: not known.
+        of_surface: Whether that surface counts.
+        refusal: What is said where no place does, with ``{what}``.
     """
 
     region: Region
-    require: Callable[[str, np.ndarray, np.ndarray], None]
+    require: Callable[[str, np.ndarray, np.ndarray | None], None]
+    of_surface: bool
+    refusal: str
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,9 @@ from limber.planning.goals.goal import GoalKind, GoalRequest
 from limber.planning.goals.regions import Ball, BoxRegion, Region
 from limber.planning.path_on_full_model import SolvedPoses
 
+_SMALL = 0.02  # [m] of a region's depth, up to which targets are drawn in all of it
+_HALVINGS = 12  # of the way into a region
+
 
 @dataclass(frozen=True)
 class TargetGoal:
@@ -58,13 +61,28 @@ class TargetGoal:
     def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
                 ) -> np.ndarray:
         """Return ``points`` [n, 3] moved so that the target comes towards places in the region."""
-        wanted = self.region.draw(len(points), generator)
+        if not len(points):
+            return points
+        wanted = self._entered(field.tip(points, self.target),
+                               self.region.draw(len(points), generator))
         for _ in range(8):
             outside = self.distance(field, points) > 0.5 * self.tolerance
             steps = _damped_steps(field.tip_gradient(points, self.target),
                                   wanted - field.tip(points, self.target))
             points = points + np.where(outside[:, None], steps, 0.0)
         return points
+
+    def _entered(self, places: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Return the points [n, 3] on the way from ``places`` to ``wanted`` places in the region
+        that are just inside: in a large region the others are far out of the branch's reach."""
+        inside = 0.25 * self.tolerance if self.tolerance < _SMALL else 0.25 * _SMALL
+        low, high = np.zeros(len(places)), np.ones(len(places))
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            deep = self.region.distance(
+                places + middle[:, None] * (wanted - places)) <= -inside
+            low, high = np.where(deep, low, middle), np.where(deep, middle, high)
+        return places + high[:, None] * (wanted - places)
 
     def centre(self, field: EnergyField) -> np.ndarray:
         points = self.guess(field, 50, np.random.default_rng(0))

@@ -63,7 +63,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
         known = (way is not None and found_from([way])) or found_from(_easiest(problem))
         if not known and verdicts[0].proven:
             raise no_way(problem, f"This is proven on {_grid(verdicts[0])}: forbidden cells "
-                         "separate the start from the goal.")
+                         "separate the start from the goal.").behind(verdicts[0].wall)
         return best[1]
 
     certificate = certify(problem, improve, enough=enough, progress=progress)

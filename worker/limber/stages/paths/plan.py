@@ -185,7 +185,7 @@ class _InCell:
 
         cell = cell_for(branch, path, progress)
         obstacles = cell_obstacles(cell, path.parent)
-        return cls(cell, obstacles, limits_in(cell, limits, obstacles), places_in(cell))
+        return cls(cell, obstacles, limits_in(cell, limits, obstacles), places_in(cell, obstacles))
 
     def slowed(self, pace: Pace) -> Pace:
         """Return the pace, no faster than the cell allows."""

@@ -20,6 +20,7 @@ from limber.planning.goals.regions import Ball
 from limber.planning.plan_file import Way
 from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
+from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
 from limber.robot.motion.execution import Blocked, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
@@ -30,6 +31,7 @@ _TURNS = 200  # directions from which a second arm may take a target
 _ROD_SPACING = 0.02  # [m] of points along a part of gripper or arm
 _POSE_SPACING = 0.01  # [m] that a part goes at most between poses that are looked at
 _BETWEEN = 0.006  # [m] by which parts are thicker for what lies between both
+_SIGHT_SPACING = 0.005  # [m] of points on a line of sight
 _LARGE = 20.0  # [m] an obstacle that is larger is in another unit
 
 
@@ -69,18 +71,46 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
     return tuple(found)
 
 
-def places_in(cell: Cell) -> dict[str, CellPlace]:
+def places_in(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str, CellPlace]:
     """Return what goals may ask of the cell: its camera's view and its second arm's reach."""
     found = {}
     if (view := _view_of(cell)) is not None:
-        found["in_view"] = CellPlace(view, view.require_seen)
+        found["in_view"] = CellPlace(view, partial(require_seen, view, obstacles), True,
+                                     "The camera does not see {what}")
     if cell.second_arm is not None:
         arm = arm_named(cell.second_arm.model)
         shoulder = matrices(np.array(cell.second_arm.base_pose)) @ np.r_[arm.shoulder, 1.0]
         x, y, z = map(float, shoulder[:3])
-        found["second_arm"] = CellPlace(Ball((x, y, z), arm.reach),
-                                        partial(require_taken, cell.second_arm))
+        found["second_arm"] = CellPlace(
+            Ball((x, y, z), _outer_reach(arm, cell.second_arm)),
+            partial(require_taken, cell.second_arm), False,
+            f"The second arm ({arm.name}) cannot take {{what}}")
     return found
+
+
+def _outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
+    """Return how far what an arm grasps is from its shoulder at most [m]: all links in line, and
+    the tool's length."""
+    joints = np.array(arm.home, float)
+    places = np.vstack([arm.shoulder, arm.link_frames(joints)[:, :3, 3],
+                        arm.forward(joints)[:3, 3]])
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+                 + np.linalg.norm(entry.grasp_pose[:3]))
+
+
+def require_seen(view: View, obstacles: tuple[Obstacle, ...], what: str, place: np.ndarray,
+                 surface: np.ndarray | None) -> None:
+    """Raise NoPathError where the branch's surface or an obstacle hides ``what`` at ``place`` [3].
+    """
+    if surface is not None:
+        view.require_seen(what, place, surface)
+    eye = view.frame[:3, 3]
+    count = int(np.ceil(np.linalg.norm(place - eye) / _SIGHT_SPACING)) + 1
+    hit = closest(obstacles, eye + np.linspace(0.0, 1.0, count)[:, None] * (place - eye))
+    if hit:
+        raise NoPathError(f"{hit[0]} hides {what} from the camera at the end of the path.",
+                          "It lies between them.",
+                          "Choose a --target-box on the camera's side, or move the camera.")
 
 
 def require_taken(entry: SecondArmEntry, what: str, place: np.ndarray, _surface: object) -> None:

@@ -1,0 +1,117 @@
+"""A field's error as a function of the place, and proofs that the full model is asked about."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.planning import closed_passages
+from limber.planning.certificate.feasibility import judge
+from limber.planning.closed_passages import checked_wall, confirmed
+from limber.planning.constraints.limits import Limits
+from limber.planning.cost import CostWeights
+from limber.planning.field.energy_field import EnergyField, fit_field
+from limber.planning.field.local_error import LocalError
+from limber.planning.goals.chosen_pose import default_goal
+from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.path_problem import GentleProblem, NoWayError
+
+
+def noisy(count, seed):
+    """Places in a cube and misses there, ten times as large on its right as on its left."""
+    generator = np.random.default_rng(seed)
+    places = generator.uniform(size=(count, 3))
+    return places, generator.normal(size=count) * np.where(places[:, 0] > 0.5, 1.0, 0.1)
+
+
+def test_an_error_covers_fresh_places_and_follows_the_place():
+    """Of fresh misses the share asked for, on both sides; less where samples are met better."""
+    error = LocalError.of(*noisy(300, 1), 0.95)
+    places, above = noisy(4000, 2)
+    stated = error.at(places)
+    assert 0.93 <= (above <= stated).mean() <= 0.98
+    left, right = places[:, 0] < 0.4, places[:, 0] > 0.6
+    assert np.median(stated[right]) > 4.0 * np.median(stated[left])
+    assert LocalError.of(*noisy(300, 1), 1.0).factor > error.factor
+    assert (LocalError.of(*noisy(300, 1), 1.0, most=0.3).at(places) <= 0.3).all()
+
+
+def test_what_is_too_little_adds_nothing_and_too_few_samples_say_nothing():
+    """Where a field says too little it closes nothing; of few samples the largest error counts."""
+    places, above = noisy(300, 1)
+    assert LocalError.of(places, -np.abs(above), 1.0).at(places).max() == 0.0
+    few = LocalError.of(places[:5], above[:5], 0.95, most=2.0)
+    assert (few.at(places) == 2.0).all()
+    unknown = LocalError.of(places, np.full(300, np.nan), 0.95)
+    assert (unknown.at(places) == np.inf).all()
+
+
+@pytest.fixture(scope="module")
+def half_rough(well):
+    """A strain with a wall across x = 0, which no fit can foretell where y is above 0."""
+    samples = well.samples(count=200)
+    generator = np.random.default_rng(1)
+    x, y = samples.positions[:, 0], samples.positions[:, 1]
+    rough = np.where(y > 0.0, 0.3, 0.003) * generator.uniform(-1.0, 1.0, len(x))
+    return fit_field(replace(samples, strains=1.0 + 2.0 * np.exp(-(x / 0.08)**2) + rough))
+
+
+def test_cells_close_by_the_error_of_their_place(half_rough):
+    """A limit that the largest error anywhere would leave in doubt closes the smooth half."""
+    start, goal = np.array([-0.12, -0.05, 0.0]), GraspGoal((0.12, -0.05, 0.0), 0.01)
+    limits = Limits(strain=2.2)
+    weights = CostWeights.between(half_rough, start, np.array(goal.position), deformation=1.0,
+                                  distance=1.5).weights
+    problem = GentleProblem(half_rough, limits.on(half_rough), weights, start, goal,
+                            beyond=limits.beyond(half_rough), errors=limits.errors(half_rough))
+    generator = np.random.default_rng(0)
+    points = half_rough.region.draw(500, generator)
+    spare = problem.spare("strain", points)
+    smooth = points[:, 1] < -0.05
+    assert spare[smooth].mean() > 2.0 * spare[points[:, 1] > 0.05].mean() >= 0.0
+    assert (replace(problem, errors={}).spare("strain", points) == 0.0).all()
+
+
+@pytest.fixture(scope="module")
+def real(planned_branch):
+    """The small branch's field, a goal on it and the force that it takes."""
+    field = EnergyField.read(planned_branch / "energy.npz")
+    goal = default_goal(field, 0.01)
+    return field, goal, float(np.linalg.norm(field.force(np.array([goal.position])), axis=1)[0])
+
+
+def test_a_wall_is_confirmed_by_the_full_model_or_refuted(real, small_model, monkeypatch):
+    """States over the limit confirm a proof; states that keep it, or that the field was farther
+    above than its error, refute it and are learnt."""
+    field, goal, held = real
+    monkeypatch.setattr(closed_passages, "_STATES", 2)
+    none = NoWayError("No path exists.", "Proven on a grid.", "").behind(
+        np.array([goal.position, goal.position]) - [[0.02, 0, 0], [0.033, 0, 0]])
+    low, high = Limits(force=0.3 * held), Limits(force=3.0 * held)
+    monkeypatch.setattr(Limits, "errors", lambda self, known: {})
+    check = checked_wall(field, small_model, low, none, workers=1)
+    assert check.learnt is None and check.solved == 2
+    assert "2 states of the full model, where the way is closed, confirm it" in str(
+        confirmed(none, check))
+    refuted = checked_wall(field, small_model, high, none, workers=1)
+    assert len(refuted.learnt.poses) == 2
+    again = small_model.follow(refuted.learnt.poses[:1, :3], small_model.rest.displacement)[0]
+    assert np.allclose(again.reaction_force, refuted.learnt.forces[0], atol=1e-3 * held)
+    wrong = LocalError(np.zeros((1, 3)), np.zeros(1), 1.0, 0.0, -1.0)  # the field says too much
+    monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
+    assert checked_wall(field, small_model, low, none, workers=1).learnt is not None
+    assert not NoWayError("Nothing.", "", "").wall.size
+
+
+def test_a_proof_tells_where_the_way_is_closed(half_rough):
+    """The wall lies between start and goal, and is over the limit there."""
+    start, goal = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
+    limits = Limits(strain=1.5)
+    weights = CostWeights.between(half_rough, start, np.array(goal.position), deformation=1.0,
+                                  distance=1.5).weights
+    found = judge(GentleProblem(half_rough, limits.on(half_rough), weights, start, goal,
+                                beyond=limits.beyond(half_rough),
+                                errors=limits.errors(half_rough)))
+    assert found.proven and len(found.wall) > 20
+    assert (np.abs(found.wall[:, 0]) < 0.1).all()
+    assert half_rough.load(found.wall, "strain").min() > 1.5

@@ -1,0 +1,112 @@
+"""A proof that no path exists, put to the full model.
+
+The proof is of the field with its error counted, and that error was measured at other places. So
+before it is passed on, the branch is solved where cells close the way: at those that are least over
+a limit, along the border of what the start reaches. Where the full model keeps the limits there, or
+is farther from the field than its error, the proof does not hold, and what was found is learnt.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from limber.core.progress import SILENT, Progress
+from limber.planning.constraints.limits import Limits, sampled_sizes
+from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.limited_quantities import limited
+from limber.planning.field.sampling import solve_branch
+from limber.planning.field.solved import samples_of
+from limber.planning.field.solver_pool import SolverPool
+from limber.planning.path_problem import UNPROVEN, NoWayError
+
+_STATES = 12  # of the branch that are solved
+_APART = 0.01  # [m] between them, and between them and known samples
+_LEARNT_APART = 0.5 * _APART
+
+
+@dataclass(frozen=True)
+class WallCheck:
+    """What the full model says where a way is closed.
+
+    Attributes:
+        solved: How many states have a solution.
+        learnt: What contradicts the proof, as samples; None where nothing does.
+    """
+
+    solved: int
+    learnt: GraspSamples | None
+
+
+def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: NoWayError, *,
+                 workers: int | None = None, progress: Progress = SILENT) -> WallCheck:
+    """Solve the branch where ``none`` says that the way is closed.
+
+    A pose without a solution is closed as well: the branch cannot be there.
+    """
+    places = _chosen(none.wall)
+    if not len(places):
+        return WallCheck(0, None)
+    with SolverPool(grasp_model, workers) as solvers:
+        good, _ = solve_branch(solvers, places, progress=progress)
+    states = good[1:]
+    if not states:
+        return WallCheck(0, None)
+    samples = samples_of(states, np.empty((0, 3)))
+    nodes = grasp_model.mesh.nodes + np.array([one.displacement for one in states])
+    samples = replace(samples, added=limits.values(samples.positions, nodes))
+    if not _contradicts(field, limits, samples).any():
+        return WallCheck(len(states), None)
+    away = np.linalg.norm(samples.positions[:, None] - field.samples.positions[None], axis=2)
+    new = np.flatnonzero(away.min(axis=1) > _LEARNT_APART)
+    return WallCheck(len(states), samples.take(new))
+
+
+def _chosen(wall: np.ndarray) -> np.ndarray:
+    """Return places [k, 3] of a wall [n, 3], the first of it first, each apart from the others;
+    half of them those that come first, half those far from all before."""
+    chosen: list[np.ndarray] = []
+    for place in wall:
+        if len(chosen) == _STATES // 2:
+            break
+        if all(np.linalg.norm(place - other) > _APART for other in chosen):
+            chosen.append(place)
+    while chosen and len(chosen) < _STATES:
+        away = np.linalg.norm(wall[:, None] - np.array(chosen)[None], axis=2).min(axis=1)
+        if away.max() <= _APART:
+            break
+        chosen.append(wall[int(away.argmax())])
+    return np.reshape(chosen, (-1, 3))
+
+
+def _contradicts(field: EnergyField, limits: Limits, samples: GraspSamples) -> np.ndarray:
+    """Return which states [n] keep all limits, or are farther below the field than its error."""
+    sizes, points = sampled_sizes(samples), samples.positions
+    errors, asked = limits.errors(field), limits.asked()
+    places = field.region.chart.plain.map(points)
+    over, off = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    for one in limited(field, limits.on(field)):
+        size = sizes[one.name]
+        if size is None:
+            continue
+        over |= np.abs(size) > asked[one.name]
+        if one.name in errors:
+            off |= one.size(points) - np.abs(size) > errors[one.name].at(places)
+    return ~over | off
+
+
+def confirmed(none: NoWayError, check: WallCheck) -> NoWayError:
+    """Return the error, saying that the full model bears it out."""
+    if not check.solved:
+        return none
+    return NoWayError(none.seen, f"{none.why} {check.solved} states of the full model, where the "
+                      "way is closed, confirm it.", none.fix)
+
+
+def not_confirmed(none: NoWayError, limits_in_words: str) -> NoWayError:
+    """Return the error of a proof that the full model does not bear out."""
+    return NoWayError(
+        f"No path to the goal with{limits_in_words or ' known poses'} was found, {UNPROVEN}.",
+        "The energy field, its error counted, leaves no path, but the full model differs from it "
+        "by more where the way is closed.",
+        "Relax the limits slightly, or sample more poses with `limber energy --samples`.")
