@@ -12,7 +12,6 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.local_error import LocalError
-from limber.planning.goals.chosen_pose import default_goal
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
 
@@ -73,21 +72,25 @@ def test_cells_close_by_the_error_of_their_place(half_rough):
 
 
 @pytest.fixture(scope="module")
-def real(planned_branch):
-    """The small branch's field, a goal on it and the force that it takes."""
+def apart(planned_branch):
+    """The small branch's field, two gentle poses far from its samples, and the forces there."""
     field = EnergyField.read(planned_branch / "energy.npz")
-    goal = default_goal(field, 0.01)
-    return field, goal, float(np.linalg.norm(field.force(np.array([goal.position])), axis=1)[0])
+    points = field.region.draw(2000, np.random.default_rng(0))
+    away = np.linalg.norm(points[:, None] - field.samples.positions[None], axis=2).min(axis=1)
+    points = points[away > 0.01]
+    points = points[np.argsort(field.energy(points))]
+    far = np.flatnonzero(np.linalg.norm(points - points[0], axis=1) > 0.03)[0]
+    places = points[[0, far]]
+    return field, places, np.linalg.norm(field.force(places), axis=1)
 
 
-def test_a_wall_is_confirmed_by_the_full_model_or_refuted(real, small_model, monkeypatch):
+def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, monkeypatch):
     """States over the limit confirm a proof; states that keep it, or that the field was farther
     above than its error, refute it and are learnt."""
-    field, goal, held = real
+    field, places, forces = apart
     monkeypatch.setattr(closed_passages, "_STATES", 2)
-    none = NoWayError("No path exists.", "Proven on a grid.", "").behind(
-        np.array([goal.position, goal.position]) - [[0.02, 0, 0], [0.033, 0, 0]])
-    low, high = Limits(force=0.3 * held), Limits(force=3.0 * held)
+    none = NoWayError("No path exists.", "Proven on a grid.", "").behind(places)
+    low, high = Limits(force=0.3 * forces.min()), Limits(force=3.0 * forces.max())
     monkeypatch.setattr(Limits, "errors", lambda self, known: {})
     check = checked_wall(field, small_model, low, none, workers=1)
     assert check.learnt is None and check.solved == 2
@@ -96,7 +99,7 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(real, small_model, mon
     refuted = checked_wall(field, small_model, high, none, workers=1)
     assert len(refuted.learnt.poses) == 2
     again = small_model.follow(refuted.learnt.poses[:1, :3], small_model.rest.displacement)[0]
-    assert np.allclose(again.reaction_force, refuted.learnt.forces[0], atol=1e-3 * held)
+    assert np.allclose(again.reaction_force, refuted.learnt.forces[0], atol=1e-3 * forces.max())
     wrong = LocalError(np.zeros((1, 3)), np.zeros(1), 1.0, 0.0, -1.0)  # the field says too much
     monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
     assert checked_wall(field, small_model, low, none, workers=1).learnt is not None
