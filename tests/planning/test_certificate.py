@@ -8,6 +8,7 @@ import pytest
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
 from limber.planning.certificate import lower_bound
+from limber.planning.certificate.grid import first_grid, refined
 from limber.planning.certificate.lower_bound import certify
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import knowing
@@ -241,6 +242,38 @@ def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
     assert kept.max() <= limit
     assert held.cost >= free.cost * (1 - 1e-6)
     assert held.certificate.lower <= held.cost
+
+
+def test_one_refinement_brings_the_end_to_the_goals_face(well_field):
+    """From the straight line to the goal's middle: the minimiser's first step must not be so long
+    that it gives up."""
+    problem = problem_on(well_field, deformation=0.0)
+    path, cost = refine(np.linspace(START, GOAL.position, 40), problem)
+    line = np.linalg.norm(np.array(GOAL.position) - START)
+    assert cost == pytest.approx(1.5 * (line - GOAL.tolerance) / line, rel=0.001)
+    assert -1e-4 < problem.goal_excess(path[-1]) <= 0.0
+
+
+def test_the_next_grid_is_as_fine_as_the_gap_asks_and_holds_what_was_kept(well_field):
+    """Cells of any share of the edge: the start in the centre of one, every kept cell covered, and
+    closed layers about them."""
+    grid, cell = first_grid(problem_on(well_field))
+    keep = np.zeros(grid.open_cells.shape, bool)
+    keep[tuple(cell)] = keep[tuple(cell + [1, 0, 0])] = keep[tuple(cell + [1, 1, 2])] = True
+    generator = np.random.default_rng(0)
+    inside = np.argwhere(keep)[generator.integers(3, size=300)] + generator.uniform(size=(300, 3))
+    points = grid.points(inside)
+    for ratio in (1.0 / 3.0, 0.47, 0.75):
+        finer, own = refined(grid, keep, keep, cell, ratio)
+        assert finer.spacing == pytest.approx(ratio * grid.spacing)
+        assert np.allclose(finer.points(own[None] + 0.5), START)
+        numbers = np.floor((points - finer.origin) @ finer.axes.T / finer.spacing).astype(int)
+        assert finer.open_cells[tuple(numbers.T)].all()
+        edge = np.ones(finer.open_cells.shape, bool)
+        edge[3:-3, 3:-3, 3:-3] = False
+        assert not finer.open_cells[edge].any()
+    exact = refined(grid, keep, keep, cell)[0]
+    assert exact.open_cells.sum() == 27 * keep.sum()
 
 
 def test_a_path_far_over_a_limit_is_given_up_soon(ridge_field, monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR
-from limber.planning.certificate.grid import CUT, Grid, spread
+from limber.planning.certificate.grid import COARSEST, Grid, spread
 from limber.planning.certificate.subsolution import Terrain, corner_values, second_differences
 from limber.planning.path_problem import GentleProblem
 
@@ -70,7 +70,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     # A next cell asks up to 4 of its edges away; its centre lies within ``half`` of this one's.
     return AboutGoal(whole(filled <= growth * 3.0 * half), whole(np.nan_to_num(cost)),
                       whole(inside), slack, bool(touching.any()),
-                      whole(filled <= growth * (half + 6.0 * h / CUT)))
+                      whole(filled <= growth * (half + 6.0 * h * COARSEST)))
 
 
 def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:

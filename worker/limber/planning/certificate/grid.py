@@ -8,8 +8,9 @@ from limber.planning.certificate.subsolution import RIM
 from limber.planning.path_problem import GentleProblem
 
 _FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
-CUT = 3
-"""Parts of a cell's edge from one grid to the next."""
+FINEST, COARSEST = 1.0 / 3.0, 0.75
+"""Of a cell's edge, from one grid to the next: at least and at most."""
+_ROUND_OFF = 1e-9  # of a cell
 _PAD = RIM + 1  # closed cells about the grid, for the coefficients and second differences there
 
 
@@ -74,25 +75,32 @@ def _axes(direction: np.ndarray) -> np.ndarray:
 
 
 def refined(grid: Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarray,
-             ) -> tuple[Grid, np.ndarray]:
-    """Return cells of a third the edge over ``keep``, in the smallest box; and the start's.
+            ratio: float = FINEST) -> tuple[Grid, np.ndarray]:
+    """Return cells of ``ratio`` times the edge over ``keep``, in the smallest box; and the start's.
 
-    A third, not a half: so the start stays in the centre of a cell.
+    The start stays in the centre of a cell. A new cell that overlaps a kept one is open.
     """
-    places = np.argwhere(keep)
-    # A closed layer of whole cells about them is as deep as ``_PAD`` new ones.
-    low = np.minimum(places.min(axis=0), cell) - 1
-    high = np.maximum(places.max(axis=0), cell) + 2
-    spacing = grid.spacing / CUT
+    places, centre = np.argwhere(keep), cell + 0.5
+    low, high = np.minimum(places.min(axis=0), cell), np.maximum(places.max(axis=0), cell) + 1
+    before = np.ceil((centre - low) / ratio - 0.5 - _ROUND_OFF).astype(int) + _PAD
+    after = np.ceil((high - centre) / ratio - 0.5 - _ROUND_OFF).astype(int) + _PAD + 1
+    first = centre - (before + 0.5) * ratio
+    overlapped = []
+    for axis, count in enumerate(before + after):
+        edges = first[axis] + ratio * np.arange(count)
+        overlapped.append([np.floor(edges + _ROUND_OFF).astype(int),
+                           np.floor(edges + ratio - _ROUND_OFF).astype(int)])
 
     def cut(cells: np.ndarray) -> np.ndarray:
-        box = cells[tuple(map(slice, low, high))]
-        for axis in range(3):
-            box = np.repeat(box, CUT, axis=axis)
-        return box
-    origin = grid.points(low[None].astype(float))[0]
-    return (Grid(origin, grid.axes, spacing, cut(keep), cut(about_goal)),
-            CUT * (cell - low) + CUT // 2)
+        padded = np.pad(cells, _PAD + 1)
+        found = np.zeros(tuple(before + after), bool)
+        for sides in np.ndindex(2, 2, 2):
+            which = [np.clip(overlapped[axis][side] + _PAD + 1, 0, padded.shape[axis] - 1)
+                     for axis, side in enumerate(sides)]
+            found |= padded[np.ix_(*which)]
+        return found
+    return (Grid(grid.points(first[None])[0], grid.axes, ratio * grid.spacing, cut(keep),
+                 cut(about_goal)), before)
 
 
 def descent(grid: Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:

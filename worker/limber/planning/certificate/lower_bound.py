@@ -22,7 +22,7 @@ from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.about_goal import about_goal
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, least_between, least_size
-from limber.planning.certificate.grid import CUT, Grid, descent, first_grid, refined
+from limber.planning.certificate.grid import COARSEST, FINEST, Grid, descent, first_grid, refined
 from limber.planning.certificate.subsolution import (
     RIM,
     Terrain,
@@ -44,7 +44,8 @@ from limber.planning.path_problem import (
 from limber.planning.search_files import CostToGo
 
 _MOST_CELLS = 800_000  # of any grid's tube; the next refinement is left away
-_LEVELS = 5
+_LEVELS = 6
+_RESERVE = 0.85  # of the edge that would do
 ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
 
@@ -156,10 +157,19 @@ class _Search:
         if self.upper <= (1.0 + self.enough) * self.lower:
             return True
         keep = found.keep(self.upper)
-        if CUT**3 * keep.sum() > _MOST_CELLS:
+        ratio = max(self._ratio(), float(np.cbrt(keep.sum() / _MOST_CELLS)))
+        if ratio > COARSEST:
             return True
-        self.grid, self.cell = refined(self.grid, keep, found.about_goal, self.cell)
+        self.grid, self.cell = refined(self.grid, keep, found.about_goal, self.cell, ratio)
         return False
+
+    def _ratio(self) -> float:
+        """Return the edge of the next grid's cells over this one's: as fine as it takes to close
+        the gap, which goes as the square of the edge."""
+        gap = self.upper / self.lower - 1.0 if self.lower > 0.0 else np.inf
+        if not np.isfinite(gap):
+            return FINEST
+        return float(np.clip(_RESERVE * np.sqrt(self.enough / gap), FINEST, COARSEST))
 
     def _note(self, open_cells: int) -> None:
         self.levels.append({"spacing_m": self.grid.spacing, "open_cells": open_cells,
@@ -215,6 +225,10 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     slopes = problem.weights.energy * grid.along_edges(force)
     ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
     goal = about_goal(problem, grid, ground)
+    if problem.longest < np.inf:
+        open_cells = _short_enough(problem, grid, open_cells, goal.near, cell)
+        ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing,
+                         problem.weights.length)
     if not goal.meets:
         if problem.goal.uncertainty(problem.energy_field) > 0.0:
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
@@ -226,6 +240,19 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     lower = spline_value(to_goal, cell) - slack
     return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
                    goal.near)
+
+
+def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
+                  cell: np.ndarray) -> np.ndarray:
+    """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
+    start and the cells ``near`` the goal."""
+    offsets = np.stack(np.indices(open_cells.shape), axis=-1) - cell
+    away = np.linalg.norm(offsets, axis=-1) + scipy.ndimage.distance_transform_edt(~near)
+    # Half a diagonal in the cell itself, as much in the goal's and at both ends of the way there.
+    within = open_cells & (grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest)
+    within[tuple(cell)] = True
+    together = scipy.ndimage.label(within, _NEAR)[0]
+    return together == together[tuple(cell)]
 
 
 def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ else the way that goes least over them.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
@@ -17,6 +18,9 @@ from limber.planning.cost import arc_lengths
 from limber.planning.path_problem import GentleProblem, no_way, not_found
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.refine import refine
+
+_GAIN = 1e-3  # of the cost, that refining a path once more has to bring
+_SAME_WAY = 0.05  # of a path's length: another way round a ridge is farther off
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     """
     best: list = [None, np.inf]
     verdicts: list[Verdict] = []
+    in_vain: list[bool] = []
 
     def found_from(paths: list[np.ndarray]) -> bool:
         for path in paths:
@@ -52,7 +57,13 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
 
     def improve(rough: np.ndarray | None) -> float:
         starts = [_straight(problem), *(others or [])] if rough is None else [rough]
+        before, along = best[1], rough is not None and best[0] is not None and _is_along(
+            rough, best[0])
+        if along and in_vain:
+            return before  # it leads to the same optimum again
         if found_from(starts):
+            if along and best[1] > (1.0 - _GAIN) * before:
+                in_vain.append(True)
             return best[1]
         if rough is not None:
             # Coarser cells than those that left it open will not settle it.
@@ -68,6 +79,13 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
 
     certificate = certify(problem, improve, enough=enough, progress=progress)
     return GentlePath(best[0], best[1], certificate)
+
+
+def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:
+    """Return whether a rough path [n, 3] keeps so near to a refined one [k, 3] that refined it
+    would be that one again."""
+    away = cKDTree(path).query(rough)[0]
+    return bool(away.max() <= _SAME_WAY * arc_lengths(path)[-1])
 
 
 def _easiest(problem: GentleProblem) -> list[np.ndarray]:

@@ -35,6 +35,9 @@ _HEAVIER = 5.0  # from a round to the next where limits are not kept much better
 _BETTER = 0.25
 _SETTLED = 3e-4  # change of the cost in a round, relative
 _MARGINS = (2e-5, 3e-4, 2e-3)  # [m] kept from the limits; the next where the last was not enough
+_FIRST_STEP = 0.1  # of an edge: so far the minimiser goes before it knows the curvature
+_FLAT = 1e-8  # slope to those units, of a cost of about 1
+_INSIDE = 1e-3  # of the goal's tolerance, that an end lies inside
 _STEP = 1e-5  # [m] of the two differences that are not worth a formula
 
 
@@ -97,11 +100,17 @@ class _Line:
         return self.chart.curved(both)
 
     def settle(self, flat: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
-        """Return the corners moved to where the augmented Lagrangian is least, and the cost."""
-        shape = flat[1:].shape
+        """Return the corners moved to where the augmented Lagrangian is least, and the cost.
+
+        The unknowns are the edges: so a step moves whole parts of the path, and the end with them,
+        as lightly as one corner (the length's second derivative is that of a chain of springs).
+        """
+        edges = np.diff(flat, axis=0)
+        units = _FIRST_STEP * float(np.linalg.norm(edges, axis=1).mean()) * self.units
 
         def moved(unknown: np.ndarray) -> np.ndarray:
-            return np.concatenate([flat[:1], unknown.reshape(shape) * self.units])
+            return np.concatenate([flat[:1], flat[0] + np.cumsum(
+                unknown.reshape(edges.shape) * units, axis=0)])
 
         def cost(unknown: np.ndarray) -> tuple[float, np.ndarray]:
             points = self.points(moved(unknown))
@@ -111,11 +120,12 @@ class _Line:
             to_corners = own[::2]
             to_corners[1:] += 0.5 * own[1::2]
             to_corners[:-1] += 0.5 * own[1::2]
-            return value + broken, (to_corners[1:] * self.units).ravel()
+            to_edges = np.cumsum(to_corners[:0:-1], axis=0)[::-1]
+            return value + broken, (to_edges * units).ravel()
 
         found = scipy.optimize.minimize(
-            cost, (flat[1:] / self.units).ravel(), jac=True, method="L-BFGS-B",
-            options={"maxiter": _ITERATIONS, "maxcor": 20})
+            cost, (edges / units).ravel(), jac=True, method="L-BFGS-B",
+            options={"maxiter": _ITERATIONS, "maxcor": 20, "gtol": _FLAT})
         flat = moved(found.x)
         return flat, smooth_cost(self.points(flat), self.problem.energy_field,
                                  self.problem.weights)[0]
@@ -203,7 +213,7 @@ class Limited:
                     outward = side * np.eye(3)[axis] / scale
                     yield _Excess((side * (points[:, axis] - bound) + self.margin) / scale,
                                   lambda push, outward=outward: push[:, None] * outward)
-        outside = (problem.goal_excess(points[-1]) + 1e-2 * problem.goal.tolerance) / scale
+        outside = (problem.goal_excess(points[-1]) + _INSIDE * problem.goal.tolerance) / scale
         yield _Excess(np.array([outside]), lambda push: self._at_end(points, push))
         if problem.longest < np.inf:
             yield self._on_length(points)
