@@ -397,7 +397,8 @@ class Plan(Result):
         shortest_path: Poses along the shortest path, shape [k, 6].
         energy: Energy integrated along the gentle path [J m].
         energy_saved: Against the shortest path [%].
-        cost: Of the gentle path on the energy field, as the planner weighs energy and length.
+        cost: Of the gentle path on the energy field, as the planner weighs energy and length;
+            with a ``max_detour`` the energy alone, integrated along it [J m].
         bound: No path costs less than that: the certificate.
         gap: Largest cost of the gentle path above that of the best one [%]; None if unknown.
     """

@@ -48,6 +48,8 @@ _LEVELS = 6
 _RESERVE = 0.85  # of the edge that would do
 ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
+COST, ENERGY = "cost", "energy_integral_jm"
+"""What a certificate bounds: the planner's cost, or the integral of energy [J m]."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Certificate:
         field_error_j: What was subtracted from the energy before bounding [J].
         to_go: The bound from anywhere, on the first grid.
         stopped: It was cancelled before it was close enough.
+        quantity: What is bounded, ``COST`` or ``ENERGY``.
     """
 
     lower: float
@@ -70,6 +73,7 @@ class Certificate:
     field_error_j: float = 0.0
     to_go: CostToGo | None = None
     stopped: bool = False
+    quantity: str = COST
 
     @property
     def gap(self) -> float:
@@ -83,7 +87,8 @@ class Certificate:
         gap = 100.0 * self.gap if np.isfinite(self.gap) else None
         levels = [{name: value if np.isfinite(value) else None for name, value in level.items()}
                   for level in self.levels]
-        return {"lower_bound": self.lower, "upper_bound": self.upper, "gap_percent": gap,
+        return {"quantity": self.quantity, "lower_bound": self.lower,
+                "upper_bound": self.upper, "gap_percent": gap,
                 "field_error_j": self.field_error_j, "levels": levels}
 
 
@@ -246,7 +251,7 @@ def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, ne
                   cell: np.ndarray) -> np.ndarray:
     """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
     start and the cells ``near`` the goal."""
-    offsets = np.stack(np.indices(open_cells.shape), axis=-1) - cell
+    offsets = np.moveaxis(np.indices(open_cells.shape), 0, -1) - cell
     away = np.linalg.norm(offsets, axis=-1) + scipy.ndimage.distance_transform_edt(~near)
     # Half a diagonal in the cell itself, as much in the goal's and at both ends of the way there.
     within = open_cells & (grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest)

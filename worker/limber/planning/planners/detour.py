@@ -1,15 +1,15 @@
 """The gentlest path that is not too long, and the trade between energy and length.
 
-Of all paths no longer than L the gentlest has the least integral of energy I. With a weight w on a
-metre, every path costs I + w length >= B(w), the certificate's bound; so one no longer than L has
+Of all paths no longer than L the gentlest has the least integral of energy I. None leaves the
+ellipsoid about start and goal whose points are reached and left within L: the bound counts on its
+cells alone. With a weight w on a metre, every path there costs I + w length >= B(w); so
 
     I >= B(w) - w L        for any w
 
-(weak duality: Boyd and Vandenberghe 2004, 5.2). The weight is sought at which the gentlest path is
-just short enough; there the bound is nearly met. Where the length jumps at a weight (energy over
-length is not convex: one way round a ridge, or the other) no weight gives a path that is just short
-enough. So from the short path and from the long one it is also sought directly, the length a limit;
-what the bound leaves open then is the jump's.
+(weak duality: Boyd and Vandenberghe 2004, 5.2). Where the length does not hold the path back, the
+least weights say most. Where it does, the best weight is what a metre more would save: the slope of
+the gentlest path's energy over the length. Where the length jumps at a weight (energy over length
+is not convex: one way round a ridge, or the other) what the bound leaves open is the jump's.
 """
 
 from dataclasses import dataclass, replace
@@ -19,18 +19,18 @@ import scipy
 
 from limber.core.errors import NoPathError
 from limber.core.progress import SILENT, Progress
+from limber.planning.certificate.lower_bound import ENERGY, ENOUGH
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.refine import refine
 
-_RANGE = (1e-2, 1e3)  # of the weight of a metre, times that which was given
-_STEPS = 8  # of the search for the weight
-_CLOSE = 2e-3  # of the length limit: near enough below it
-_ENOUGH = 0.001  # gap of the weighed cost: of the energy, a part of it, it is five to ten times
+_LIGHT = 1e-2  # of the weight of a metre that was given: the energy alone counts, nearly
+_SHORTER = (0.99, 0.97)  # of the length allowed: for the slope of the energy over it
+_BINDS = 0.998  # of the length allowed: a longer path is held back by it
+_UNUSED = 0.004  # of the energy, that the weight of a length left over may cost the bound
+_FINEST_GAP = 1e-3  # of the weighed cost, that is asked for
 _MOST_BOUNDS = 3
-_NEAR = 0.01  # of the energy: a bound so near needs no other
-_ROUGH = 0.03  # gap of the weighed cost above which a dearer metre tells more
 _STRIDE = 2.5
 _SPACING = 0.001  # [m] at which a path's integral is taken
 
@@ -52,7 +52,7 @@ class DetourPath:
     """The gentlest path within a length.
 
     Attributes:
-        found: Path and certificate at the weight that was found.
+        found: Path, and the certificate of what was asked: of the integral of energy [J m].
         weight: That weight, relative to the problem's.
         shortest, longest: Length of the shortest path known, and what was allowed [m].
         energy_integral: Of the path [J m]. energy_bound: No path so short has less.
@@ -69,11 +69,10 @@ class DetourPath:
 
     def describe(self) -> dict:
         """Return it as plain data."""
-        bound = max(self.energy_bound, 0.0)
-        gap = 100.0 * (self.energy_integral / bound - 1.0) if bound > 0.0 else None
         return {"shortest_m": self.shortest, "longest_m": self.longest, "weight": self.weight,
-                "energy_integral_jm": self.energy_integral, "energy_bound_jm": bound,
-                "gap_percent": gap, "curve": [vars(point) for point in self.curve]}
+                "energy_integral_jm": self.energy_integral, "energy_bound_jm": self.energy_bound,
+                "gap_percent": self.found.certificate.describe()["gap_percent"],
+                "curve": [vars(point) for point in self.curve]}
 
 
 def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
@@ -83,53 +82,93 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
     Raises:
         NoPathError: there is no path at all; says whether that is proven.
     """
-    least = arc_lengths(shortest)[-1]
-    longest = float((1.0 + max_detour) * least)
-    search = _Search(problem, longest, [shortest, *others])
-    for step in range(_STEPS):
-        progress(0.5 * step / _STEPS, "weighing length against energy", length=search.last_length)
-        if not search.step():
-            break
-    bounds = _Bounds(problem, search)
-    weight = search.first_weight()
+    least = float(arc_lengths(shortest)[-1])
+    search = _Search(problem, shortest, (1.0 + max_detour) * least)
+    progress(0.0, "refining paths of the allowed length")
+    search.begin(others)
+    weight: float | None = search.first_weight()
     for number in range(_MOST_BOUNDS):
-        part = progress.part(0.5 + 0.4 * number / _MOST_BOUNDS, 0.5 + 0.4 * (number + 1)
+        part = progress.part(0.2 + 0.8 * number / _MOST_BOUNDS, 0.2 + 0.8 * (number + 1)
                              / _MOST_BOUNDS)
-        weight = bounds.ask(weight, part)
+        weight = search.bound(weight, part)
         if weight is None:
             break
-    if not bounds.stopped:
-        progress(0.95, "refining the path of the allowed length")
-    return search.result(bounds.best, bounds.best_weight, float(least), bounds.stopped)
+    return search.result(least)
 
 
-class _Bounds:
-    """The dual's ascent: bounds at a few weights, and which weight to try next."""
+class _Search:
+    """The gentlest path of the allowed length, and bounds at a few weights."""
 
-    def __init__(self, problem: GentleProblem, search: "_Search"):
-        self.problem, self.search = problem, search
+    def __init__(self, problem: GentleProblem, shortest: np.ndarray, longest: float):
+        self.problem, self.longest = problem, longest
+        self.path, self.shortest = shortest, shortest
+        self.length, self.integral = _measured(shortest, problem)
+        self.slope = 0.0  # [J] what a metre more saves
+        self.curve: list[TradePoint] = []
         self.best: GentlePath | None = None
         self.best_weight, self.value = np.nan, -np.inf
+        self.levels: list[dict[str, float]] = []
         self.low, self.high = 0.0, np.inf
-        self.stopped = False
 
-    def ask(self, weight: float, progress: Progress) -> float | None:
-        """Bound at a weight; returns the next one, None where none is worth its time."""
-        search, weighed = self.search, _weighed(self.problem, weight)
-        found = plan_gentle(weighed, [search.short_path], enough=_ENOUGH, progress=progress)
-        self.stopped = found.certificate.stopped
-        search.add(weight, found.points, found.certificate.lower)
-        last = search.curve[-1]
-        value = last.lower_bound_jm - last.metre_jm * search.longest
+    def begin(self, others: list[np.ndarray]) -> None:
+        """Find the gentlest path from those known, and what a metre more saves.
+
+        Raises:
+            NoPathError: the shortest path is not allowed.
+        """
+        light = _weighed(self.problem, _LIGHT)
+        free = [refine(path, light)[0] for path in (self.shortest, *others)]
+        limited = replace(light, longest=self.longest)
+        for path in [self.shortest, *others, *free]:
+            self._take(refine(path, limited)[0])
+        if not np.isfinite(limited.cost(self.path)):
+            raise NoPathError("No allowed path was found as a starting point.",
+                              "Refinement of the known paths ended outside the limits.",
+                              "Sample more poses with `limber energy --samples`.")
+        for path in free:
+            self._note(_LIGHT, *_measured(path, self.problem))
+        if self.length < _BINDS * self.longest:
+            return
+        for share in _SHORTER:
+            path, cost = refine(self.path, replace(light, longest=share * self.longest))
+            if np.isfinite(cost):
+                length, integral = _measured(path, self.problem)
+                self._note(0.0, length, integral)
+                if length < self.length:
+                    self.slope = max((integral - self.integral) / (self.length - length), 0.0)
+                    break
+
+    def first_weight(self) -> float:
+        """Return the weight whose bound is asked for first."""
+        metre = self.problem.weights.length / self.problem.weights.energy
+        spare = max(self.longest - self.length, (1.0 - _BINDS) * self.longest)
+        light = _UNUSED * self.integral / spare
+        return max(self.slope, min(light, self.integral / self.longest)) / metre
+
+    def bound(self, weight: float, progress: Progress) -> float | None:
+        """Bound at a weight; return the next one, None where none is worth its time."""
+        energy, metre = self.problem.weights.energy, (
+            weight * self.problem.weights.length / self.problem.weights.energy)
+        asked = replace(_weighed(self.problem, weight), longest=self.longest)
+        # The gap that is asked for is the energy's: of the weighed cost it is a part.
+        wanted = self.integral / (1.0 + ENOUGH) + metre * self.longest
+        enough = max((self.integral + metre * self.length) / wanted - 1.0, _FINEST_GAP)
+        found = plan_gentle(asked, [self.path], enough=enough, progress=progress)
+        self._take(found.points)
+        length, integral = _measured(found.points, self.problem)
+        lower = found.certificate.lower / energy
+        self._note(weight, length, integral, lower, metre)
+        value = lower - metre * self.longest
         if value > self.value:
             self.best, self.best_weight, self.value = found, weight, value
-        if last.length_m > search.longest:
-            search.long_path = found.points
-        if self.stopped or value >= (1.0 - _NEAR) * search.gentlest_short(found.points):
+            self.levels = [level | {"lower": max(
+                level["lower"] / energy - metre * self.longest, 0.0), "upper": self.integral}
+                for level in found.certificate.levels]
+        if found.certificate.stopped or self.integral <= (1.0 + ENOUGH) * value:
             return None
-        spare = last.metre_jm * (search.longest - last.length_m)
-        unsure = found.cost / self.problem.weights.energy - last.lower_bound_jm
-        if spare < 0.0 or (found.certificate.gap > _ROUGH and unsure > spare):
+        spare = metre * (self.longest - length)
+        unsure = found.cost / energy - lower
+        if spare < unsure and self.length >= _BINDS * self.longest:
             self.low = weight
         elif spare > unsure:
             self.high = weight
@@ -139,81 +178,29 @@ class _Bounds:
             return float(np.sqrt(self.low * self.high))
         return weight * _STRIDE if self.low > 0.0 else weight / _STRIDE
 
+    def _take(self, path: np.ndarray) -> None:
+        """Keep a path where it is short enough, allowed and gentler than what is known."""
+        length, integral = _measured(path, self.problem)
+        allowed = np.isfinite(replace(self.problem, longest=self.longest).cost(path))
+        if allowed and integral < self.integral:
+            self.path, self.length, self.integral = path, length, integral
 
-class _Search:
-    """Bisection of the weight: length falls as it grows."""
+    def _note(self, weight: float, length: float, integral: float, lower: float | None = None,
+              metre: float = 0.0) -> None:
+        self.curve.append(TradePoint(weight, length, integral, lower, metre))
 
-    def __init__(self, problem: GentleProblem, longest: float, starts: list[np.ndarray]):
-        self.problem, self.longest, self.starts = problem, longest, starts
-        self.low, self.high = np.log(_RANGE)
-        self.curve: list[TradePoint] = []
-        self.short_weight, self.short_path = _RANGE[1], starts[0]
-        self.long_path: np.ndarray | None = None
-        self.last_length = np.nan
-
-    def step(self) -> bool:
-        """Try one weight; returns whether another one is worth it."""
-        weight = float(np.exp(self.low if not self.curve else 0.5 * (self.low + self.high)))
-        weighed = _weighed(self.problem, weight)
-        tried = [refine(path, weighed) for path in self.starts]
-        path, cost = min(tried, key=lambda item: item[1])
-        if not np.isfinite(cost):
-            raise NoPathError("No allowed path was found as a starting point.",
-                              "Refinement of the known paths ended outside the limits.",
-                              "Sample more poses with `limber energy --samples`.")
-        self.add(weight, path, None)
-        # From here on the neighbouring weight's path is start enough.
-        self.starts = [path, self.short_path]
-        if self.last_length > self.longest:
-            self.low, self.long_path = np.log(weight), path
-            return True
-        first = len(self.curve) == 1
-        self.high, self.short_weight, self.short_path = np.log(weight), weight, path
-        return not first and self.last_length < (1.0 - _CLOSE) * self.longest
-
-    def add(self, weight: float, path: np.ndarray, bound: float | None) -> None:
-        """Note what a weight gave; ``bound`` on the weighed cost."""
-        energy = self.problem.weights.energy
-        self.last_length, integral = _measured(path, self.problem)
-        self.curve.append(TradePoint(
-            weight, self.last_length, integral, None if bound is None else bound / energy,
-            weight * self.problem.weights.length / energy))
-
-    def first_weight(self) -> float:
-        """Return the weight whose bound is asked for first.
-
-        That of the search where the length holds the path back. Where it does not, any smaller one
-        proves as much, but where a metre costs nearly nothing the grid tells little: that at which
-        the length allowed costs as much as the energy.
-        """
-        if self.long_path is not None:
-            return self.short_weight
-        last = self.curve[-1]
-        return last.energy_integral_jm * last.weight / (last.metre_jm * self.longest)
-
-    def gentlest_short(self, *others: np.ndarray) -> float:
-        """Take the gentlest of the short enough paths that are known, or follow from the short and
-        the long one with the length as a limit; return its integral of energy [J m]."""
-        limited = replace(_weighed(self.problem, _RANGE[0]), longest=self.longest)
-        starts = [self.short_path] if self.long_path is None else [self.short_path, self.long_path]
-        known = [self.short_path, *others, *(refine(path, limited)[0] for path in starts)]
-        measured = [_measured(path, self.problem) for path in known]
-        integral, number = min((integral, number) for number, (length, integral)
-                               in enumerate(measured) if length <= self.longest * (1.0 + 1e-9))
-        self.short_path = known[number]
-        return integral
-
-    def result(self, found: GentlePath, weight: float, shortest: float, stopped: bool,
-               ) -> DetourPath:
-        """Return the gentlest of the short enough paths that are known, and the best bound."""
-        bounds = [p.lower_bound_jm - p.metre_jm * self.longest for p in self.curve
-                  if p.lower_bound_jm is not None]
-        integral = self.gentlest_short()
-        cost = _weighed(self.problem, weight).cost(self.short_path)
-        found = GentlePath(self.short_path, cost, replace(found.certificate, upper=cost,
-                                                                    stopped=stopped))
-        return DetourPath(found, weight, shortest, self.longest, integral, max(bounds),
-                          tuple(sorted(self.curve, key=lambda point: point.weight)))
+    def result(self, least: float) -> DetourPath:
+        """Return the gentlest path of the allowed length, and the best bound."""
+        assert self.best is not None
+        bound = min(max(self.value, 0.0), self.integral)
+        proof = replace(self.best.certificate, lower=bound, upper=self.integral,
+                        levels=self.levels, quantity=ENERGY)
+        cost = _weighed(self.problem, self.best_weight).cost(self.path)
+        self._note(0.0, *_measured(self.shortest, self.problem))
+        self._note(0.0, self.length, self.integral)
+        return DetourPath(GentlePath(self.path, cost, proof), self.best_weight, least,
+                          self.longest, self.integral, bound,
+                          tuple(sorted(self.curve, key=lambda point: point.length_m)))
 
 
 def _weighed(problem: GentleProblem, weight: float) -> GentleProblem:

@@ -204,7 +204,9 @@ def convergence(plan: PlanFile) -> "Figure":
 def certificate(plan: PlanFile) -> "Figure":
     """Draw how the lower and the upper bound on the best path's cost close, grid by grid."""
     levels = plan.summary["certificate"]["levels"]
-    figure, axis = chart(6, 3.2, "cell size of the grid [mm]", "cost", has_grid=True)
+    of_energy = plan.summary["certificate"].get("quantity") == "energy_integral_jm"
+    figure, axis = chart(6, 3.2, "cell size of the grid [mm]",
+                         "energy along the path [J m]" if of_energy else "cost", has_grid=True)
     spacing = 1e3 * np.array([level["spacing_m"] for level in levels])
     lower, upper = (np.array([level[name] for level in levels], float)
                     for name in ("lower", "upper"))

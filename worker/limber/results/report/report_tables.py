@@ -57,6 +57,9 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
             continue
         change = f"{100 * (after / before - 1):+.1f} %" if before else "-"
         rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
+    gap = (plan.get("certificate") or {}).get("gap_percent")
+    if gap is not None:
+        rows.append(["above the best possible path, at most [%]", "", f"{gap:.2g}", ""])
     return rows
 
 
