@@ -124,8 +124,8 @@ def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath)
     if gap is not None and gap > _WIDE_GAP:
         takes = "cost" if summary["certificate"]["quantity"] == COST else "take"
         energy = "" if takes == "cost" else "energy "
-        doubts.append(f"The path may {takes} up to {gap:.1f} % more {energy}than the best possible "
-                      "one" + ("." if summary["planner"] == "eikonal" else "; `--planner eikonal` comes closest."))
+        doubts.append(f"The path may {takes} up to {gap:.1f} % more {energy}than the best "
+                      "possible one" + ("." if summary["planner"] == "eikonal" else "; `--planner eikonal` comes closest."))
     shortest, gentle = (summary[key]["length_m"] for key in ("baseline", "plan"))
     if shortest > _LONGER * gentle:
         doubts.append("The path called shortest is longer than the gentle one: in a large goal "

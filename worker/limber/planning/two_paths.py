@@ -8,9 +8,10 @@ import numpy as np
 
 from limber.core.errors import InputError, NoPathError
 from limber.core.progress import SILENT, Progress
+from limber.planning.certificate.feasibility import judge
 from limber.planning.certificate.lower_bound import Certificate
 from limber.planning.constraints.limits import Limits
-from limber.planning.cost import STEP, CostWeights
+from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.limited_quantities import UNITS
 from limber.planning.field.local_error import LocalError
@@ -25,7 +26,7 @@ from limber.planning.goals.grasp_goal import near
 from limber.planning.path_problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
-from limber.planning.planners.gentle import GentlePath, plan_gentle
+from limber.planning.planners.gentle import GentlePath, plan_gentle, separated
 from limber.planning.planners.refine import refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
@@ -85,6 +86,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     """
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
+    _check_any_way(field, start, goal, limits, asked or limits)
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
@@ -108,6 +110,26 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
         found = _in_doubt(error, field, start, goal, settings, limits, surely,
                           errors=errors, before=before, progress=progress.part(0.5, 1.0))
     return replace(found, margins=none)
+
+
+def _check_any_way(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
+                   asked: Limits) -> None:
+    """Raise NoWayError where cells prove at once that no path keeps the limits: before any search
+    for one."""
+    if not limits.asked():
+        return
+    problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
+                            beyond=asked.beyond(field), errors=asked.errors(field))
+    verdict = judge(problem)
+    if not verdict.proven:
+        return
+    none = separated(problem, verdict)
+    try:
+        goal_points(goal, field, problem.limits)
+    except GoalOverLimitsError as nobody:
+        raise NoWayError(nobody.seen, f"{nobody.why} {none.why}", nobody.fix).behind(
+            none.wall) from nobody
+    raise none
 
 
 def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goal,

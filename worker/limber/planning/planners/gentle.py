@@ -15,7 +15,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
-from limber.planning.path_problem import GentleProblem, no_way, not_found
+from limber.planning.path_problem import GentleProblem, NoWayError, no_way, not_found
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.refine import refine
 
@@ -73,12 +73,17 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
         way = verdicts[0].way
         known = (way is not None and found_from([way])) or found_from(_easiest(problem))
         if not known and verdicts[0].proven:
-            raise no_way(problem, f"This is proven on {_grid(verdicts[0])}: forbidden cells "
-                         "separate the start from the goal.").behind(verdicts[0].wall)
+            raise separated(problem, verdicts[0])
         return best[1]
 
     certificate = certify(problem, improve, enough=enough, progress=progress)
     return GentlePath(best[0], best[1], certificate)
+
+
+def separated(problem: GentleProblem, verdict: Verdict) -> NoWayError:
+    """Return the error for a goal that cells separate from the start."""
+    return no_way(problem, f"This is proven on {_grid(verdict)}: forbidden cells separate the "
+                  "start from the goal.").behind(verdict.wall)
 
 
 def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:

@@ -46,15 +46,15 @@ def plan_section(branch: Branch, name: str) -> Section:
     if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
         detour = plan.get("detour")
         section.text.append(
-            f"Certificate: on the energy field, its cost is at most {gap:.2g} % above that of the "
+            f"Certificate: on the energy field, its cost is at most {gap:.1f} % above that of the "
             "best possible path. No path costs less than the lower bound." if not detour else
-            f"Certificate: on the energy field, its energy is at most {gap:.2g} % above that of "
+            f"Certificate: on the energy field, its energy is at most {gap:.1f} % above that of "
             f"the gentlest path no longer than {detour['longest_m']:.3f} m.")
     if whole := (plan.get("certificate") or {}).get("full_model"):
         if whole["gap_percent"] is not None:
             section.text.append(
-                f"On the full model, this is at most {whole['gap_percent']:.2g} %; the field has an error of "
-                f"{1e3 * whole['field_error_j']:.2g} mJ.")
+                f"On the full model, this is at most {whole['gap_percent']:.1f} %; the field has "
+                f"an error of {1e3 * whole['field_error_j']:.2g} mJ.")
     if moving := plan.get("in_motion"):
         peaks = ", ".join(f"{key} {peak['moving']:.3g} ({peak['standing']:.3g} quasi-static)"
                           for key, peak in moving["peaks"].items())

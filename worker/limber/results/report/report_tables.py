@@ -59,7 +59,7 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
         rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
     gap = (plan.get("certificate") or {}).get("gap_percent")
     if gap is not None:
-        rows.append(["above the best possible path, at most [%]", "", f"{gap:.2g}", ""])
+        rows.append(["above the best possible path, at most [%]", "", f"{gap:.1f}", ""])
     return rows
 
 
