@@ -7,8 +7,21 @@ Where Blender's numpy may be too old for them, they bring another one, in a fold
 itself does not search.
 """
 
+import json
 import os
 import sys
+
+
+def not_loaded(error: ImportError) -> int:
+    """Say that the worker does not load, as it says what fails; return the exit code."""
+    python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
+    told = (f"Limber's worker does not load ({error}). Its wheels are incomplete, or are for "
+            f"another Blender. Install the extension's zip for this system and {python} again.")
+    if "--json" in sys.argv:
+        print(json.dumps({"status": "failed", "error": told}), flush=True)
+    print(f"error: {told}", file=sys.stderr)
+    return 3
+
 
 if __name__ == "__main__":
     folder = sys.argv.pop(1)
@@ -16,6 +29,9 @@ if __name__ == "__main__":
     searched = [own_numpy, folder] if os.path.isdir(own_numpy) else [folder]
     os.environ["PYTHONPATH"] = os.pathsep.join(searched)
     sys.path[:1] = searched
-    from limber.cli.main import run
+    try:
+        from limber.cli.main import run
+    except ImportError as error:
+        sys.exit(not_loaded(error))
 
     run()

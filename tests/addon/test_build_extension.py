@@ -2,6 +2,7 @@
 
 import importlib.machinery
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -105,6 +106,36 @@ def test_the_workers_numpy_is_found_by_the_worker_alone(build, tmp_path):
     assert blender.stdout.strip() != "9.9"
 
 
+def test_the_zip_is_for_the_blenders_with_its_python(build):
+    """Another Blender refuses it before it unpacks anything; a Python that none has is refused."""
+    plain = (ROOT / "addon" / "blender_manifest.toml").read_text()
+    wheel = Path("a-1.0-py3-none-any.whl")
+    made = {python: tomllib.loads(build.with_wheels(plain, [wheel], "linux-x64", python))
+            for python in ("3.11", "3.13")}
+    assert [(each["blender_version_min"], each.get("blender_version_max"))
+            for each in made.values()] == [("4.2.0", "5.1.0"), ("4.3.0", None)]
+    assert made["3.11"]["wheels"] == [f"./wheels/{wheel.name}"]
+    assert made["3.11"]["permissions"] == tomllib.loads(plain)["permissions"]
+    with pytest.raises(SystemExit, match=r"no Blender has Python 3\.14.*3\.11, 3\.13"):
+        build.blender_versions("3.14")
+
+
+def test_a_worker_that_does_not_load_says_what_to_do(tmp_path):
+    """Wheels of another Python or a numpy too old: a sentence, not a trace."""
+    package = tmp_path / "limber" / "cli"
+    package.mkdir(parents=True)
+    for folder in (package, package.parent):
+        (folder / "__init__.py").touch()
+    (package / "main.py").write_text("import numpy_that_is_too_old")
+    done = subprocess.run([sys.executable, ROOT / "addon" / "bundled.py", tmp_path, "plan",
+                           "--json"], check=False, capture_output=True, text=True)
+    assert done.returncode == 3 and "Traceback" not in done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert told["status"] == "failed"
+    assert "numpy_that_is_too_old" in told["error"]
+    assert "Install the extension's zip" in told["error"]
+
+
 def test_a_python_without_the_tools_is_told_in_one_line(build, tmp_path, monkeypatch):
     """A system's Python with an old setuptools: .venv's is taken, or it is said what is missing."""
     lacking, root = tmp_path / "lacking", tmp_path / "root"
@@ -180,3 +211,24 @@ def test_an_invalid_manifest_is_refused(tmp_path, bpy):
     manifest.write_text(manifest.read_text().replace("scanned ones do", "scanned ones do."))
     with pytest.raises(AssertionError, match="tagline"):
         _build(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("refusals", "says"), [(2, "installed"), (1000, "could not install")])
+def test_provisioning_waits_for_apts_lock(tmp_path, refusals, says):
+    """Another apt holds it for a while: tried again; for ever: said with apt's own words."""
+    apt = f"""cd {tmp_path}; n=$(cat n 2>/dev/null || echo 0); echo $((n + 1)) > n
+        [ "$n" -ge {refusals} ] || {{ echo "E: Could not get lock x" >&2; exit 100; }}"""
+    stubs = {"apt-get": apt, "sleep": f"echo $1 >> {tmp_path}/slept"}
+    for name, body in stubs.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{body}\n")
+        (tmp_path / name).chmod(0o755)
+    script = (ROOT / "scripts" / "provision_blender").read_text()
+    functions = script[script.index("say() {"):script.index("debian_mirror() {")]
+    done = subprocess.run(
+        ["bash", "-c", f"{functions}\ninstall_on_host no-such-program a && echo installed"],
+        check=False, capture_output=True, text=True,
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin"})
+    assert says in done.stdout + done.stderr
+    waits = (tmp_path / "slept").read_text().split()
+    assert waits == ["5"] * min(refusals, 60)
+    assert ("Could not get lock" in done.stderr) == (refusals > 60)

@@ -5,6 +5,7 @@ import errno
 import gc
 import io
 import os
+import re
 import shutil
 import weakref
 from pathlib import Path
@@ -147,6 +148,10 @@ def test_what_is_the_machines_and_what_is_not():
     assert isinstance(full, WorkError) and "/a/b cannot be written" in str(full)
     assert isinstance(machine_error(PermissionError(errno.EROFS, "Read-only", "/a")), InputError)
     assert "memory" in str(machine_error(MemoryError()))
+    lost = machine_error(ModuleNotFoundError("No module named 'numpy.exceptions'",
+                                             name="numpy.exceptions"))
+    assert re.match(r"numpy\.exceptions does not load .*do not fit.*install the extension's zip",
+                    str(lost))
     assert machine_error(FileNotFoundError(errno.ENOENT, "No such file", "/a")) is None
     # Without a file it may be a robot's connection.
     assert machine_error(TimeoutError(errno.ETIMEDOUT, "timed out")) is None

@@ -1,10 +1,12 @@
-"""What the machine does to a program, in words: a full disk, a lost folder, no memory."""
+"""What the machine does to a program, in words: a full disk, a lost folder, no memory, packages
+that do not load."""
 
 import errno
 import re
+import sys
 from pathlib import Path
 
-from limber.core.errors import InputError, LimberError, WorkError
+from limber.core.errors import InputError, LimberError, MissingDependencyError, WorkError
 
 
 def _codes(*names: str) -> frozenset[int]:
@@ -36,6 +38,8 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
     """
     if isinstance(error, MemoryError):
         return WorkError("Out of memory.", "", "Use a coarser mesh or a thinner cloud.")
+    if isinstance(error, ImportError):
+        return _not_loaded(error)
     if not isinstance(error, OSError):
         return None
     name = error.filename2 or error.filename or place or "A file"
@@ -67,3 +71,12 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
                           "It is read-only, or belongs to another user.",
                           "Change its permissions, or work on a copy.")
     return None
+
+
+def _not_loaded(error: ImportError) -> LimberError:
+    python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
+    return MissingDependencyError(
+        f"{error.name or 'A package'} does not load ({error}).",
+        f"The installed packages are incomplete, or do not fit each other or {python}.",
+        f"In Blender, install the extension's zip for this system and {python} again. Elsewhere, "
+        "install Limber anew with pip.")
