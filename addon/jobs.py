@@ -7,16 +7,14 @@ from Blender's main thread.
 import atexit
 import enum
 import json
-import os
 import queue
-import signal
 import subprocess
 import threading
 import time
 from collections import deque
 from typing import Any
 
-from .worker import worker_environment
+from .worker_process import WorkerProcess
 
 _GRACE_SECONDS = 8.0
 _SILENT_SECONDS = 20.0
@@ -27,7 +25,6 @@ _LEAST_CPU_SECONDS = 0.05
 """Of work within a beat; a sign of life itself takes some thousandths."""
 _KNOWN_SHARE, _KNOWN_SECONDS = 0.03, 3.0
 """How much must be done before the rest can be foretold."""
-_POSIX = os.name == "posix"
 
 
 def _what_to_do(code: int) -> str:
@@ -86,16 +83,11 @@ class Job:
         self._cancelled_at: float | None = None
         self._started_at = self._heard_at = self._worked_at = 0.0
         self._cpu_seconds = 0.0
-        self._process: subprocess.Popen | None = None
+        self._process: WorkerProcess | None = None
 
     def launch(self) -> None:
         """Start the process; OSError where the program cannot be started."""
-        self._process = subprocess.Popen(
-            self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True, encoding="utf-8", errors="replace",
-            # Its input closes when Blender ends, however that comes; then it ends too.
-            env=worker_environment() | {"LIMBER_PARENT_PIPE": "stdin"},
-            start_new_session=_POSIX)
+        self._process = WorkerProcess(self.command, LIMBER_PARENT_PIPE="stdin")
         self.state, self.message = JobState.RUNNING, "starting"
         self._started_at = self._heard_at = self._worked_at = time.monotonic()
         self._readers = [
@@ -124,7 +116,7 @@ class Job:
             self._process.stdin.close()
             self._finish(code)
         elif self._cancelled_at and time.monotonic() - self._cancelled_at > _GRACE_SECONDS:
-            self._signal(kill=True)
+            self._process.end_now()
         return self.state
 
     def wait(self) -> JobState:
@@ -161,18 +153,18 @@ class Job:
         elif self.state is JobState.RUNNING and self._cancelled_at is None:
             self._cancelled_at = time.monotonic()
             self.message = "stopping"
-            self._signal(kill=False)
+            self._process.ask_to_end()
 
     def stop_now(self) -> None:
         """End the worker immediately because Blender is closing."""
         if self.state is JobState.WAITING:
             self._give_up("")
         elif self._process is not None and self._process.poll() is None:
-            self._signal(kill=False)
+            self._process.ask_to_end()
             try:
                 self._process.wait(1.0)
             except subprocess.TimeoutExpired:
-                self._signal(kill=True)
+                self._process.end_now()
                 self._process.wait(5.0)
 
     def _give_up(self, why: str) -> None:
@@ -225,18 +217,6 @@ class Job:
             # What was to go on from there has nothing to go on from.
             for job in [job for job in _waiting if job.folder == self.folder]:
                 job._give_up(f"not run because {self.title} failed before it")
-
-    def _signal(self, *, kill: bool) -> None:
-        try:
-            if _POSIX:
-                # The whole group: a mesher or a pool may be running under the worker.
-                os.killpg(self._process.pid, signal.SIGKILL if kill else signal.SIGTERM)
-            elif kill:
-                self._process.kill()
-            else:
-                self._process.terminate()
-        except ProcessLookupError:
-            return
 
 
 def _is_fraction(value: Any) -> bool:

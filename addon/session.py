@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .worker import worker_environment
+from .worker_process import WorkerProcess
 
 PROTOCOL = 2
 _MAGIC = b"LIMBPOS2"
@@ -119,9 +119,7 @@ class Session:
         self._ids = 0
         self._said: deque[str] = deque(maxlen=20)
         self._lines: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True, encoding="utf-8", errors="replace", env=worker_environment())
+        self._process = WorkerProcess(command)
         for name, stream in (("out", self._process.stdout), ("err", self._process.stderr)):
             threading.Thread(target=self._read, args=(name, stream), daemon=True).start()
         _open.append(self)
@@ -201,7 +199,7 @@ class Session:
             self._process.stdin.close()
             self._process.wait(2.0)
         except (OSError, subprocess.TimeoutExpired):
-            self._process.kill()
+            self._process.end_now()
             self._process.wait()
             if path := self.hello.get("positions"):
                 Path(path).unlink(missing_ok=True)
