@@ -90,6 +90,30 @@ def current_folder(scene: bpy.types.Scene) -> Path | None:
     return Path(bpy.path.abspath(path)) if path else None
 
 
+def current_uuid(scene: bpy.types.Scene) -> str:
+    """Return which branch is the current one, as it was opened; nothing where it is not shown."""
+    branch, _ = _current(scene)
+    return "" if branch is None else branch.get(UUID_KEY, "")
+
+
+def current_name(scene: bpy.types.Scene) -> str:
+    """Return what the user reads of the current branch: its collection, or its folder; or nothing.
+    """
+    branch, path = _current(scene)
+    return Path(bpy.path.abspath(path)).stem if branch is None and path else (
+        "" if branch is None else branch.name)
+
+
+def shown_from(scene: bpy.types.Scene, folder: Path) -> bpy.types.Collection | None:
+    """Return the branch that is shown from a folder, with its surface; None without."""
+    return _shown_from(scene, str(folder))
+
+
+def shown_with(scene: bpy.types.Scene, uuid: str) -> list[bpy.types.Collection]:
+    """Return the shown branches with a UUID: several where a folder was copied."""
+    return [branch for branch in branches(scene) if branch.get(UUID_KEY) == uuid]
+
+
 def current_path(scene: bpy.types.Scene) -> str:
     """Return :func:`current_folder` as Blender keeps it: relative to a saved .blend, or empty."""
     return _current(scene)[1]
@@ -106,6 +130,12 @@ def use_folder(scene: bpy.types.Scene, path: str) -> None:
         activate(scene, surface_of(branch))
     elif not _is_same_folder(current_path(scene), path):
         activate(scene, None)
+
+
+def choose(scene: bpy.types.Scene, branch: bpy.types.Collection) -> None:
+    """Make a branch that is shown the current one."""
+    use_folder(scene, branch[FOLDER_KEY])
+    activate(scene, surface_of(branch))
 
 
 def activate(scene: bpy.types.Scene, thing: bpy.types.Object | None) -> None:
@@ -178,9 +208,17 @@ def in_branch(scene: bpy.types.Scene, place: Vector) -> Vector:
 
 def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:
     """Return the skeleton of the current branch, if it has one."""
-    surface = find_surface(scene)
-    return None if surface is None else next(
-        (thing for thing in branch_of(surface).objects
+    return _skeleton_in(_current(scene)[0])
+
+
+def skeleton_from(scene: bpy.types.Scene, folder: Path) -> bpy.types.Object | None:
+    """Return the skeleton of the branch that is shown from a folder, whichever is current."""
+    return _skeleton_in(shown_from(scene, folder))
+
+
+def _skeleton_in(branch: bpy.types.Collection | None) -> bpy.types.Object | None:
+    return None if branch is None else next(
+        (thing for thing in branch.objects
          if thing.type == "MESH" and skeletons.NODES_KEY in thing.data), None)
 
 

@@ -54,6 +54,34 @@ def _choose_folder(settings: bpy.types.PropertyGroup, path: str) -> None:
     branches.use_folder(settings.id_data, path)
 
 
+_NOT_SHOWN = "/"
+"""Instead of a collection's name: of a folder that is not shown."""
+_branch_items: list[tuple[str, str, str, str, int]] = []
+"""Blender keeps no copy of these texts."""
+
+
+def _branches_to_choose(settings: bpy.types.PropertyGroup, _context) -> list:
+    scene = settings.id_data
+    shown = [(branch.name, branch.name, bpy.path.abspath(branch[branches.FOLDER_KEY]))
+             for branch in branches.branches(scene) if branches.surface_of(branch) is not None]
+    if branches.find_surface(scene) is None:
+        shown.insert(0, (_NOT_SHOWN, f"{branches.current_name(scene) or 'none'} (not shown)", ""))
+    _branch_items[:] = [(*item, "NONE", number) for number, item in enumerate(shown)]
+    return _branch_items
+
+
+def _branch_in_sight(settings: bpy.types.PropertyGroup) -> int:
+    surface = branches.find_surface(settings.id_data)
+    name = _NOT_SHOWN if surface is None else branches.branch_of(surface).name
+    return next((item[-1] for item in _branches_to_choose(settings, None) if item[0] == name), 0)
+
+
+def _choose_branch(settings: bpy.types.PropertyGroup, number: int) -> None:
+    name = _branches_to_choose(settings, None)[number][0]
+    if name != _NOT_SHOWN:
+        branches.choose(settings.id_data, bpy.data.collections[name])
+
+
 class LimberSettings(bpy.types.PropertyGroup):
     """Choices of one scene; the settings of each stage stand below its name."""
 
@@ -62,6 +90,10 @@ class LimberSettings(bpy.types.PropertyGroup):
         get=_folder_in_sight, set=_choose_folder,
         description="NAME.branch, the folder in which the worker keeps everything about one "
                     "branch: that of the active object, otherwise the last one used")
+    branch: bpy.props.EnumProperty(
+        name="Branch", items=_branches_to_choose, get=_branch_in_sight, set=_choose_branch,
+        description="The branch that every panel works on. Clicking a part of a branch in the view "
+                    "chooses it too")
     live_weight: bpy.props.BoolProperty(
         name="Own Weight", default=True,
         description="Apply gravity while the branch is held. The scan shows the branch bent by "

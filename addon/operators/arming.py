@@ -6,6 +6,7 @@ import bpy
 
 from .. import branch_folder, branches, jobs, properties
 from ..stages import stages
+from .needs_result import branch_property
 from .run_stage import StageOperator, stage_operator
 
 _WIDTH = 420
@@ -24,6 +25,7 @@ class MovesRobot(StageOperator):
         if bpy.app.background or context.window is None:
             return self.execute(context)
         self._is_asked = True
+        self.branch_uuid = self.branch_uuid or branches.current_uuid(context.scene)
         return context.window_manager.invoke_props_dialog(self, width=_WIDTH,
                                                           confirm_text="Move the Robot")
 
@@ -42,6 +44,9 @@ class MovesRobot(StageOperator):
             # It would move when its turn comes, perhaps with nobody there any more.
             raise ValueError("The worker is busy. The robot must move immediately or not at all. "
                              "Try again when no job is running or waiting.")
+        if self.branch_uuid not in ("", branches.current_uuid(context.scene)):
+            raise ValueError("Another branch has become the current one. Choose the branch that "
+                             "the robot holds, and confirm again.")
         if trouble := self.trouble(context):
             raise ValueError(trouble)
         if not self.confirm:
@@ -74,6 +79,7 @@ class LIMBER_OT_arm(MovesRobot, bpy.types.Operator):
     title = "Robot motion along the plan"
 
     replace: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})
+    branch_uuid: branch_property()
 
     @classmethod
     def poll(cls, context):

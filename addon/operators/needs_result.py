@@ -1,6 +1,7 @@
 """What an operator of a branch needs before it can run: an opened result, or a branch folder."""
 
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -14,12 +15,29 @@ def is_open(operator: type, thing: bpy.types.Object | None) -> bool:
     return thing is not None
 
 
-def needed_folder(scene: bpy.types.Scene) -> Path:
-    """Return the folder of the current branch; ValueError if there is none.
+def branch_property() -> Any:
+    """Return the property of an operator that says which branch its button is about."""
+    return bpy.props.StringProperty(
+        name="Branch", options={"HIDDEN", "SKIP_SAVE"},
+        description="UUID of the branch that is meant. Empty: the current one")
+
+
+def needed_folder(scene: bpy.types.Scene, uuid: str = "") -> Path:
+    """Return the folder of the branch with a UUID, by default of the current one.
 
     One that a job is about to make will do.
+
+    Raises:
+        ValueError: there is none, or the folder has another branch than the one that is shown.
     """
     folder = branches.current_folder(scene)
+    if uuid and branches.current_uuid(scene) not in ("", uuid):
+        # Another one has become the current one since the button was drawn.
+        meant = branches.shown_with(scene, uuid)
+        if len(meant) != 1:
+            raise ValueError("The branch that was meant is no longer in the scene. Choose a branch "
+                             "in the panel Branch, then press the button again.")
+        folder = Path(bpy.path.abspath(meant[0][branches.FOLDER_KEY]))
     if folder is None:
         raise ValueError("This scene has no branch folder. Choose a branch folder with Open "
                          "Result in the panel Branch, or enter its path under Folder there.")
@@ -27,7 +45,23 @@ def needed_folder(scene: bpy.types.Scene) -> Path:
         raise ValueError(f"{folder} has no file {branch_folder.MANIFEST}. Choose a branch folder "
                          "under Folder in the panel Branch. If the folder was moved, use Find the "
                          "Folder Again there.")
+    check_identity(scene, folder, uuid)
     return folder
+
+
+def check_identity(scene: bpy.types.Scene, folder: Path, uuid: str = "") -> None:
+    """Refuse a folder that has another branch than the one that is meant, or that is shown from it.
+
+    Raises:
+        ValueError: so it is; nothing may be written there.
+    """
+    shown = branches.shown_from(scene, folder)
+    meant = uuid or ("" if shown is None else shown.get(branches.UUID_KEY, ""))
+    record = branch_folder.read_record(folder)
+    if meant and record is not None and record.uuid not in ("", meant):
+        raise ValueError(f"{folder} has another branch now than the one that is shown. Press Open "
+                         "Result to show that one, or use Find the Folder Again in the panel "
+                         "Branch.")
 
 
 class NeedsBranch:

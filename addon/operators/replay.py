@@ -6,7 +6,7 @@ from typing import ClassVar
 import bpy
 
 from .. import branch_folder
-from .needs_result import needed_folder
+from .needs_result import branch_property, needed_folder
 from .worker_operator import WorkerOperator
 
 
@@ -20,10 +20,11 @@ class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
     title = "Replaying the pull"
 
     pull: bpy.props.StringProperty(name="Pull", description="Name of the recording")
+    branch_uuid: branch_property()
     _folder: Path | None = None
 
     def arguments(self, context):
-        folder = needed_folder(context.scene)
+        folder = needed_folder(context.scene, self.branch_uuid)
         if self.pull not in pulls_of(branch_folder.read_record(folder)):
             raise ValueError(f"The branch has no pull {self.pull!r}. Import one first.")
         self._folder = folder

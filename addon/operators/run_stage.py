@@ -6,7 +6,7 @@ import bpy
 
 from .. import branch_folder, branches, properties
 from ..stages import SettingError, Stage, stages
-from .needs_result import needed_folder
+from .needs_result import branch_property, check_identity, needed_folder
 from .worker_operator import WorkerOperator
 
 _registered: list[type] = []
@@ -39,6 +39,7 @@ class StageOperator(WorkerOperator):
         if not trouble or bpy.app.background or context.window is None:
             return super().invoke(context, event)
         self._is_asked = self.replace = True
+        self.branch_uuid = self.branch_uuid or branches.current_uuid(context.scene)
         return context.window_manager.invoke_confirm(
             self, event, title="Replace the branch?", message=trouble, confirm_text="Replace",
             icon="QUESTION")
@@ -62,8 +63,10 @@ class StageOperator(WorkerOperator):
             if branches.current_folder(scene) is None:
                 branches.use_folder(scene, str(branch_folder.folder_for(self._source(context))))
             self._folder = branches.current_folder(scene)
+            if not self.replace:
+                check_identity(scene, self._folder, self.branch_uuid)
             return stage.arguments({**values, "output": str(self._folder)})
-        self._folder = needed_folder(scene)
+        self._folder = needed_folder(scene, self.branch_uuid)
         self._given = properties.arguments_of(context.scene, stage, str(self._folder))
         self._name = getattr(properties.group_of(context.scene, stage), "name", "")
         return self._given
@@ -146,7 +149,8 @@ def stage_operator(name: str, base: type = StageOperator) -> type:
     """Return the operator of a stage; ``base`` is the mix-in that runs it."""
     stage = stages()[name]
     return type(f"LIMBER_OT_{properties.attribute_name(name)}", (base, bpy.types.Operator), {
-        "__annotations__": _own_properties(stage) | {"replace": bpy.props.BoolProperty(
+        "__annotations__": _own_properties(stage) | {"branch_uuid": branch_property(),
+            "replace": bpy.props.BoolProperty(
             name="Replace", options={"HIDDEN", "SKIP_SAVE"},
             description="Replace the branch even if the folder belongs to another scan")},
         "__doc__": stage.summary.rstrip("."), "__module__": __name__, "stage_name": name,

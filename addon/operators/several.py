@@ -26,12 +26,10 @@ class LIMBER_OT_choose_branch(NeedsBranch, bpy.types.Operator):
     def execute(self, context):
         found = next((each for each in branches.branches(context.scene)
                       if each.name == self.branch), None)
-        surface = branches.surface_of(found) if found is not None else None
-        if surface is None:
+        if found is None or branches.surface_of(found) is None:
             self.report({"ERROR"}, f"There is no branch {self.branch!r}.")
             return {"CANCELLED"}
-        branches.use_folder(context.scene, found[branches.FOLDER_KEY])
-        branches.activate(context.scene, surface)
+        branches.choose(context.scene, found)
         return {"FINISHED"}
 
 

@@ -14,7 +14,7 @@ import bpy
 from .. import branches
 from ..bridge import skeletons
 from ..skeleton_edits import Mark, SkeletonEditError, edits_of
-from .needs_result import NeedsSkeleton
+from .needs_result import NeedsSkeleton, check_identity
 from .worker_operator import WorkerOperator
 
 _ACTIONS = (
@@ -180,6 +180,7 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
         if not edits and not self.restore:
             raise ValueError("Nothing has been edited yet. Move or delete nodes first.")
         self._folder = bpy.path.abspath(branches.branch_of(thing)[branches.FOLDER_KEY])
+        check_identity(context.scene, Path(self._folder))
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-edits-")
         path = Path(self._temporary.name) / "edits.json"
         path.write_text(json.dumps(edits), encoding="utf-8")
@@ -191,7 +192,7 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
 
     def finish(self, context, result):
         self.report({"INFO"}, f"{self.title}: done in {result['seconds']:.0f} s")
-        thing = branches.find_skeleton(context.scene)
+        thing = branches.skeleton_from(context.scene, Path(self._folder))
         if thing is not None:
             # They are in the folder now.
             branches.put_skeleton_back(thing)

@@ -18,8 +18,8 @@ def draw_pulls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     layout.label(text="Replay over the branch:")
     for name in names:
         is_shown = shown.get("is_shown", False) and shown["pull"] == name
-        layout.operator("limber.replay_pull", text=name, depress=is_shown,
-                        icon="PLAY").pull = name
+        button = layout.operator("limber.replay_pull", text=name, depress=is_shown, icon="PLAY")
+        button.pull, button.branch_uuid = name, branches.current_uuid(context.scene)
         if is_shown:
             _draw_timeline(layout, context, info)
 

@@ -20,6 +20,8 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
     def draw(self, context):
         settings = context.scene.limber
         surface = branches.find_surface(context.scene)
+        if branches.current_path(context.scene):
+            self.layout.prop(settings, "branch", text="", icon="OUTLINER")
         self.layout.prop(settings, "branch_folder", text="Folder")
         if surface is None and branches.branches(context.scene):
             self.layout.label(text="Not shown: press Open Result", icon="INFO")

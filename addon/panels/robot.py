@@ -30,7 +30,8 @@ def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         return
     trouble = why_not_armed(context)
     column = layout.column()
-    column.operator("limber.arm", icon="ARMATURE_DATA")
+    button = column.operator("limber.arm", icon="ARMATURE_DATA")
+    button.branch_uuid = branches.current_uuid(context.scene)
     if trouble:
         words, _, rest = trouble.partition(": ")
         column.label(text=words, icon="LOCKED")

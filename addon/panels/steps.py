@@ -36,6 +36,8 @@ class StepPanel(SidebarPanel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         view = step.view
+        if len(branches.branches(context.scene)) > 1:
+            layout.label(text=f"Branch: {branches.current_name(context.scene)}", icon="OUTLINER")
         if step.hint:
             layout.label(text=step.hint, icon="INFO")
         if step.name == "scan":
@@ -123,8 +125,9 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     state, entry = state_of(context.scene, view.stage)
     row = layout.row()
     row.scale_y = 1.4 if is_primary else 1.0
-    row.operator(f"limber.{properties.attribute_name(view.stage)}", text=stage.label,
-                 icon="PLAY" if is_primary else "NONE")
+    button = row.operator(f"limber.{properties.attribute_name(view.stage)}", text=stage.label,
+                          icon="PLAY" if is_primary else "NONE")
+    button.branch_uuid = branches.current_uuid(context.scene)
     if state is not StepState.NOT_RUN:
         layout.label(text=state.words[0].upper() + state.words[1:], icon=state.icon)
     folder = branches.current_folder(context.scene)

@@ -105,6 +105,26 @@ def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_button_means_the_branch_that_it_was_drawn_for(bpy, two):
+    """Drawn for a; b becomes the current one; pressed: into a. The list says which is current."""
+    folders, shown = two
+    scene, branches = bpy.context.scene, part("branches")
+    for branch, uuid in zip(shown, ("uuid-a", "uuid-b"), strict=True):
+        branch[branches.UUID_KEY] = uuid
+        path = Path(branch[branches.FOLDER_KEY]) / "branch.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"uuid": uuid}))
+    scene.limber.branch = shown[0].name
+    assert branches.current_uuid(scene) == "uuid-a"
+    assert bpy.context.view_layer.objects.active == branches.surface_of(shown[0])
+    scene.limber.branch = shown[1].name
+    assert scene.limber.branch == shown[1].name and branches.current_uuid(scene) == "uuid-b"
+    bpy.ops.limber.target(branch_uuid="uuid-a", name="flower", at=(0.0, 0.0, 0.3))
+    assert [_targets(folder) for folder in folders] == [["flower"], []]
+    with pytest.raises(RuntimeError, match="no longer in the scene"):
+        bpy.ops.limber.target(branch_uuid="uuid-c", name="flower", at=(0.0, 0.0, 0.3))
+
+
+@pytest.mark.slow
 def test_a_refused_folder_leaves_the_current_one(bpy, two, tmp_path):
     """What cannot be opened is not where the next step writes."""
     folders, _ = two

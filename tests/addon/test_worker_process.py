@@ -1,4 +1,4 @@
-"""The process of the worker on Windows, as far as another system can tell: job object, no window."""
+"""The process of the worker on Windows, as far as another system can tell: jobs, no console."""
 
 import ctypes
 import importlib

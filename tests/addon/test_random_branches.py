@@ -1,0 +1,154 @@
+"""Three branches and random operators: nothing is written to another branch than the tab names.
+
+``LIMBER_RANDOM_OPERATORS=500`` tries as many; the seed is printed where one fails.
+"""
+
+import importlib
+import json
+import os
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+
+from limber.store import Branch
+
+COUNT = int(os.environ.get("LIMBER_RANDOM_OPERATORS", "40"))
+WRITTEN = "written-by-the-test.json"
+
+
+def part(name):
+    return importlib.import_module(f"limber_addon.{name}")
+
+
+class Run:
+    """A scene with three branches, and what may happen to it. Names of folders may change; what
+    was written into which branch is told by the UUID in its folder."""
+
+    def __init__(self, bpy, folders, seed):
+        self.bpy, self.folders, self.chance = bpy, folders, random.Random(seed)
+        self.written = {}
+        for folder in folders:
+            self.open(folder)
+
+    def uuid(self, folder):
+        return json.loads((Path(folder) / "branch.json").read_text())["uuid"]
+
+    def open(self, folder=None):
+        folder = folder or self.chance.choice(self.folders)
+        self.bpy.ops.limber.open_result(directory=str(folder))
+
+    def shown(self):
+        return [one for one in part("branches").branches(self.bpy.context.scene)
+                if part("branches").surface_of(one) is not None]
+
+    def switch(self):
+        """Click any object of the scene, or none."""
+        things = [*self.bpy.context.view_layer.objects, None]
+        self.bpy.context.view_layer.objects.active = self.chance.choice(things)
+        self.bpy.context.view_layer.update()
+
+    def choose(self):
+        settings = self.bpy.context.scene.limber
+        items = part("properties")._branches_to_choose(settings, None)
+        settings.branch = self.chance.choice(items)[0]
+
+    def rename(self):
+        if self.shown():
+            self.chance.choice(self.shown()).name = self.chance.choice(("a", "twig", "x.001"))
+
+    def delete(self):
+        """Delete a surface, or a whole collection, as the outliner does."""
+        if not self.shown():
+            return
+        branch = self.chance.choice(self.shown())
+        if self.chance.random() < 0.5:
+            self.bpy.data.objects.remove(part("branches").surface_of(branch))
+        else:
+            self.bpy.data.collections.remove(branch)
+
+    def swap(self):
+        """Two folders change places on the disk; the scene does not know."""
+        one, other = self.chance.sample(self.folders, 2)
+        aside = one.with_name("aside")
+        one.rename(aside)
+        other.rename(one)
+        aside.rename(other)
+
+    def target(self, *, late=False):
+        """Press the button as it was drawn; ``late``: after another branch became current."""
+        scene = self.bpy.context.scene
+        named = part("branches").current_uuid(scene)
+        if not named:
+            return
+        if late:
+            self.choose()
+        name = f"t{len(self.written)}"
+        try:
+            self.bpy.ops.limber.target(branch_uuid=named, name=name, at=(0.0, 0.0, 0.3))
+        except RuntimeError as refused:
+            assert any(words in str(refused) for words in
+                       ("another branch now", "no longer in the scene")), refused
+        else:
+            self.written[name] = named
+
+    def late_target(self):
+        self.target(late=True)
+
+    def check(self):
+        """Each target is in the branch that was named as it was written, and nowhere else."""
+        found = {}
+        for folder in self.folders:
+            path = folder / WRITTEN
+            for each in json.loads(path.read_text()) if path.is_file() else ():
+                found[each] = self.uuid(folder)
+        assert found == self.written
+
+
+@pytest.fixture()
+def three(bpy, registered, tmp_path, bare_beam, monkeypatch):
+    """Three branches with UUIDs of their own. The worker only writes down what it was to write."""
+    folders = [tmp_path / f"{name}.branch" for name in "abc"]
+    for number, folder in enumerate(folders):
+        shutil.copytree(bare_beam.folder, folder)
+        path = folder / "branch.json"
+        content = json.loads(path.read_text()) | {"uuid": f"uuid-{number}"}
+        path.write_text(json.dumps(content))
+    return folders
+
+
+@pytest.fixture()
+def quick_worker(worker_here, monkeypatch):
+    """``target`` writes its name into the folder that it is given; all else is the real worker."""
+    jobs = importlib.import_module("limber_addon.jobs")
+    launch = jobs.Job.launch
+
+    def launch_here(job):
+        arguments = job.command[job.command.index("limber") + 1:]
+        if arguments[0] != "target":
+            return launch(job)
+        folder, name = arguments[arguments.index("--") + 1:]
+        path = Path(folder) / WRITTEN
+        names = json.loads(path.read_text()) if path.is_file() else []
+        path.write_text(json.dumps([*names, name]))
+        job._lines.put(("out", json.dumps({"status": "done", "seconds": 0.0})))
+        job._process, job._readers = type("Ended", (), {
+            "stdin": type("In", (), {"close": lambda self: None})(), "poll": lambda self: 0})(), []
+        job.state = jobs.JobState.RUNNING
+        return None
+    monkeypatch.setattr(jobs.Job, "launch", launch_here)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1])
+def test_random_operators_write_to_the_named_branch_alone(bpy, three, quick_worker, seed):
+    """Opened, clicked, chosen, renamed, deleted, swapped on the disk, written: all in any order."""
+    run = Run(bpy, three, seed)
+    kinds = ["open", "switch", "switch", "choose", "rename", "delete", "swap", "target",
+             "target", "late_target"]
+    for _ in range(COUNT):
+        getattr(run, run.chance.choice(kinds))()
+        run.check()
+    assert len(run.written) > COUNT / 20, "too little was written to tell"
+    assert len(set(run.written.values())) > 1
