@@ -180,9 +180,13 @@ def test_the_last_line_is_the_table_as_json(monkeypatch, tmp_path, capsys):
     assert seen == [(12, True, True)] and (tmp_path / "out").is_dir()
     told = capsys.readouterr().out.splitlines()
     assert told[0] == "base seed 12 (--seed repeats it)"
-    assert json.loads(told[-1]) == {"bench": "geometry", "rows": [
+    record = json.loads(told[-1])
+    assert record.pop("date").count("-") == 2 and "commit" in record
+    assert {key: record[key] for key in ("bench", "seed", "budget_s")} == {
+        "bench": "geometry", "seed": 12, "budget_s": 90}
+    assert record["rows"] == [
         {"measure": "a", "asked": "1 %", "measured": "0.5 %", "met": True, "count": 7},
-        {"measure": "b", "asked": "1 %", "measured": "not shown", "met": None, "count": 0}]}
+        {"measure": "b", "asked": "1 %", "measured": "not shown", "met": None, "count": 0}]
 
 
 @pytest.mark.parametrize("arguments", [["geometry", "--budget", "soon"],

@@ -1,9 +1,11 @@
 """The table that every benchmark prints: measure, asked, measured, met, count."""
 
 import argparse
+import datetime
 import importlib
 import json
 import secrets
+import subprocess
 import sys
 import tempfile
 import time
@@ -131,12 +133,13 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.only:
         if name not in parts:
             parser.error(f"{options.name} has no part {name!r}; it has: {', '.join(parts)}")
+    options.seed = secrets.randbits(31) if options.seed is None else options.seed
     started = time.perf_counter()
     rows, failed = _measured(parts, options, budget)
     show(rows)
     print(f"{options.name}: {time.perf_counter() - started:.0f} s")
     if options.json:
-        print(json.dumps({"bench": options.name, "rows": [plain(asdict(row)) for row in rows]}))
+        print(json.dumps(_record(options, rows)))
     return 1 if rows and failed == len(rows) else 0
 
 
@@ -223,16 +226,24 @@ def _tried(name: str, part: Part, setting: Setting) -> list[Row]:
 
 def _measured(parts: dict[str, Part], options: argparse.Namespace, budget: Budget,
               ) -> tuple[list[Row], int]:
-    seed = secrets.randbits(31) if options.seed is None else options.seed
-    print(f"base seed {seed} (--seed repeats it)", flush=True)
+    print(f"base seed {options.seed} (--seed repeats it)", flush=True)
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         kept = options.out or Path(place)
         kept.mkdir(parents=True, exist_ok=True)
-        setting = Setting(seed, options.quick, budget, SILENT, kept, options.out)
+        setting = Setting(options.seed, options.quick, budget, SILENT, kept, options.out)
         if not sys.stderr.isatty():
             return rows_of(parts, setting, options.only)
         with BarSink(options.name) as bar:
             return rows_of(parts, replace(setting, progress=Progress(bar)), options.only)
+
+
+def _record(options: argparse.Namespace, rows: Sequence[Row]) -> dict[str, object]:
+    """The table with what a reader needs to place it: when, of which code, from which seed."""
+    done = subprocess.run(["git", "rev-parse", "--short=10", "HEAD"], cwd=Path(__file__).parent,
+                          capture_output=True, text=True, check=False)
+    return {"bench": options.name, "date": datetime.date.today().isoformat(),
+            "commit": done.stdout.strip() or None, "seed": options.seed,
+            "budget_s": options.budget, "rows": [plain(asdict(row)) for row in rows]}
 
 
 def _seconds(text: str) -> float:
