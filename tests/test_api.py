@@ -75,6 +75,35 @@ def test_public_names_are_explained(name):
                 assert inspect.getdoc(getattr(thing, member)), member
 
 
+@pytest.mark.parametrize("name", [*(name for name in limber.__all__ if name != "__version__"), *(
+    f"Branch.{name}" for name, value in vars(limber.Branch).items()
+    if not name.startswith("_") and (callable(value) or isinstance(value, property)))])
+def test_public_names_have_an_example(name):
+    """Each shows a call; `test_the_docstrings_examples` runs them."""
+    thing, _, member = name.partition(".")
+    told = inspect.getdoc(getattr(getattr(limber, thing), member) if member
+                          else getattr(limber, thing))
+    assert doctest.DocTestParser().get_examples(told)
+
+
+DIMENSIONLESS = ("ratio", "strain", "fraction", "factor", "positions of the control points",
+                 "root mean square", "likewise", "dimensionless")
+"""A quantity without a unit says one of these."""
+
+
+@pytest.mark.parametrize("kind", RESULTS)
+def test_results_say_units(kind):
+    """Each number or array of a result has its unit in square brackets, or is dimensionless."""
+    told = re.split(r"\n    (?=\w+: )", inspect.getdoc(kind).partition("Attributes:")[2])
+    meanings = dict(line.strip().split(": ", 1) for line in told if ": " in line)
+    for field in dataclasses.fields(kind):
+        if field.name in kind.__annotations__ and not field.name.startswith("_") and any(
+                word in str(field.type) for word in ("ndarray", "float")):
+            meaning = meanings[field.name]
+            assert "[" in meaning or any(word in meaning.lower() for word in DIMENSIONLESS), (
+                f"{kind.__name__}.{field.name}: {meaning}")
+
+
 def test_names_for_programs_are_those_for_type_checkers():
     """What a type checker sees of the package is what it has."""
     text = Path(limber.__file__).read_text(encoding="utf-8")
@@ -89,10 +118,11 @@ def test_the_docstrings_examples(own, tmp_path, monkeypatch):
     """They run as they stand, in a folder with a scan and a branch."""
     monkeypatch.chdir(tmp_path)
     limber.generate("scan", length=0.3, fork_count=0, seed=1)
-    failed, tried = doctest.testmod(
-        verbs, extraglobs={"limber": limber},
-        optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
-    assert tried >= 10 and not failed
+    for module in (verbs, typed_results):
+        failed, tried = doctest.testmod(
+            module, extraglobs={"limber": limber},
+            optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
+        assert tried >= 10 and not failed
 
 
 @pytest.mark.parametrize("key", ["estimate", "energy", "plan:to-goal", "pull:pull-1",

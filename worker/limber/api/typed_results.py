@@ -35,6 +35,9 @@ class Result:
 
     Attributes:
         values: What its command prints with ``--json``, in SI units that the names carry.
+
+    >>> limber.open("a.branch").results["reconstruct"].values["watertight"]
+    True
     """
 
     values: Mapping[str, Any]
@@ -73,6 +76,9 @@ class Generated(Result):
     Attributes:
         cloud: The scan, for :func:`limber.reconstruct`.
         young: True Young's modulus at the control points [Pa], shape [K].
+
+    >>> limber.generate("made", length=0.3, fork_count=0, seed=1).young.shape
+    (4,)
     """
 
     cloud: Path
@@ -100,6 +106,10 @@ class Pull(Result):
         torques: Likewise [N m], shape [n, 3].
         marker_times: [s], shape [k]; empty where there are no markers.
         markers: Positions of the observed points [m], shape [k, points, 3]; NaN where not observed.
+
+    >>> pull = limber.open("a.branch").pulls["pull-1"]
+    >>> pull.table()["fx_n"].shape == pull.times.shape
+    True
     """
 
     name: str
@@ -159,6 +169,10 @@ class Estimate(Result):
         poisson: Poisson's ratio.
         loss: The paper's loss J [m^2].
         converged: Whether the fit ended at a solution.
+
+    >>> found = limber.open("a.branch").results["estimate"]
+    >>> found.young.shape, found.interval.shape, found.converged
+    ((4,), (4, 2), True)
     """
 
     young: np.ndarray
@@ -221,6 +235,10 @@ class Simulation(Result):
         strains: Largest principal strain in the branch, shape [n].
         positions: Of the surface's vertices [m], shape [n, vertices, 3], single precision.
         converged: Whether the branch followed to the end.
+
+    >>> bent = limber.open("a.branch").simulate(move=(0.005, 0, 0), kind="static", duration=0.1)
+    >>> bent.positions.shape[::2] == (len(bent.times), 3)
+    True
     """
 
     name: str
@@ -278,6 +296,10 @@ class Load(Result):
         tip_displacement: [m], shape [3].
         wind_force: On all of the branch [N], shape [3].
         bears_times: Factor on the loads that the branch bears; None if it was not requested.
+
+    >>> found = limber.open("a.branch").load(snow=2.0)
+    >>> bool(found.frequencies[0] < found.frequencies_before[0]), found.bears_times is None
+    (True, True)
     """
 
     sag: float
@@ -335,6 +357,10 @@ class EnergyField(Result):
         forces: Of the gripper on the branch there [N], shape [m, 3].
         energy_error: Of samples outside the fit: root mean square error over that of the energy.
         force_error: Likewise of the force.
+
+    >>> field = limber.open("a.branch").results["energy"]
+    >>> field.energy(field.positions[:2]).shape, bool(field.energy_error < 0.1)
+    ((2,), True)
     """
 
     positions: np.ndarray
@@ -397,10 +423,14 @@ class Plan(Result):
         shortest_path: Poses along the shortest path, shape [k, 6].
         energy: Energy integrated along the gentle path [J m].
         energy_saved: Against the shortest path [%].
-        cost: Of the gentle path on the energy field, as the planner weighs energy and length;
-            with a ``max_detour`` the energy alone, integrated along it [J m].
-        bound: No path costs less than that: the certificate.
+        cost: Of the gentle path on the energy field, dimensionless: the planner weighs energy and
+            length, each over its scale. With a ``max_detour``: the energy along it [J m].
+        bound: No path costs less than that, in the same unit: the certificate.
         gap: Largest cost of the gentle path above that of the best one [%]; None if unknown.
+
+    >>> way = limber.open("a.branch").results["plan:to-goal"]
+    >>> way.path.shape[1], way.bound <= way.cost
+    (6, True)
     """
 
     name: str
@@ -471,6 +501,9 @@ class Execution(Result):
         stop_reason: Why it was stopped; None where it was not.
         peak_force: Largest measured force [N]; None in a dry run.
         path_error: Largest distance from the path [m]; None in a dry run.
+
+    >>> limber.open("a.branch").execute("cell.toml", name="to-goal").reached  # doctest: +SKIP
+    False
     """
 
     name: str
@@ -513,6 +546,9 @@ class Written(Result):
 
     Attributes:
         path: Of the file.
+
+    >>> limber.open("a.branch").export("a.swc").path.suffix
+    '.swc'
     """
 
     path: Path

@@ -110,6 +110,11 @@ def mesh(surface: PathLike, folder: PathLike, *, quiet: bool = False, **settings
 
     Raises:
         InputError: the surface or a setting cannot be used. MeshingError: no mesh came out.
+
+    >>> sections = ["x_mm,y_mm,z_mm,width_mm,height_mm", "0,0,0,10,10", "0,0,200,10,10"]
+    >>> _ = Path("beam.csv").write_text("\\n".join(sections))
+    >>> limber.mesh("beam.csv", "beam.branch").mesh.nodes[:, 2].max().round(3)
+    0.2
     """
     return _made("mesh", folder, quiet, {**settings, "surface": surface})
 
@@ -236,6 +241,9 @@ class Branch:
     def mesh(self) -> "TetMesh":
         """The tetrahedra: ``nodes`` [m], ``tets``, ``cell_data["young"]`` [Pa] and more.
 
+        >>> limber.open("a.branch").mesh.tets.shape[1]
+        10
+
         Raises:
             BranchFolderError: there is no mesh yet.
         """
@@ -247,6 +255,9 @@ class Branch:
     def skeleton(self) -> "Skeleton":
         """The axes as a tree: ``nodes`` [m], ``parent``, ``radius`` [m], ``order`` and more.
 
+        >>> limber.open("a.branch").skeleton.branch_count
+        3
+
         Raises:
             BranchFolderError: there is no skeleton yet.
         """
@@ -256,7 +267,11 @@ class Branch:
 
     @property
     def pulls(self) -> Mapping[str, Pull]:
-        """The recordings by name."""
+        """The recordings by name.
+
+        >>> limber.open("a.branch").pulls["pull-1"].times[0]
+        0.0
+        """
         from limber.store.loading import known_pulls
 
         branch = self._read()
@@ -267,13 +282,20 @@ class Branch:
 
     @property
     def results(self) -> Mapping[str, Result]:
-        """The results that the folder holds, such as ``estimate`` or ``plan:path``, by name."""
+        """The results that the folder holds, such as ``estimate`` or ``plan:path``, by name.
+
+        >>> limber.open("a.branch").results["plan:to-goal"].name
+        'to-goal'
+        """
         branch = self._read()
         entries = branch.manifest.stages
         return ByName(sorted(entries), lambda key: read_result(branch, key, entries[key].result))
 
     def plot(self) -> "Figure":
-        """Draw the scan and its skeleton from the front and from the side."""
+        """Draw the scan and its skeleton from the front and from the side.
+
+        >>> limber.open("a.branch").plot().savefig("scan.png")
+        """
         from limber.results.report.figures import scan_and_skeleton
 
         branch = self._read()
@@ -293,6 +315,11 @@ class Branch:
 
         Raises:
             InputError: the recording or a setting cannot be used.
+
+        >>> folder = "a.branch/pulls/pull-1"
+        >>> limber.open("a.branch").add_pull(f"{folder}/markers.csv", "mine",
+        ...                                  robot=f"{folder}/robot.csv").poses.shape
+        (24, 6)
         """
         return cast(Pull, self._run("add_pull", quiet, settings, source=source, name=name))
 
@@ -307,6 +334,9 @@ class Branch:
 
         Raises:
             WorkError: the branch cannot be pulled like that.
+
+        >>> limber.open("a.branch").virtual_pull(name="short", frames=4, seed=1).forces.shape
+        (4, 3)
         """
         return cast(Pull, self._run("virtual_pull", quiet, settings))
 
@@ -322,6 +352,9 @@ class Branch:
         Raises:
             InputError: there are no pulls, or they cannot determine Young's modulus.
             WorkError: the fit ends at no result.
+
+        >>> found = limber.open("a.branch").estimate(pull=("pull-1",))  # doctest: +SKIP
+        >>> found.young, found.interval                                 # doctest: +SKIP
         """
         if settings.get("follow"):
             raise InputError("follow was given.", "It estimates while a pull is recorded, and "
@@ -342,6 +375,11 @@ class Branch:
         Raises:
             ConvergenceError: the branch could not follow; what it reached is in
                 ``branch.results["simulate"]``.
+
+        >>> branch = limber.open("a.branch")
+        >>> bent = branch.simulate(move=(0.005, 0, 0), kind="static", duration=0.1, hold=0)
+        >>> bent.forces.shape, bool(bent.strains.max() < 0.02)
+        ((7, 3), True)
         """
         replayed = settings.get("pull")
         return cast(Simulation, self._run(
@@ -358,6 +396,11 @@ class Branch:
 
         Raises:
             WorkError: the branch finds no rest under the loads.
+
+        >>> calm = limber.open("a.branch").load(wind=(0.1, 0, 0))
+        >>> gale = limber.open("a.branch").load(wind=(10, 0, 0))
+        >>> bool(gale.greatest_strain > calm.greatest_strain)
+        True
         """
         return cast(Load, self._run("load", quiet, settings))
 
@@ -371,6 +414,9 @@ class Branch:
 
         Raises:
             WorkError: too few poses could be solved.
+
+        >>> field = limber.open("a.branch").energy_field(samples=40)  # doctest: +SKIP
+        >>> field.energy([[0.02, 0.0, 0.25]])                         # doctest: +SKIP
         """
         return cast(EnergyField, self._run("energy_field", quiet, settings))
 
@@ -386,6 +432,9 @@ class Branch:
         Raises:
             BranchFolderError: there is no energy field, or one of another branch.
             NoPathError: no path reaches the goal; the message states why.
+
+        >>> way = limber.open("a.branch").plan(max_strain=0.02, name="soft")  # doctest: +SKIP
+        >>> way.strains.max() <= 0.02                                        # doctest: +SKIP
         """
         return cast(Plan, self._run("plan", quiet, settings))
 
@@ -402,6 +451,8 @@ class Branch:
             InputError: plan, cell and branch do not belong together, or nobody confirmed.
             NoPathError: the arm cannot follow the path.
             SafetyStop: it was stopped; its ``result`` states where.
+
+        >>> limber.open("a.branch").execute("cell.toml", name="to-goal")  # doctest: +SKIP
         """
         return cast(Execution, self._run("execute", quiet, settings, cell=cell))
 
@@ -411,6 +462,9 @@ class Branch:
         Args:
             quiet: Show no progress.
             settings: ``picture``, ``caliper`` and those that ``limber.settings("report")`` lists.
+
+        >>> limber.open("a.branch").report().path.name
+        'report.html'
         """
         _, values = self._values("report", quiet, settings)
         return Written(MappingProxyType(values), Path(values["report"]))
@@ -426,6 +480,8 @@ class Branch:
 
         Raises:
             WorkError: Blender failed, or is not installed.
+
+        >>> limber.open("a.branch").scene("a.blend", render="a.png")  # doctest: +SKIP
         """
         _, values = self._values("scene", quiet, settings, output=output)
         return Written(MappingProxyType(values), Path(output))
@@ -441,6 +497,9 @@ class Branch:
 
         Raises:
             InputError: the suffix is not known, or the file cannot be written.
+
+        >>> limber.open("a.branch").export("a.xml").path.name
+        'a.xml'
         """
         _, values = self._values("export", quiet, settings, output=output)
         return Written(MappingProxyType(values), Path(output))
@@ -455,6 +514,9 @@ class Branch:
 
         Raises:
             InputError: there is no such stage, or a setting is refused.
+
+        >>> limber.open("a.branch").run("predict", weight=0.1).values["drop_m"] > 0
+        True
         """
         if _known_stage(stage) in ("generate", "reconstruct", "mesh"):
             raise InputError(f"{stage} makes a new branch.", "", f"Call limber.{stage}.")
@@ -473,6 +535,9 @@ class Branch:
 
         Raises:
             InputError: a setting is refused. WorkError: the session did not start.
+
+        >>> with limber.open("a.branch").session(mode="pinned") as session:  # doctest: +SKIP
+        ...     session.wait(session.move([0.02, 0, 0.25, 0, 0, 0])).energy
         """
         from limber.session.client import InteractiveSession
         from limber.session.settings import SessionSettings
