@@ -21,8 +21,7 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     paths = [result.get(key) or {} for key in ("plan", "baseline")]
     if not paths[0]:
         return
-    title = "Gentle" if result.get("planner") == "eikonal" else "D-RRT*"
-    rows = [["", title, "RRT*"]]
+    rows = [["", "Gentle", "Shortest"]]
     rows += [[f"{words} [{unit}]", *(_number(path.get(key), factor) for path in paths)]
              for words, key, factor, unit in _PATH_ROWS]
     draw_table(layout, rows)
@@ -30,10 +29,15 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     if saved is not None and longer is not None:
         layout.label(text=f"{saved:.0f} % of the energy saved, {abs(longer):.1f} % "
                      f"{'longer' if longer >= 0 else 'shorter'}")
+    wood = result.get("wood") or {}
+    is_over = "plan" in wood.get("paths_over", ())
+    if is_over:
+        layout.label(text=f"Over the strain that breaks wood: {100 * wood['breaking_strain']:.2g} %",
+                     icon="ERROR")
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
                  f"Proven: at most {gap:.1f} % above the minimum",
-                 icon="QUESTION" if gap is None else "CHECKMARK")
+                 icon="QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (
         record.stages.items() if record else ()) if key.startswith(_PLAN)}
     if len(others) > 1:

@@ -2,12 +2,13 @@
 
 A stage's command is made from its description (:mod:`limber.stages.registry`); any other command
 is a module in ``limber/cli/commands`` with an object ``command``, its docstring the help. Those
-made here take ``--json`` and ``--progress``, end with the exit codes of ``limber.core.errors``
-and, with ``--json``, print one JSON object as their last line.
+made here take ``--json``, ``--verbose`` and ``--progress``, end with the exit codes of
+``limber.core.errors`` and, with ``--json``, print one JSON object as their last line.
 """
 
 import ast
 import contextlib
+import difflib
 import functools
 import importlib
 import json
@@ -22,7 +23,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from limber.cli.terminal import result_lines, table_lines
+from limber.cli.terminal import (
+    closing_lines,
+    command_to_type,
+    found_lines,
+    result_lines,
+    table_lines,
+)
 from limber.core.errors import LimberError, SafetyStop
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
@@ -53,6 +60,17 @@ class _Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(command_summaries())
 
+    def resolve_command(self, ctx: click.Context, args: list[str],
+                        ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find a command by its name; one that is not known is answered with those like it."""
+        name = args[0]
+        if name not in command_summaries() and not name.startswith("-"):
+            # Loads no package: it is what one who has just begun meets first.
+            close = difflib.get_close_matches(name, command_summaries(), 2)
+            ctx.fail(f"There is no command '{name}'. " + (
+                f"Did you mean {' or '.join(close)}?" if close else "`limber --help` lists all."))
+        return super().resolve_command(ctx, args)
+
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in stage_summaries():
             return command_of(stage_description(name), stage_module(name).__doc__)
@@ -82,13 +100,19 @@ class Run:
     """What a command's function gets besides its options.
 
     ``progress`` to report and warn to, ``say`` to print a line on standard error, ``show`` a
-    table there. ``warnings`` are kept for the JSON result.
+    table there. ``warnings`` are kept for the JSON result. ``close`` sets the last lines, which
+    stand in place of all of the result.
     """
 
     def __init__(self, sink: Sink | None, say: Callable[[str], None]):
         self.progress = Progress(sink, self._warned)
         self.say = say
         self.warnings: list[str] = []
+        self.closing: list[str] = []
+
+    def close(self, *found: str, where: object = "", then: str = "") -> None:
+        """Say what was found, where it is and what to type next."""
+        self.closing = closing_lines(found, where, then)
 
     def _warned(self, message: str) -> None:
         self.warnings.append(message)
@@ -102,19 +126,23 @@ class Run:
 def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
     """Make a click command of ``function(run, **options) -> result dict``.
 
-    The docstring's first line is the help text. The result is printed for a person to read,
-    or, with ``--json``, as the last line together with ``command``, ``status``, ``seconds``,
-    ``warnings`` and ``error``.
+    The docstring's first line is the help text. The result is printed for a person to read, in
+    the function's own closing lines or (``--verbose``) value by value, or, with ``--json``, as
+    the last line together with ``command``, ``status``, ``seconds``, ``warnings`` and ``error``.
     """
     def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
         @functools.wraps(function)
-        def body(as_json: bool, progress_style: str, **options: Any) -> None:
-            sys.exit(_execute(name, function, as_json, progress_style, options))
+        def body(as_json: bool, verbose: bool, progress_style: str, **options: Any) -> None:
+            style = "json" if as_json else "verbose" if verbose else "short"
+            sys.exit(_execute(name, function, style, progress_style, options))
         decorated = click.option(
             "--progress", "progress_style", type=click.Choice(["auto", "bar", "json", "none"]),
             default="auto", show_default=True,
             help="auto: a bar on a terminal. json: one JSON object per line on standard "
                  "output.")(body)
+        decorated = click.option(
+            "-v", "--verbose", is_flag=True,
+            help="Print every value of the result.")(decorated)
         decorated = click.option(
             "--json", "as_json", is_flag=True,
             help="Print the result as one JSON object in the last line.")(decorated)
@@ -133,12 +161,36 @@ def command_of(stage: "StageDescription", help_text: str) -> click.Command:
                        "exit.")
     @stage_options(stage)
     def command(run: Run, values: dict[str, Any]) -> dict[str, Any]:
-        result = stage.run(*stage.models(values), run.progress)
+        models = stage.models(values)
+        result = stage.run(*models, run.progress)
         for title, rows in stage.tables(_plain(result)) if stage.tables else ():
             run.show(title, rows)
+        known = {name: value for model in models for name, value in dict(model).items()}
+        _close_stage(run, stage, known | _plain(result))
         return result
     command.help = help_text
     return command
+
+
+def _close_stage(run: Run, stage: "StageDescription", values: dict[str, Any]) -> None:
+    """Say what a stage found, in which file, and which command follows.
+
+    Args:
+        values: Inputs, settings and result by name.
+    """
+    found = list(found_lines(stage.found, values))
+    if found:
+        run.close(*found, where=_place(stage, values), then=command_to_type(stage.then, values))
+
+
+def _place(stage: "StageDescription", values: dict[str, Any]) -> object:
+    """The file or folder that a stage wrote first, as far as it did."""
+    folder = values.get("branch_folder")
+    if folder is None or "output" in values:
+        return values.get("output") or values.get("data") or values.get("folder") or folder or ""
+    written = Path(folder, stage.writes[0].replace("{name}", str(values.get("name")))
+                   if stage.writes else "")
+    return written if written.exists() else folder
 
 
 def _grouped_command() -> type[click.Command]:
@@ -201,7 +253,7 @@ def _output_lost(error: OSError) -> int:
     return 3
 
 
-def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
+def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
              progress_style: str, options: dict[str, Any]) -> int:
     started = time.perf_counter()
     if progress_style == "auto":
@@ -237,20 +289,24 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
             told = f"internal error: {error!r}; please report it"
         outcome |= {"status": "failed", "error": str(told)}
     outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
-    _print_outcome(outcome, result or {}, as_json)
+    _print_outcome(outcome, result or {}, style, state.closing)
     return code
 
 
-def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], as_json: bool) -> None:
-    if as_json:
+def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,
+                   closing: list[str]) -> None:
+    if style == "json":
         print(json.dumps(_plain(outcome | result), allow_nan=False), flush=True)
     if outcome["error"]:
         click.echo(f"error: {outcome['error']}", err=True)
-    elif not as_json:
+    elif style != "json":
         # Warnings were said when they came up.
-        for line in result_lines({k: v for k, v in _plain(result).items() if k != "warnings"}):
+        shown = {k: v for k, v in _plain(result).items() if k != "warnings"}
+        is_short = bool(closing) and style == "short"
+        for line in closing if is_short else [*result_lines(shown), *closing]:
             click.echo(line)
-        click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s")
+        click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s"
+                   + (" (--verbose shows all values)" if is_short else ""))
 
 
 def _terminate_like_interrupt() -> None:

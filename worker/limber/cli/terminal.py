@@ -1,7 +1,19 @@
-"""Results as a person reads them on a terminal: few digits, one thing a line, tables aligned."""
+"""Results as a person reads them on a terminal: few digits, one thing a line, tables aligned.
 
-from collections.abc import Iterator, Mapping, Sequence
+A command ends with what was found, where it is and what to do next. Lines of what was found are
+templates with the names of results in them, ``"{length_m:m} of centreline"``; units that a name
+may be written in are those of :data:`UNITS`.
+"""
+
+import math
+import shlex
+import string
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+Line = str | Callable[[Mapping[str, Any]], str | None]
+"""A template, or what makes a line of the results; a line without its results is left out."""
 
 # A list of plain numbers up to this length stands on one line; of others so many are shown.
 _SHOWN = 12
@@ -25,6 +37,84 @@ def result_lines(result: Mapping[str, Any]) -> Iterator[str]:
             yield from (f"  {_text(item)}" for item in value[:_SHOWN])
             if len(value) > _SHOWN:
                 yield f"  and {len(value) - _SHOWN} more (--json shows all)"
+
+
+def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines whose values are all there, filled in."""
+    for line in lines:
+        try:
+            told = _FILLED.vformat(line, (), values) if isinstance(line, str) else line(values)
+        except _NotThere:
+            continue
+        if told:
+            yield told
+
+
+def command_to_type(template: str, values: Mapping[str, Any]) -> str:
+    """Return a command with its names and paths filled in, quoted for a shell; empty where one of
+    them is not there."""
+    try:
+        return _QUOTED.vformat(template, (), values)
+    except _NotThere:
+        return ""
+
+
+def closing_lines(found: Sequence[str], where: object = "", then: str = "") -> list[str]:
+    """Return the end of a command: what was found, where it is, what to type next."""
+    return [*found, *([f"in    {where}"] if where else []), *([f"next  {then}"] if then else [])]
+
+
+def _in_metres(value: float) -> str:
+    return f"{value:.3g} m" if abs(value) >= 1 else f"{1e3 * value:.3g} mm"
+
+
+def _in_pascal(value: float) -> str:
+    return f"{value / 1e9:.3g} GPa" if abs(value) >= 1e9 else f"{value / 1e6:.3g} MPa"
+
+
+UNITS: dict[str, Callable[[float], str]] = {
+    "m": _in_metres, "Pa": _in_pascal,
+    "J": lambda value: f"{value:.3g} J" if abs(value) >= 0.1 else f"{1e3 * value:.3g} mJ",
+    "kg": lambda value: f"{value:.3g} kg" if abs(value) >= 1 else f"{1e3 * value:.3g} g",
+    "cm3": lambda value: f"{1e6 * value:.3g} cm³", "N": lambda value: f"{value:.3g} N",
+    "Hz": lambda value: f"{value:.3g} Hz", "s": lambda value: f"{value:.3g} s",
+    "MB": lambda value: f"{value / 1e6:,.1f} MB", "count": lambda value: f"{value:,.0f}",
+    "share": lambda value: f"{100 * value:.3g} %", "%": lambda value: f"{value:.3g} %"}
+"""How a value in SI units is written for a person; ``|m`` is the length of a vector."""
+
+
+class _NotThere(Exception):
+    """A template names a value that a result does not have."""
+
+
+class _Filled(string.Formatter):
+    """Fills values of a result into a template, by the units of :data:`UNITS`."""
+
+    def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
+        try:
+            value, first = super().get_field(field_name, args, kwargs)
+        except (KeyError, IndexError, TypeError) as error:
+            raise _NotThere from error
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            raise _NotThere
+        return value, first
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if format_spec.startswith("|"):
+            value, format_spec = math.hypot(*value), format_spec[1:]
+        if format_spec in UNITS:
+            return UNITS[format_spec](value)
+        return format(value, format_spec) if format_spec else _text(value)
+
+
+class _Quoted(_Filled):
+    """Fills names and paths into a command."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        return shlex.quote(str(value))
+
+
+_FILLED, _QUOTED = _Filled(), _Quoted()
 
 
 def table_lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -52,6 +142,8 @@ def _text(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.5g}"
+    if isinstance(value, Path):
+        return str(value)
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_text(item)}" for name, item in value.items()
                          if not _is_empty(item))

@@ -44,6 +44,9 @@ class StageDescription:
         reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
         writes: Names of those that it writes.
         tables: Titles and rows to show a person beside the result, the first row the header.
+        found: Lines that say what was found, as :func:`limber.cli.terminal.found_lines` fills
+            them from inputs, settings and result; without any, all of the result is shown.
+        then: The command that mostly follows, its names and paths filled in alike.
         step: The panel of the add-on (:data:`addon.steps.STEPS`) that it stands in; empty: none.
         label: What its button says there.
         moves_robot: Whether it does; batches do not run it then.
@@ -60,6 +63,8 @@ class StageDescription:
     writes: tuple[str, ...] = ()
     tables: ("Callable[[dict[str, Any]], Sequence[tuple[str, Sequence[Sequence[str]]]]]"
              " | None") = None
+    found: "Sequence[str | Callable[[Mapping[str, Any]], str | None]]" = ()
+    then: str = ""
     step: str = ""
     label: str = ""
     moves_robot: Literal["", "when armed", "always"] = ""

@@ -1,5 +1,6 @@
 """Run the stages of a job file on many branches; continues where it stopped."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +70,16 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     if emit is not None:
         from limber.batch.jobs.scheduler_scripts import write_script
 
-        return {"branch_count": len(jobs.branches), "script": write_script(jobs, emit)}
+        script = write_script(jobs, emit)
+        run.close(f"A script for {len(jobs.branches)} branches.", where=script)
+        return {"branch_count": len(jobs.branches), "script": script}
     records = Records(jobs)
     if dry_run:
         planned = plan_of(jobs, records, retry_failed=retry_failed)
         run.show("What would run", [["branch", "stage", ""], *(
             [branch.name, task.label, told] for branch, task, told in planned)])
+        run.close(f"{len(planned)} stages on {len(jobs.branches)} branches would run.",
+                  then=f"limber batch {shlex.quote(str(job_file))}")
         return {"branch_count": len(jobs.branches), "task_count": len(planned),
                 "planned": [[branch.name, task.label, told] for branch, task, told in planned]}
     try:
@@ -99,5 +104,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
                         "The others are done.",
                         f"See {path_of_page(jobs)}, correct the cause, and run this with "
                         "--retry-failed.")
+    run.close(f"All {len(jobs.branches)} branches are done. Open the page in a browser.",
+              where=path_of_page(jobs))
     return {"branch_count": len(jobs.branches), **counts(jobs, records),
             "table": path_of_table(jobs), "page": path_of_page(jobs)}

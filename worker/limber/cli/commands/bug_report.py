@@ -62,6 +62,8 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     except OSError as error:
         raise InputError(f"{output} cannot be written ({error.strerror}).",
                          "The report goes there.", "Choose another place with -o.") from error
+    run.close(f"{count} files and what is installed. Look into it before you send it.",
+              where=output)
     return {"output": output, "file_count": count, "byte_count": Path(output).stat().st_size,
             "opens": told["opens"], "damaged_count": len(told["damages"])}
 

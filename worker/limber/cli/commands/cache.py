@@ -37,6 +37,8 @@ def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
     caches = known_caches()
     run.show(f"Kept in {cache_folder()}", [["what", "files", "MB"], *(
         [one.name, str(one.file_count), f"{one.byte_count / 1e6:.1f}"] for one in caches)])
+    run.close(f"{sum(one.byte_count for one in caches) / 1e6:.1f} MB are kept, {freed / 1e6:.1f} "
+              "MB were freed.", where=cache_folder())
     return {"folder": cache_folder(), "byte_count": sum(one.byte_count for one in caches),
             "freed_bytes": freed,
             "caches": {one.name: {"file_count": one.file_count, "byte_count": one.byte_count}

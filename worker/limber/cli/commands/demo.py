@@ -1,6 +1,8 @@
 """Run the whole pipeline on one branch."""
 
 import functools
+import json
+import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,6 +13,7 @@ import click
 
 from limber.cli.main import Run, stage_command
 from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.files.atomic import write_atomically
 from limber.core.optional import require_extra
 from limber.core.processes.stage_process import run_stage
 from limber.geometry.settings import ReconstructSettings
@@ -21,6 +24,10 @@ from limber.stages.command_line import (
     settings_options,
     without_foreign_options,
 )
+from limber.stages.registry import stage_description
+from limber.store import Branch
+from limber.store.manifest import MANIFEST
+from limber.version import VERSION
 
 # Assumed Young's modulus [Pa] at the control points for the simulated pull on a scan that comes
 # without a recording: green wood that softens towards the tip.
@@ -36,11 +43,14 @@ class _Demo:
     """A demo in progress: its folder and what its stages returned, by command."""
 
     folder: Path
+    branch: Path
     run: Run
     own: frozenset[str]
     """The demo's options."""
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    kept: set[str] = field(default_factory=set)
+    """Stages whose results were there from an earlier demo."""
     done: float = 0.0
 
     def stage(self, title: str, *arguments: object) -> None:
@@ -49,6 +59,7 @@ class _Demo:
         started = time.perf_counter()
         progress = self.run.progress.part(self.done, _ENDS[name])
         progress(0.0, title)
+        before = self._entries()
         try:
             result = run_stage([str(a) for a in arguments], progress)
         except LimberError as error:
@@ -56,10 +67,38 @@ class _Demo:
         self.done = _ENDS[name]
         self.seconds[name] = round(time.perf_counter() - started, 1)
         self.results[name] = result
-        self.run.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
+        if before and before == self._entries() and stage_description(name).key:
+            self.kept.add(name)
+        self._tell(title, name)
         for warning in result.get("warnings", []):
             if told := without_foreign_options(warning, self.own):
                 self.run.progress.warn(f"{name}: {told}")
+
+    def scene(self, scene: Path, picture: Path) -> None:
+        """Make scene and picture, unless they are there and show the branch as it is."""
+        title, note = "a Blender scene and its picture", self.folder / "demo.json"
+        shown = {"branch": self._digest(), "limber": VERSION}
+        if scene.is_file() and picture.is_file() and _read_note(note) == shown:
+            self.kept.add("scene")
+            self.seconds["scene"], self.done = 0.0, _ENDS["scene"]
+            self._tell(title, "scene")
+            return
+        self.stage(title, "scene", self.branch, "-o", scene, "--render", picture)
+        write_atomically(note, json.dumps(shown) + "\n")
+
+    def _tell(self, title: str, name: str) -> None:
+        told = "kept" if name in self.kept else f"{self.seconds[name]:.1f} s"
+        self.run.say(f"  {title:<42} {told:>8}")
+
+    def _entries(self) -> dict[str, str]:
+        """Return when each stage of the branch was finished, by its entry."""
+        if not (self.branch / MANIFEST).is_file():
+            return {}
+        return {key: entry.finished
+                for key, entry in Branch.read(self.branch).manifest.stages.items()}
+
+    def _digest(self) -> str:
+        return Branch.read(self.branch).manifest.content_digest()
 
     def _in_own_words(self, name: str, error: LimberError) -> LimberError:
         """Return a stage's error without advice to use options that only the stage has."""
@@ -108,7 +147,8 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     # Before minutes of work, not after them.
     require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     name = cloud.stem if cloud else "generated"
-    demo = _Demo(output or Path("out") / name, run,
+    folder = output or Path("out") / name
+    demo = _Demo(folder, folder / f"{name}.branch", run,
                  options_of(click.get_current_context().command))
     _make_folder(demo.folder)
     started = time.perf_counter()
@@ -116,13 +156,16 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     if cloud is not None:
         run.say("The pull is simulated with an assumed Young's modulus (--young). The stiffness "
                 "of this branch was not measured.")
-    branch, failure = _run_stages(demo, cloud, name, young=young, seed=seed, wishes=wishes)
+    failure = _run_stages(demo, cloud, young=young, seed=seed, wishes=wishes)
     _show_tables(demo)
-    summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}
-    run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\npicture "
-            f"{summary['picture']}\n{summary['demo_seconds']:.0f} s in total")
+    summary = _summary(demo) | {"demo_seconds": round(time.perf_counter() - started, 1)}
     if failure is not None:
+        run.say(f"The report has what was found before: {summary['report']}")
         raise failure
+    run.close(*_found(demo), *_files(summary["report"], summary["scene"], summary["picture"]),
+              then="limber demo SCAN.ply   (your own scan)" if cloud is None else
+              f"limber import-pull {shlex.quote(str(demo.branch))} PULL --name NAME   "
+              "(a pull that you measured)")
     return summary
 
 
@@ -151,18 +194,18 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
     with_picture = ["--picture", str(picture)] if picture.exists() else []
     report = run_stage(["report", result["branch"], *with_picture])["report"]
     seconds = round(time.perf_counter() - started, 1)
-    run.say(f"\nreport  {report}\nscene   {scene}\npicture {picture}\n{seconds:.0f} s in total")
+    run.close(_loop_sentence(result), *_files(report, scene, picture))
     return result | {"report": report, "demo_seconds": seconds}
 
 
-def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, young: str, seed: int,
-                wishes: Mapping[str, Any]) -> tuple[Path, LimberError | None]:
+def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
+                wishes: Mapping[str, Any]) -> LimberError | None:
     """Run all stages; what fails between mesh and scene ends in a report all the same.
 
     Returns:
-        The branch folder, and what failed.
+        What failed.
     """
-    branch = demo.folder / f"{name}.branch"
+    branch = demo.branch
     truth: list[str] = []
     if cloud is None:
         source = demo.folder / "scan"
@@ -187,10 +230,9 @@ def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, young: str, seed:
         failure = error
         demo.run.progress.warn(f"{error} Scene and report show the results so far.")
     picture = demo.folder / "scene.png"
-    demo.stage("a Blender scene and its picture", "scene", branch,
-               "-o", demo.folder / "scene.blend", "--render", picture)
+    demo.scene(demo.folder / "scene.blend", picture)
     demo.stage("the report", "report", branch, "--picture", picture)
-    return branch, failure
+    return failure
 
 
 def _scan_options(wishes: Mapping[str, Any]) -> list[object]:
@@ -225,9 +267,46 @@ def _show_tables(demo: _Demo) -> None:
         demo.run.show("Paths", comparison_rows(demo.results["plan"]))
 
 
-def _summary(demo: _Demo, branch: Path) -> dict[str, Any]:
+def _found(demo: _Demo) -> list[str]:
+    """What the demo found, in the sentences of its stages."""
+    from limber.results.report.findings import beyond_sentence, certificate_sentence, path_sentence
+
+    plan = demo.results["plan"]
+    told = [path_sentence(plan), certificate_sentence(plan), beyond_sentence(plan)]
+    if demo.kept:
+        kept = "All results" if not demo.results.keys() - demo.kept - {"generate"} else (
+            f"Results of {', '.join(sorted(demo.kept))}")
+        told.append(f"{kept} were kept from an earlier demo. --force reconstructs again.")
+    return [line for line in told if line]
+
+
+def _loop_sentence(result: Mapping[str, Any]) -> str:
+    held = sum(result["covered"])
+    flower = ("was brought to its goal" if result["flower_in_goal"] else
+              "did not reach its goal")
+    return (f"{held} of {len(result['covered'])} intervals contain the true modulus; the flower "
+            f"{flower}; the force along the path was within 5 % of the peak, or its interval, on "
+            f"{100 * result['force_within_share']:.1f} % of it.")
+
+
+def _files(report: object, scene: Path, picture: Path) -> list[str]:
+    """Say where what there is to look at lies."""
+    shown = [(name, path) for name, path in (("scene", scene), ("picture", picture))
+             if path.is_file()]
+    return [f"{name:<8}{path}" for name, path in (("report", report), *shown)]
+
+
+def _read_note(path: Path) -> Any:
+    """Return what an earlier demo noted; None where there is none, or it is damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _summary(demo: _Demo) -> dict[str, Any]:
     return {
-        "branch": branch, "report": branch / "report.html",
+        "branch": demo.branch, "report": demo.branch / "report.html",
         "scene": demo.folder / "scene.blend", "picture": demo.folder / "scene.png",
         "stage_seconds": demo.seconds,
         "young_pa": demo.results.get("estimate", {}).get("young_pa"),

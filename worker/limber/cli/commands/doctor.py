@@ -54,6 +54,12 @@ def command(run: Run, warm: bool) -> dict[str, Any]:
         warm_mechanics(run.progress.part(0.1, 0.5))
         compile_kernels()
         warm_planning(run.progress.part(0.5, 1.0))
+    costs = {module: cost for module, _distribution, cost in PARTS}
+    run.close(f"Python {result['python']}, {result['cores']} cores, {result['system']}.",
+              f"{len(PARTS) - len(result['missing'])} of {len(PARTS)} packages are installed.",
+              *(f"Without {module}: {costs[module] or 'nothing works'}."
+                for module in result["missing"]),
+              f"Blender: {result['blender']}")
     return result
 
 

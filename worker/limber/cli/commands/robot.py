@@ -1,5 +1,6 @@
 """Check and calibrate a robot: `limber robot check`, `limber robot calibrate`."""
 
+import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -50,6 +51,8 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
 
     nominal = cell.arm.forward(np.array(facts["joints"])) @ matrices(np.array(
         cell.tool.grasp_pose))
+    run.close(f"A {cell.arm.name} with controller version {facts['version']} answers at "
+              f"{cell.robot.address}; {len(samples)} samples a second. Nothing was moved.")
     return facts | {
         "arm": cell.arm.name, "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,
         "samples_per_second": len(samples),
@@ -144,6 +147,7 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Pa
     _write_base(cell_file, cell, branch.uuid, pose, position_sigma, rotation_sigma, fit.residual)
     run.show("Views", [["view", "off [mm]"], *(
         [str(number + 1), f"{1000 * off:.2f}"] for number, off in enumerate(fit.residuals))])
+    _close_calibration(run, cell_file, fit.residual, position_sigma)
     return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": pose,
             "residual_m": fit.residual, "position_sigma_m": position_sigma,
             "rotation_sigma_rad": rotation_sigma, "camera_pose": mounted["pose"],
@@ -171,11 +175,18 @@ def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file:
                 fit.residual)
     run.show("Touched points", [["point", "off [mm]"], *(
         [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))])
+    _close_calibration(run, cell_file, fit.residual, fit.position_sigma)
     return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": fit.pose,
             "residual_m": fit.residual,
             "points": [{"name": name, "residual_m": float(off)}
                        for name, off in zip(names, fit.residuals, strict=True)],
             "position_sigma_m": fit.position_sigma, "rotation_sigma_rad": fit.rotation_sigma}
+
+
+def _close_calibration(run: Run, cell_file: Path, residual: float, sigma: float) -> None:
+    run.close(f"The base's position is known to {1e3 * sigma:.2g} mm (standard deviation); RMS "
+              f"residual {1e3 * residual:.2g} mm.", where=cell_file,
+              then=f"limber robot check {shlex.quote(str(cell_file))}")
 
 
 def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
@@ -265,6 +276,9 @@ def scan(run: Run, address: str, output: Path, middle: tuple[float, float, float
 
     points = scanned(address, views_around(np.array(middle), distance, views))
     Cloud(points, {}).write_ply(output)
+    run.close(f"{len(points):,} points from {views} positions.", where=output,
+              then=f"limber reconstruct {shlex.quote(str(output))} -o "
+              f"{shlex.quote(output.stem)}.branch")
     return {"cloud": str(output), "point_count": len(points), "view_count": views}
 
 

@@ -1,5 +1,6 @@
 """Show what a batch has done, and what failed, runs or waits."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,11 @@ def command(run: Run, job_file: Path) -> dict[str, Any]:
     failed = failures(jobs, records)
     if failed:
         run.show("Failed", [["branch", "stage", "why"], *map(list, failed)])
-    return {"branch_count": len(jobs.branches), **counts(jobs, records),
+    count = counts(jobs, records)
+    run.close(f"Of {len(jobs.branches)} branches " + ", ".join(
+        f"{number} {state}" for state, number in count.items() if number) + ".",
+        then=f"limber batch {shlex.quote(str(job_file))}" if count["waiting"] else "")
+    return {"branch_count": len(jobs.branches), **count,
             "running_now": [f"{branch.name} {task.label}" for branch in jobs.branches
                             for task in branch.tasks
                             if records.of(branch, task).status == RUNNING],

@@ -31,8 +31,13 @@ def command(run: Run, branch_folder: Path, finish: bool) -> dict[str, Any]:
     damages = branch.damages()
     if damages:
         raise damage_error(branch.folder, damages, shown_count=len(damages))
-    return {"uuid": branch.uuid, "file_count": len(branch.manifest.files),
-            "byte_count": sum(entry.bytes for entry in branch.manifest.files.values()),
-            "unlisted": unlisted(branch.folder, branch.manifest),
+    found = branch.manifest.files
+    beside = unlisted(branch.folder, branch.manifest)
+    run.close(f"All {len(found)} files are as they were written.",
+              *([f"Written by no stage: {', '.join(map(str, beside))}."] if beside else []),
+              where=branch.folder)
+    return {"uuid": branch.uuid, "file_count": len(found),
+            "byte_count": sum(entry.bytes for entry in found.values()),
+            "unlisted": beside,
             "is_unfinished": branch.is_unfinished,
             "unfinished_streams": branch.streams()}

@@ -54,6 +54,8 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
         controller.gripper_output = tool.close_output if tool else 0
         real_time = claim_real_time(VIRTUAL_ROBOT_PRIORITY)
         server = serve(controller, address, seconds=seconds, say=run.say)
+    run.close(f"The virtual {controller.arm.name} made {controller.step_count:,} steps; this "
+              f"computer delayed it by {server.lost_seconds:.2g} s.")
     return {"model": controller.arm.name, "address": address, "steps": controller.step_count,
             "real_time": real_time, "lost_seconds": server.lost_seconds}
 

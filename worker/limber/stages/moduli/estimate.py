@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,8 +21,6 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from limber.estimation.estimated_branch import Subject
     from limber.estimation.judgement import Estimate
 
@@ -268,7 +267,16 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     return tables
 
 
+def _moduli_line(result: Mapping[str, Any]) -> str:
+    from limber.results.report.findings import modulus_sentence
+
+    return modulus_sentence(result)
+
+
 STAGE = StageDescription(
     "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
-    tables=_tables, step="estimate", label="Estimate")
+    tables=_tables, found=(
+        _moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "
+        "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}."),
+    then="limber energy {branch_folder}", step="estimate", label="Estimate")

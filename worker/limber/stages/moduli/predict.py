@@ -57,5 +57,7 @@ def _entry(branch: Branch, name: str | None) -> PullEntry:
 
 STAGE = StageDescription(
     "predict", 77, by_name(predict), BranchInputs, PredictSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"), step="estimate",
-    label="Predict Another Load")
+    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"),
+    found=("Under the load the points sink by {drop_m:m} ({drop_interval_m[0]:m} to "
+           "{drop_interval_m[1]:m}, 95 % interval).",),
+    step="estimate", label="Predict Another Load")

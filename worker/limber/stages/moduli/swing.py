@@ -122,4 +122,6 @@ def _summary(found: SwingFit, young: np.ndarray, pull: Pull, warnings: list[str]
 STAGE = StageDescription(
     "swing", 75, by_name(swing), BranchInputs, SwingSettings, RunOptions, key="swing",
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"),
-    step="estimate", label="Fit a Free Swing")
+    found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
+           "{young_interval_pa[1]:Pa}); damping ratio {damping_ratio:.3g}.",),
+    then="limber energy {branch_folder}", step="estimate", label="Fit a Free Swing")

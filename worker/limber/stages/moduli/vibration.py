@@ -174,5 +174,7 @@ def _summary(seen: Ringing, told: dict[str, Any], level: float) -> dict[str, Any
 
 STAGE = StageDescription(
     "vibration", 76, by_name(vibration), VibrationInputs, VibrationSettings, RunOptions,
-    key="vibration", reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"), step="estimate",
-    label="Fit Natural Frequencies")
+    key="vibration", reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"),
+    found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
+           "{young_interval_pa[1]:Pa}), from a ringing at {frequencies_hz[0]:Hz}.",),
+    then="limber energy {branch_folder}", step="estimate", label="Fit Natural Frequencies")

@@ -204,4 +204,8 @@ STAGE = StageDescription(
     "load", 45, by_name(load, folder="branch_folder"), BranchInputs, LoadSettings, RunOptions,
     key="load:{name}", reads=("mesh.vtu", "skeleton.swc"),
     writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
-    tables=_tables, step="material", label="Wind, Snow, Fruit, Cuts")
+    tables=_tables,
+    found=("Under the loads the tip sags by {sag_m:m}; greatest strain {greatest_strain:share}, "
+           "{strain_over_limit:share} of the limit; first frequency {frequencies_hz[0]:Hz}.",
+           "It bears {bears_times:.3g} times these loads; then held by: {held_by}."),
+    then="limber report {branch_folder}", step="material", label="Wind, Snow, Fruit, Cuts")

@@ -227,4 +227,8 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
 
 STAGE = StageDescription(
     "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY, reads=("mesh.vtu",),
-    writes=("frames/{name}.pc2", "frames/{name}.json"), step="material", label="Simulate a Motion")
+    writes=("frames/{name}.pc2", "frames/{name}.json"),
+    found=("{frame_count} frames. At the end the tip has moved by {tip_displacement_m:|m}, the "
+           "force on the grasp is {grasp_force_n:|N} and the branch stores {energy_j:J}.",),
+    then="limber scene {branch_folder} -o scene.blend --motion {name}", step="material",
+    label="Simulate a Motion")

@@ -84,4 +84,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
 STAGE = StageDescription(
     "energy", 90, by_name(sample_energy_field, folder="branch_folder"), BranchInputs,
     EnergySettings, ParallelOptions, key="energy", reads=("mesh.vtu", "skeleton.swc"),
-    writes=("energy.npz",), step="goal", label="Sample the Energy")
+    writes=("energy.npz",),
+    found=("{sample_count} poses solved, {rejected_count} rejected.",
+           "Error of the field: energy {energy_error:share}, force {force_error:share}."),
+    then="limber plan {branch_folder}", step="goal", label="Sample the Energy")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -436,9 +437,21 @@ def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, A
         raise
 
 
+def _outcome_line(result: Mapping[str, Any]) -> str:
+    if not result["armed"]:
+        return (f"Dry run: a {result['robot']} can follow the path, there and back in "
+                f"{result['duration_s']:.0f} s, with up to "
+                f"{result['predicted_peak_force_n']:.3g} N. Nothing was moved.")
+    return ("The robot followed the path and returned." if result["reached"]
+            else f"The robot stopped: {result['stop_reason']}.")
+
+
 STAGE = StageDescription(
     "execute", 110, by_name(execute, folder="branch_folder", cell_file="cell"), ExecuteInputs,
     ExecuteSettings, ExecuteOptions, key="execute:{name}",
     reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
-    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"), step="robot",
-    label="Check With Robot", moves_robot="when armed")
+    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
+    found=(_outcome_line, "Predicted peak force {predicted_peak_force_n:N}, measured "
+           "{peak_force_n:N}; at most {path_error_m:m} off the path."),
+    then="limber report {branch_folder}", step="robot", label="Check With Robot",
+    moves_robot="when armed")

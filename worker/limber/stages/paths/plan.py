@@ -10,6 +10,7 @@ import csv
 import io
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -154,6 +155,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         progress(0.95, "writing")
         rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
         found.summary["setpoint_rate_hz"] = rate
+        found.summary["wood"] = _wood(settings, found.summary)
         stage.path(f"plans/{name}-setpoints.csv").write_text(_setpoints(motion, pace, rate),
                                                              encoding="utf-8")
         _write(stage, name, limits, pace, motion, grasp_model, found)
@@ -206,6 +208,20 @@ class _InCell:
                     f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
                     "The branch cannot be moved there.",
                     "Choose another goal, or correct the obstacle in the cell file.")
+
+
+def _wood(settings: PlanSettings, summary: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the strain at which the wood breaks, and the paths that are over it; None where the
+    user has set a limit of the strain for wood that he knows."""
+    from limber.mechanics.materials.species import SPECIES, STRENGTH_OVER_YOUNG
+
+    if settings.max_strain is not None:
+        return None
+    known = settings.wood and SPECIES[settings.wood].rupture_strain
+    most = known or STRENGTH_OVER_YOUNG
+    return {"name": settings.wood, "breaking_strain": most, "is_assumed": not known,
+            "paths_over": [path for path in ("plan", "baseline")
+                           if summary[path].get("peak_strain", 0.0) > most]}
 
 
 def _stiffer(branch: Branch) -> float:
@@ -315,10 +331,18 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     return [("Both paths, on the full model", comparison_rows(result))]
 
 
+def _found_lines(result: Mapping[str, Any]) -> str:
+    from limber.results.report.findings import beyond_sentence, certificate_sentence, path_sentence
+
+    return "\n".join(filter(None, (
+        path_sentence(result), certificate_sentence(result), beyond_sentence(result))))
+
+
 STAGE = StageDescription(
     "plan", 100, by_name(plan, folder="branch_folder", cell_file="cell"), PlanInputs, PlanSettings,
     ParallelOptions, key="plan:{name}", reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
             "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
             "plans/{name}-bound.npz", "frames/{name}.pc2", "frames/{name}.json",
-            "frames/{name}.npz"), tables=_tables, step="plan", label="Plan Path")
+            "frames/{name}.npz"), tables=_tables, found=(_found_lines,),
+    then="limber report {branch_folder}", step="plan", label="Plan Path")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -51,7 +52,12 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
     return {"output": output, "messages": counts}
 
 
+def _message_line(result: Mapping[str, Any]) -> str:
+    counts = result["messages"]
+    return f"{sum(counts.values()):,} messages on {len(counts)} topics."
+
+
 STAGE = StageDescription(
     "export-pull", 58, by_name(export_pull, folder="branch_folder", output="mcap"),
-    ExportPullInputs, NoSettings, NoOptions, reads=("pulls/{name}/",), step="pulls",
-    label="Export a Pull")
+    ExportPullInputs, NoSettings, NoOptions, reads=("pulls/{name}/",),
+    found=(_message_line,), step="pulls", label="Export a Pull")

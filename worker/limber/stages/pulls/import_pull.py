@@ -144,4 +144,8 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
-    writes=("pulls/{name}/",), step="pulls", label="Import Pull")
+    writes=("pulls/{name}/",),
+    found=("Pull {pull} ({kind}): {frame_count} frames of {point_count} points.",
+           "The points moved by {displacement_m:m} under the load.",
+           "Force over displacement: {slope_n_per_m:.3g} N/m."),
+    then="limber estimate {branch_folder}", step="pulls", label="Import Pull")

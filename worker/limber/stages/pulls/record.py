@@ -341,4 +341,8 @@ def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str
 STAGE = StageDescription(
     "record", 55, by_name(record, folder="branch_folder", cell_file="cell"), RecordInputs,
     RecordSettings, RecordOptions, key="record:{name}", reads=("skeleton.swc",),
-    writes=("pulls/{name}/",), step="pulls", label="Record a Pull", moves_robot="always")
+    writes=("pulls/{name}/",),
+    found=("Pull {pull}: {sample_count:count} samples in {seconds:s}, {marker_frames} marker "
+           "frames, peak force {peak_force_n:N}; ended: {ended}.",),
+    then="limber estimate {branch_folder}", step="pulls", label="Record a Pull",
+    moves_robot="always")

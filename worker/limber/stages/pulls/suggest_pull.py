@@ -238,4 +238,8 @@ STAGE = StageDescription(
     "suggest-pull", 78, by_name(suggest_pull), SuggestPullInputs, SuggestPullSettings,
     ParallelOptions, key="suggest-pull",
     reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"), writes=("suggested_pull.json",),
-    tables=_tables, step="estimate", label="Suggest the Next Pull")
+    tables=_tables,
+    found=("Best: hold the branch at {best[grasp_fraction]:.2f} of its main path and move it by "
+           "{best[travel_m]:m}, with up to {best[peak_force_n]:N}.",),
+    then="limber record {branch_folder} --suggested --cell cell.toml", step="estimate",
+    label="Suggest the Next Pull")

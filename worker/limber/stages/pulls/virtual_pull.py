@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -109,7 +110,14 @@ def _is_meshed_body(branch: Branch) -> bool:
         "truth/truth.json")
 
 
+def _assumed_line(result: Mapping[str, Any]) -> str | None:
+    return ("Its modulus is assumed: it says nothing of the real branch."
+            if result.get("young_assumed") else None)
+
+
 STAGE = StageDescription(
     "virtual-pull", 52, by_name(virtual_pull), VirtualPullInputs, VirtualPullSettings, RunOptions,
-    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",), step="pulls",
-    label="Simulate a Pull")
+    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",),
+    found=("Simulated pull {pull}: {travel_m:m} of travel, peak force {peak_force_n:N}, "
+           "{frame_count} frames.", _assumed_line),
+    then="limber estimate {branch_folder}", step="pulls", label="Simulate a Pull")

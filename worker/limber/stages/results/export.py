@@ -186,4 +186,8 @@ class ExportInputs(BranchInputs):
 
 STAGE = StageDescription(
     "export", 125, by_name(export, folder="branch_folder"), ExportInputs, ExportSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc"), step="report", label="Export for Other Programs")
+    reads=("mesh.vtu", "skeleton.swc"),
+    found=("{link_count} links on springs, {mass_kg:kg}.",
+           "{tet_count:count} tetrahedra, {node_count:count} nodes.",
+           "{cylinder_count:count} cylinders."),
+    step="report", label="Export for Other Programs")

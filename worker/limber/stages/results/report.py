@@ -76,5 +76,8 @@ def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> d
 
 STAGE = StageDescription(
     "report", 110, by_name(write_report, folder="branch_folder", caliper_path="caliper"),
-    ReportInputs, NoSettings, RunOptions, key="report", writes=("report.html",), step="report",
-    label="Write Report")
+    ReportInputs, NoSettings, RunOptions, key="report", writes=("report.html",),
+    found=("A page with {figure_count} figures. Open it in a browser.",
+           lambda result: ("Not done yet: " + ", ".join(result["missing"]) + "."
+                           if result["missing"] else None)),
+    step="report", label="Write Report")

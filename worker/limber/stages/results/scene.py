@@ -149,4 +149,7 @@ def _writable(path: Path) -> Path:
 
 
 STAGE = StageDescription(
-    "scene", 120, by_name(scene), SceneInputs, SceneSettings, NoOptions, reads=("mesh.vtu",))
+    "scene", 120, by_name(scene), SceneInputs, SceneSettings, NoOptions, reads=("mesh.vtu",),
+    found=("{object_count} objects and {frame_count} frames, made by Blender {blender}.",
+           "Data of {vertex_count:count} vertices.", "Picture {picture}.",
+           "Turntable {turntable}."))

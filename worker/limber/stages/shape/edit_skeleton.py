@@ -20,7 +20,7 @@ and radii are in the branch's frame [m]; with --append they come after those tha
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -250,10 +250,19 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
              doubtful_rows(doubtful[:_SHOWN]))]
 
 
+def _doubtful_line(result: Mapping[str, Any]) -> str:
+    count = len(result["doubtful"])
+    return (f"{count} doubtful parts. Edits of them (a JSON list) are applied with --edits."
+            if count else "No part of it is doubtful.")
+
+
 STAGE = StageDescription(
     "skeleton", 25, by_name(review_skeleton, folder="branch_folder", edits_path="edits"),
     SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
     reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", EDITS),
-    tables=tables, step="skeleton", label="Review and Edit")
+    tables=tables,
+    found=("{node_count:count} nodes in {branch_count} branches, {length_m:m}; the mesh is {mesh}.",
+           _doubtful_line),
+    then="limber virtual-pull {branch_folder}", step="skeleton", label="Review and Edit")

@@ -141,5 +141,7 @@ def _text(targets: list[NamedTarget]) -> str:
 
 STAGE = StageDescription(
     "target", 35, by_name(set_target), TargetInputs, TargetSettings, RunOptions,
-    key="target:{name}", reads=("mesh.vtu",), writes=("targets.json",), step="goal",
-    label="Name a Target")
+    key="target:{name}", reads=("mesh.vtu",), writes=("targets.json",),
+    found=("{target} is at {position_m} m, {distance_m:m} from the branch, and weighs "
+           "{mass_kg:kg}.",),
+    then="limber energy {branch_folder}", step="goal", label="Name a Target")

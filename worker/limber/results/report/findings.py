@@ -1,0 +1,134 @@
+"""What was found, in sentences that the report's first part and the terminal share."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from limber.core.constants import STANDARD_GRAVITY
+from limber.core.errors import InputError
+from limber.robot.known_arms import arm_named
+from limber.robot.ur.arms import ARMS
+
+_MOST_NAMED = 6
+"""Control points whose moduli stand one by one in a sentence."""
+PATH_NAMES = {"baseline": "shortest", "plan": "gentle"}
+"""Of the two paths of a plan, in text, tables and figures."""
+
+
+def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
+    """Return the moduli from base to tip with their intervals.
+
+    Args:
+        estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa], with None where open.
+        assumed: What is to be known of them before they are read; empty for a real pull.
+    """
+    intervals = estimate.get("young_interval_pa") or [None] * len(estimate["young_pa"])
+    told = [_with_interval(young, interval) for young, interval in zip(
+        estimate["young_pa"], intervals, strict=True)]
+    if len(told) > _MOST_NAMED:
+        order = sorted(range(len(told)), key=lambda k: estimate["young_pa"][k])
+        told = [told[order[0]], told[order[-1]]]
+        words = "between the lowest and the highest control point"
+    else:
+        words = "from base to tip"
+    return (f"Young's modulus {words}: {', '.join(told)} MPa (95 % intervals"
+            f"{f'; {assumed}' if assumed else ''}).")
+
+
+def path_sentence(plan: Mapping[str, Any]) -> str:
+    """Return length, energy and force of the gentle path, and what it saves.
+
+    Args:
+        plan: Summary of a plan.
+    """
+    gentle = plan["plan"]
+    parts = [f"is {1e3 * gentle['length_m']:.3g} mm long"]
+    if gentle.get("peak_energy_j") is not None:
+        parts.append(f"stores at most {1e3 * gentle['peak_energy_j']:.3g} mJ")
+    if gentle.get("peak_force_n") is not None:
+        parts.append(f"needs at most {gentle['peak_force_n']:.3g} N")
+    told = "The gentle path " + _listed(parts)
+    saved, added = plan.get("energy_saved_percent"), plan.get("length_added_percent")
+    if saved is None or added is None:
+        return f"{told}."
+    return (f"{told}; it saves {saved:.3g} % of the shortest path's energy for {added:+.2g} % of "
+            "length.")
+
+
+def certificate_sentence(plan: Mapping[str, Any]) -> str:
+    """Return how far a plan's cost is at most above the least possible, as far as it is proven."""
+    certificate = plan.get("certificate") or {}
+    gaps = [(certificate.get("gap_percent"), "on the energy field"),
+            ((certificate.get("full_model") or {}).get("gap_percent"), "on the full model")]
+    known = [f"{gap:.1f} % {where}" for gap, where in gaps if gap is not None]
+    if not known:
+        return "No bound on its cost is proven."
+    return f"Proven: its cost is at most {' and '.join(known)} above the least possible."
+
+
+def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:
+    """Return what is beyond an arm or the wood along a plan's paths, by measure.
+
+    Args:
+        plan: Summary of a plan; ``robot`` names the arm it is for, ``wood`` has the strain at
+            which the wood breaks, and the paths that are over it.
+
+    Returns:
+        Sentences by ``peak_force_n`` and ``peak_strain``; nothing where all is within reach.
+    """
+    found = {}
+    for key, over in (("peak_force_n", _over_arm), ("peak_strain", _over_wood)):
+        told: dict[str, list[str]] = {}
+        for path, name in PATH_NAMES.items():
+            if (plan.get(path) or {}).get(key) is not None and (words := over(path, plan)):
+                told.setdefault(words, []).append(name)
+        if told:
+            found[key] = "; ".join(f"{' and '.join(names)}: {words}"
+                                   for words, names in told.items())
+    return found
+
+
+def beyond_sentence(plan: Mapping[str, Any]) -> str:
+    """Return what along a plan's paths is beyond an arm or the wood; empty where nothing is."""
+    labels = {"peak_force_n": "Peak force", "peak_strain": "Largest strain"}
+    return " ".join(f"{labels[key]}, {words}." for key, words in remarks_on(plan).items())
+
+
+def breaks_wood(plan: Mapping[str, Any]) -> bool:
+    """Whether the gentle path strains the wood beyond where it is known, or assumed, to break."""
+    return bool(_over_wood("plan", plan))
+
+
+def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
+    """Say which arm cannot carry a path's force: the plan's, or the strongest known that cannot."""
+    force, model = float(plan[path]["peak_force_n"]), (plan.get("robot") or {}).get("model")
+    try:
+        arms = [arm_named(model)] if model else list(ARMS.values())
+    except InputError:
+        # The arm's file, or the package that has the arm, is on another computer.
+        return ""
+    weak = [arm for arm in arms if force > arm.payload * STANDARD_GRAVITY]
+    if not weak:
+        return ""
+    arm = max(weak, key=lambda each: each.payload)
+    return (f"more than a {Path(arm.name).stem.upper()} carries "
+            f"({arm.payload * STANDARD_GRAVITY:.0f} N)")
+
+
+def _over_wood(path: str, plan: Mapping[str, Any]) -> str:
+    wood = plan.get("wood")
+    if not wood or path not in wood["paths_over"]:
+        return ""
+    return (f"over the {100 * wood['breaking_strain']:.2g} % at which "
+            f"{wood['name'] or 'green wood'} breaks{' (assumed)' if wood['is_assumed'] else ''}")
+
+
+def _with_interval(young: float, interval: Sequence[float | None] | None) -> str:
+    low, high = interval or (None, None)
+    if low is None or high is None:
+        return f"{young / 1e6:.3g} (not determined)"
+    return f"{young / 1e6:.3g} ({low / 1e6:.3g} to {high / 1e6:.3g})"
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
