@@ -32,8 +32,8 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     wood = result.get("wood") or {}
     is_over = "plan" in wood.get("paths_over", ())
     if is_over:
-        layout.label(text=f"Over the strain that breaks wood: {100 * wood['breaking_strain']:.2g} %",
-                     icon="ERROR")
+        most = f"{100 * wood['breaking_strain']:.2g} %"
+        layout.label(text=f"Over the strain that breaks wood: {most}", icon="ERROR")
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
                  f"Proven: at most {gap:.1f} % above the minimum",

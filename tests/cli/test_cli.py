@@ -119,6 +119,44 @@ def test_wrong_usage_is_exit_code_2(arguments):
     assert main.call(arguments) == 2
 
 
+def test_an_unknown_command_or_option_is_answered_with_those_like_it(capfd):
+    """One that is like none points at the list."""
+    for arguments, told in ((["recnstruct"], "Did you mean reconstruct?"),
+                            (["robot", "chek"], "Did you mean 'check'?"),
+                            (["simulate", "x.branch", "--duratoin", "1"], "--duration"),
+                            (["xyzzy"], "`limber --help` lists all.")):
+        assert main.call(arguments) == 2
+        assert told in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_knows_commands_and_options(shell, capfd, monkeypatch):
+    """The script asks the program, which answers from its own parsers."""
+    assert main.call(["completion", shell]) == 0
+    assert f"_LIMBER_COMPLETE={shell}_complete" in capfd.readouterr().out
+    monkeypatch.setenv("_LIMBER_COMPLETE", f"{shell}_complete")
+    for typed, word, wanted in (("limber reco", 1, "reconstruct"),
+                                ("limber energy --samp", 2, "--samples")):
+        monkeypatch.setenv("COMP_WORDS", typed)
+        # fish hands over the word itself, the others its number.
+        monkeypatch.setenv("COMP_CWORD", typed.split()[-1] if shell == "fish" else str(word))
+        main.call([])
+        assert wanted in capfd.readouterr().out
+
+
+def test_values_are_shown_in_full_on_demand(capfd):
+    """Short lines by default, every value with --verbose, one object with --json."""
+    def function(run, **_options):
+        """Probe."""
+        run.close("12 tetrahedra.", where="a.branch", then="limber simulate a.branch")
+        return {"tet_count": 12}
+    short = invoke(function, [], capfd)[1]
+    assert short[:3] == ["12 tetrahedra.", "in    a.branch", "next  limber simulate a.branch"]
+    assert "--verbose" in short[3] and len(short) == 4
+    assert invoke(function, ["-v"], capfd)[1][0] == "tet_count: 12"
+    assert json.loads(invoke(function, ["--json"], capfd)[1][0])["tet_count"] == 12
+
+
 REQUIRED = [(name, model, field) for name in stage_summaries()
             for model in (stage_description(name).inputs, stage_description(name).settings,
                           stage_description(name).options)

@@ -9,6 +9,7 @@ from limber.cli import main
 from limber.cli.commands import demo
 from limber.core.errors import NoPathError
 from limber.stages.command_line import options_of, without_foreign_options
+from limber.store import Branch
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 
@@ -19,11 +20,12 @@ def stages(monkeypatch):
     seen: dict = {"fail": [], "pull": {"young_true_pa": [1e9]}}
     results = {"estimate": {"young_pa": [1e9], "young_interval_pa": [[9e8, 1.1e9]]},
                "virtual-pull": seen["pull"],
-               "plan": {"baseline": {}, "plan": {}, "energy_saved_percent": 1.0,
+               "plan": {"baseline": {}, "plan": {"length_m": 0.2}, "energy_saved_percent": 1.0,
                         "length_added_percent": 2.0}}
 
     def run(arguments, _progress):
         seen[arguments[0]] = arguments
+        seen.setdefault("order", []).append(arguments[0])
         if arguments[0] in seen["fail"]:
             raise NoPathError("There is no path (--max-strain 0.01).", "Walls.",
                               "Raise --max-force or --max-strain. Or move the goal (--goal).")
@@ -58,6 +60,37 @@ def test_a_simulated_pull_of_ones_own_scan_is_no_truth(stages, tmp_path, own, ca
     assert ("stiffness of this branch was not measured" in words) == own
     assert ("assumed E [MPa]" in words) == own and ("true E [MPa]" in words) != own
     assert ("contain the true modulus" in words) != own
+
+
+def test_a_second_demo_keeps_results_and_renders_nothing_again(stages, tmp_path, capsys) -> None:
+    """It says so. Once the branch has changed, its scene is made anew."""
+    branch, out = Branch.create(tmp_path / "generated.branch"), tmp_path
+    with branch.stage("energy") as stage:
+        stage.result["sample_count"] = 1
+    for name in ("scene.blend", "scene.png"):
+        (out / name).write_text("made")
+    assert main.call(["demo", "-o", str(out)]) == 0
+    assert stages["order"].count("scene") == 1
+    capsys.readouterr()
+    assert main.call(["demo", "-o", str(out)]) == 0
+    told = capsys.readouterr()
+    assert stages["order"].count("scene") == 1 and stages["order"].count("plan") == 2
+    assert "a Blender scene and its picture" in told.err and "kept" in told.err
+    assert "All results were kept from an earlier demo" in told.out
+    with branch.stage("energy") as stage:
+        stage.result["sample_count"] = 2
+    assert main.call(["demo", "-o", str(out)]) == 0
+    assert stages["order"].count("scene") == 2
+
+
+def test_a_demo_ends_with_what_was_found_and_where(stages, tmp_path, capsys) -> None:
+    """Few lines; a scene that was not made is not named."""
+    assert main.call(["demo", "-o", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("The gentle path is 200 mm long")
+    assert any(line.startswith("report") for line in told)
+    assert not any(line.startswith("scene") for line in told)
+    assert told[-2].startswith("next  ") and len(told) < 8
 
 
 @pytest.mark.parametrize("failing", ["plan", "estimate"])

@@ -14,6 +14,7 @@ import click
 from limber.cli.main import Run, stage_command
 from limber.core.errors import Cancelled, InputError, LimberError
 from limber.core.files.atomic import write_atomically
+from limber.core.files.reading import read_json
 from limber.core.optional import require_extra
 from limber.core.processes.stage_process import run_stage
 from limber.geometry.settings import ReconstructSettings
@@ -26,7 +27,7 @@ from limber.stages.command_line import (
 )
 from limber.stages.registry import stage_description
 from limber.store import Branch
-from limber.store.manifest import MANIFEST
+from limber.store.manifest import MANIFEST, Manifest
 from limber.version import VERSION
 
 # Assumed Young's modulus [Pa] at the control points for the simulated pull on a scan that comes
@@ -92,13 +93,17 @@ class _Demo:
 
     def _entries(self) -> dict[str, str]:
         """Return when each stage of the branch was finished, by its entry."""
-        if not (self.branch / MANIFEST).is_file():
-            return {}
-        return {key: entry.finished
-                for key, entry in Branch.read(self.branch).manifest.stages.items()}
+        manifest = self._manifest()
+        return {} if manifest is None else {
+            key: entry.finished for key, entry in manifest.stages.items()}
 
-    def _digest(self) -> str:
-        return Branch.read(self.branch).manifest.content_digest()
+    def _digest(self) -> str | None:
+        manifest = self._manifest()
+        return None if manifest is None else manifest.content_digest()
+
+    def _manifest(self) -> Manifest | None:
+        there = (self.branch / MANIFEST).is_file()
+        return Branch.read(self.branch).manifest if there else None
 
     def _in_own_words(self, name: str, error: LimberError) -> LimberError:
         """Return a stage's error without advice to use options that only the stage has."""
@@ -299,8 +304,8 @@ def _files(report: object, scene: Path, picture: Path) -> list[str]:
 def _read_note(path: Path) -> Any:
     """Return what an earlier demo noted; None where there is none, or it is damaged."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json(path, "a demo's note")
+    except InputError:
         return None
 
 
