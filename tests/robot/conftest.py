@@ -173,6 +173,14 @@ def worker_address(own_address) -> str:
     return own_address
 
 
+@pytest.fixture(scope="package", autouse=True)
+def _state_folder(tmp_path_factory):
+    """Ways that robots followed are kept in a folder of the tests' own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIMBER_STATE", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 class Watch:
     """The witness of this test process, and when the test that is run began."""
 

@@ -25,7 +25,7 @@ from limber.core.progress import SILENT
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.operator_decisions import retreat_if_chosen
+from limber.robot.operator_decisions import _force_left, retreat_if_chosen
 
 pytest.importorskip("rtde_control")
 
@@ -159,6 +159,23 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(e_serie
     assert paused["outputs"] == 1 and ended["outputs"] == 0
     way = np.subtract(paused["pose"][:3], ended["pose"][:3])
     assert 0.015 < way[1] < 0.03 and np.linalg.norm(ended["tool_speed"]) < 1e-3
+
+
+def test_a_killed_program_leaves_its_way_and_its_tare_to_the_next(e_series):
+    """Killed while it pulls with 4 N: another driver goes back, judged by the tare of the first."""
+    cell = cell_for(e_series.address)
+    with RobotLink(cell) as link:
+        begin = np.array(e_series.state["pose"])
+        set_off(e_series, link, straight(e_series, (0.0, 0.2, 0.0), expected=False))
+        e_series.ask("added_wrench", wrench=[0, 0, 4.0, 0, 0, 0])
+        time.sleep(0.1)
+        link.process.kill()
+        stands_soon(e_series)
+    assert np.linalg.norm(np.subtract(e_series.state["pose"], begin)) > 0.005
+    with RobotLink(cell) as link:
+        assert _force_left(link) == pytest.approx(4.0, abs=0.7)
+        assert link.retreat()["event"] == "reached"
+    assert np.allclose(e_series.state["pose"][:3], begin[:3], atol=2e-3)
 
 
 def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(e_series):

@@ -13,6 +13,7 @@ from benchmarks.robot_faults import cell_for, new_robot, restored, straight
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import COLUMNS, RobotLink
+from limber.robot.observed import observe, show_before_motion
 
 pytest.importorskip("rtde_control")
 pytestmark = pytest.mark.slow
@@ -90,3 +91,43 @@ def test_nobody_at_the_address_is_told_soon():
     with pytest.raises(WorkError, match="No robot answers"):
         RobotLink(cell_for("127.0.0.99")).close()
     assert time.monotonic() - begin < 20
+
+
+def test_what_is_read_writes_nothing_and_what_is_set_is_put_back(resting_robot):
+    """Payload and tool of another job: named with both values, set for a link, then as before."""
+    before = {"payload": 1.2, "tool": [0.0, 0.0, 0.05, 0.0, 0.0, 0.0]}
+    resting_robot.ask("payload", value=before["payload"])
+    resting_robot.ask("tool", offset=before["tool"])
+    cell = Cell(robot={"model": "ur5e", "address": resting_robot.address},
+                base={"pose": (0,) * 6}, tool={"mass_kg": 0.5})
+    try:
+        seen = observe(cell, 0.1)
+        told = "; ".join(map(str, seen.differences))
+        assert "payload: 1.200 kg in the controller, 0.500 kg in the cell file (set for" in told
+        assert "tool centre point: about (0, 0, 50) mm" in told
+        assert not seen.implausible(cell) and not seen.program_runs
+        state = resting_robot.state
+        assert state["program"] == "STOPPED"
+        assert {name: state[name] for name in before} == before
+        with RobotLink(cell):
+            state = resting_robot.state
+            assert state["payload"] == 0.5 and state["tool"] == [0.0] * 6
+            with pytest.raises(SafetyStop, match="A program is running on the controller"):
+                show_before_motion(cell, lambda text: None)
+        state = resting_robot.state
+        assert state["payload"] == pytest.approx(1.2)
+        assert state["tool"] == pytest.approx(before["tool"])
+    finally:
+        resting_robot.ask("payload", value=0.0)
+        resting_robot.ask("tool", offset=[0.0] * 6)
+
+
+def test_settings_that_could_not_be_put_back_are_told(resting_robot):
+    """Somebody ends the program at the pendant: nothing takes them any more."""
+    resting_robot.ask("payload", value=1.2)
+    with RobotLink(cell_for(resting_robot.address)) as link:
+        link.wait_for_samples()
+        resting_robot.ask("stop_program")
+        assert link.wait("stopped", seconds=5)["reason"]
+    assert any("keeps the tool centre point and payload" in each for each in link.warnings)
+    resting_robot.ask("payload", value=0.0)

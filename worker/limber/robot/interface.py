@@ -149,6 +149,8 @@ class Sample:
         slider: Speed slider, 0 to 1.
         tool: Tool that is set in the controller, the flange's frame [m, rad], shape [6]; None where
             its version does not tell it.
+        payload: Mass that is set there [kg], and ``payload_centre`` its centre in the flange's
+            frame [m], shape [3]; None likewise.
     """
 
     clock: float
@@ -163,6 +165,8 @@ class Sample:
     runtime_state: int
     slider: float
     tool: np.ndarray | None = None
+    payload: float | None = None
+    payload_centre: np.ndarray | None = None
 
 
 class ArmControl(Protocol):
@@ -197,7 +201,9 @@ class ArmControl(Protocol):
         ...
 
     def connect(self) -> None:
-        """Connect what moves the arm, and :meth:`watch`.
+        """Connect what moves the arm, set its tool and payload, and :meth:`watch`.
+
+        Nothing else writes to a controller that only was opened.
 
         Raises:
             WorkError: it does not take its settings.
@@ -242,6 +248,10 @@ class ArmControl(Protocol):
         Raises:
             LimberError: it cannot.
         """
+        ...
+
+    def put_back(self) -> str | None:
+        """Set what was set before :meth:`connect`; returns in words what could not be."""
         ...
 
     def close(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from limber.core.errors import InputError, LimberError
 from limber.robot.driver.link import COLUMNS
+from limber.robot.observed import show_before_motion
 
 if TYPE_CHECKING:
     from limber.core.progress import Progress
@@ -22,13 +23,19 @@ _FORCE = slice(COLUMNS.index("smooth_fx_n"), COLUMNS.index("smooth_fx_n") + 3)
 _FORCE_SECONDS = 1.0
 
 
-def require_confirmation(name: str, typed: str | None) -> None:
+def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Progress) -> None:
     """Let the robot move only when somebody has typed ``name``; asked for at a terminal.
+
+    What its controller has set otherwise than the cell states is shown before that.
 
     Raises:
         InputError: nothing was typed, or something else.
+        LimberError: the robot does not answer, or cannot be moved now.
     """
-    if typed is None and sys.stdin.isatty():
+    asks = typed is None and sys.stdin.isatty()
+    if asks or typed == name:
+        show_before_motion(cell, progress.warn)
+    if asks:
         typed = input(f"The robot will move. Type {name} to continue: ").strip()
     if typed != name:
         raise InputError("Nobody confirmed that the robot may move.", "",

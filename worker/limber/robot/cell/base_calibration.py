@@ -7,15 +7,13 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rigid_fit, spreads
-from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.cell.cell import Cell
+from limber.robot.cell.controller_settings import in_millimetres, is_tool, tool_in_controller
 from limber.robot.interface import Sample
 
 _FEWEST = 4
 _LEAST_SPREAD = 0.02  # m, of the second principal direction
 _LEAST_OUT_OF_PLANE = 0.005  # m, of the third
-# Real arms differ from their nominal measures by millimetres: so far a tool is known from joints.
-_TOOL_M, _TOOL_RAD = 0.01, np.radians(2.0)
 
 
 @dataclass(frozen=True)
@@ -109,26 +107,19 @@ def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
     grasp = np.array(cell.tool.grasp_pose)
     if sample.tool is not None:
         return _carried(sample.pose, sample.tool, grasp)
-    seen = pose_vectors(inverted(cell.arm.forward(sample.joints)) @ matrices(sample.pose))
     for tool in (grasp, np.zeros(6)):
-        if (length(seen[:3] - tool[:3]) <= _TOOL_M
-                and length(turn_between(tool, seen)) <= _TOOL_RAD):
+        if is_tool(cell, sample, tool):
             return _carried(sample.pose, tool, grasp)
     raise InputError(
-        f"The tool centre point in the controller is at about {_millimetres(seen)} in the "
-        f"flange's frame, but the cell's tool.grasp_pose is at {_millimetres(grasp)}.",
+        "The tool centre point in the controller is at about "
+        f"{in_millimetres(tool_in_controller(cell, sample))} in the "
+        f"flange's frame, but the cell's tool.grasp_pose is at {in_millimetres(grasp)}.",
         "So the controller's pose is not the pose of the gripper's centre.",
         "Set the tool centre point to tool.grasp_pose on the pendant, or correct the cell file.")
 
 
 def _carried(pose: np.ndarray, tool: np.ndarray, grasp: np.ndarray) -> np.ndarray:
     return (matrices(pose) @ inverted(matrices(tool)) @ matrices(grasp))[:3, 3]
-
-
-def _millimetres(pose: np.ndarray) -> str:
-    place = ", ".join(f"{1000 * value:.0f}" for value in pose[:3])
-    turn = ", ".join(f"{value:.1f}" for value in np.degrees(pose[3:]))
-    return f"({place}) mm, turned by ({turn}) degrees"
 
 
 def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: float = 0.01,

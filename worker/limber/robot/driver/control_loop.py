@@ -59,8 +59,9 @@ class Driver:
         self.guard = _guard_of(cell, self._control)
         _warm_up(cell, self._control, sensor)
         # Now: where it has just compiled this takes longer than the watchdog would wait.
-        self.facts = self._control.facts | {"kept_in_memory": spare_what_is_loaded(),
-                                            "kept_awake": keep_awake()}
+        self.facts = self._control.facts | {
+            "real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
+            "kept_awake": keep_awake()}
         set_deadline(CONNECT_SECONDS)
         self._control.connect()
         self._deadline = RenewedDeadline()
@@ -134,6 +135,8 @@ class Driver:
             if order is None:
                 self._under_way.judge(
                     self.guard.event("the program that drives the robot has ended"))
+                self._put_back()
+                self._senses.way_file.close()
                 self.ended = True
                 return
             self._heard = time.monotonic()
@@ -168,6 +171,7 @@ class Driver:
         elif name == "gripper":
             close = bool(order["close"])
             self._control.grip(close)
+            self._senses.way_file.gripped(close)
             self.tell(event="gripper", closed=close)
         else:
             raise InputError(f"Order {name!r} is unknown.")
@@ -187,6 +191,7 @@ class Driver:
         sample = self._require_sample()
         way = self._senses.way_back.from_here(sample, self.cell.limits.acceleration_m_s2)
         self._require_program(sample)
+        self._senses.recall_tare()
         self.guard.begin_retreat(self._senses.smooth)
         self._set_off(way)
 
@@ -261,7 +266,12 @@ class Driver:
         set_deadline()
         self._under_way.give_up()
         self._senses.close()
+        self._put_back()
         self._control.close()
+
+    def _put_back(self) -> None:
+        if left := self._control.put_back():
+            self.tell(event="warning", text=left)
 
 
 def _ordered(order: dict[str, Any]) -> Trajectory:

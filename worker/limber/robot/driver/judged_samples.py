@@ -15,6 +15,7 @@ from limber.robot.driver.guard import Guard, Verdict
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.retreat import WayBack
 from limber.robot.motion.trajectory import Trajectory
+from limber.robot.motion.way_file import WayFile, read_way
 
 _BATCH_SECONDS = 0.02
 _OLDEST_READING_SECONDS = 0.05
@@ -37,7 +38,13 @@ class Senses:
         self._sensor, self._guard = sensor, guard
         self._chain = WrenchChain(cell, count=5 if control.rate > 200 else 3)
         self._under_way, self._hold_ups, self._tell = under_way, hold_ups, tell
-        self.way_back = WayBack(cell.arm.joint_names)
+        self.way_file, followed = WayFile(cell), read_way(cell)
+        self.way_back = WayBack(cell.arm.joint_names, followed, self.way_file)
+        self._is_tared = False
+        self._recalls_tare = followed is not None and followed.bias is not None
+        if followed is not None and followed.bias is not None:
+            # What a program before this one found: a retreat is judged by it.
+            self._chain.bias = followed.bias
         self.smooth = _NOTHING
         self._held_for: np.ndarray | None = None
         self._held_at = np.zeros(6)
@@ -135,6 +142,11 @@ class Senses:
         self._chain.start_tare()
         self._tare_until = sample.clock + seconds
 
+    def recall_tare(self) -> None:
+        """Judge forces by the tare of the program that followed the way, if none was done since."""
+        if self._recalls_tare and not self._is_tared:
+            self._guard.tared()
+
     def _end_tare(self) -> None:
         self._tare_until = None
         try:
@@ -143,6 +155,8 @@ class Senses:
             self._tell(event="refused", order="tare", reason=str(error))
             return
         self._guard.tared()
+        self._is_tared = True
+        self.way_file.tared(self._chain.bias)
         self._tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
                    delay_s=self._chain.delay(self._rate))
 
@@ -156,5 +170,6 @@ class Senses:
             self._batch, self._batch_since = [], now
 
     def close(self) -> None:
-        """Let go of the sensor."""
+        """Let go of the sensor, and see that the way is on disk."""
+        self.way_file.close()
         self._sensor.close()

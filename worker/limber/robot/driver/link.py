@@ -20,6 +20,7 @@ from limber.robot.motion.trajectory import Trajectory
 _CONNECT_SECONDS = 25.0
 _BEAT_SECONDS = 0.2
 _STANDS_SECONDS = 0.3
+_LAST_WORDS_SECONDS = 1.0  # that are in the pipe still when the process has ended
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop}
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
@@ -208,10 +209,14 @@ class RobotLink:
             self.process.stdin.close()
 
     def close(self) -> None:
-        """Stop what moves and end the process."""
+        """Stop what moves and end the process; its last warnings are kept."""
         self._closing.set()
         with self._write_lock:
             end_by_closing(self.process)
+        with self._news:
+            self._news.wait_for(lambda: self._ended, _LAST_WORDS_SECONDS)
+            self.warnings += [event["text"] for event in self._events
+                              if event["event"] == "warning"]
 
     def _order(self, **content: Any) -> None:
         self._write(json.dumps(content))

@@ -7,7 +7,7 @@ import numpy as np
 
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.robot.cell.cell import Cell
-from limber.robot.driver.real_time import claim_real_time
+from limber.robot.cell.controller_settings import plays
 from limber.robot.interface import Sample
 from limber.robot.ur.samples import Dashboard, SampleStream
 
@@ -38,7 +38,10 @@ class UrControl(SampleStream):
         self._control: Any = None
         self._outputs: Any = None
         self.facts = self._identified()
-        self.facts |= _ready(self)
+        self._first = _first_sample(self)
+        self.facts |= {"pose": self._first.pose.tolist(), "joints": self._first.joints.tolist(),
+                       "slider": self._first.slider}
+        self._before: dict[str, Any] = {}
         # Loaded now, to be kept in memory with the rest.
         import_module("rtde_control")
 
@@ -61,7 +64,7 @@ class UrControl(SampleStream):
         model = ask("get robot model")
         facts = {"address": self.address, "version": version, "model": model,
                  "serial": ask("get serial number"), "remote": ask("is in remote control"),
-                 "rate_hz": self.rate, "real_time": claim_real_time()}
+                 "rate_hz": self.rate}
         known = model.lower()
         if known.startswith("ur") and known != arm.name.rstrip("e"):
             raise InputError(f"The robot reports that it is a {model}, but the cell file states "
@@ -78,12 +81,21 @@ class UrControl(SampleStream):
         """Connect with ur-rtde, set tool, payload and watchdog.
 
         Raises:
-            WorkError: the robot does not take its settings. RuntimeError: ur-rtde's own.
+            SafetyStop: another program runs. WorkError: the robot does not take its settings.
+            RuntimeError: ur-rtde's own.
         """
         from rtde_control import RTDEControlInterface
 
+        if plays(self._first):
+            raise SafetyStop("A program is running on the controller "
+                             f"({self._dashboard.ask('programState')}).",
+                             "Limber's own program would end it, wherever it is.",
+                             "Stop it on the pendant.")
         tool = self._cell.tool
         self._control = RTDEControlInterface(self.address, self.rate)
+        self._before["tool"] = self._control.getTCPOffset()
+        if self._first.payload is not None and self._first.payload_centre is not None:
+            self._before["payload"] = (self._first.payload, self._first.payload_centre.tolist())
         if tool.gripper == "digital_output":
             from rtde_io import RTDEIOInterface
 
@@ -135,6 +147,23 @@ class UrControl(SampleStream):
         _require(self._outputs.setStandardDigitalOut(tool.close_output, close),
                  "drive its gripper")
 
+    def put_back(self) -> str | None:
+        """Set tool and payload as they were; returns in words where that failed."""
+        if not self._before:
+            return None
+        before, self._before = self._before, {}
+        try:
+            # A program that was stopped takes nothing, and is not started for this alone.
+            done = (self._control.isProgramRunning() and "payload" in before
+                    and self._control.setTcp(before["tool"])
+                    and self._control.setPayload(*before["payload"]))
+        except RuntimeError:
+            done = False
+        return None if done else (
+            "The controller keeps the tool centre point and payload of the cell file: its program "
+            "had ended before they could be put back. Set them on the pendant if another program "
+            "needs others.")
+
     def close(self) -> None:
         """Let go of the robot."""
         for interface in (self._outputs, self._control):
@@ -144,8 +173,8 @@ class UrControl(SampleStream):
         self._dashboard.close()
 
 
-def _ready(stream: SampleStream) -> dict[str, Any]:
-    """Where the arm stands, once it may be moved."""
+def _first_sample(stream: SampleStream) -> Sample:
+    """Where the arm stands, if it may be moved."""
     samples: list[Sample] = stream.read(1.0)
     if not samples:
         raise WorkError("The robot sends no data.", "", "Restart its controller.")
@@ -158,8 +187,7 @@ def _ready(stream: SampleStream) -> dict[str, Any]:
     if sample.slider <= 0.0:
         raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
                          "Raise it on the pendant.")
-    return {"pose": sample.pose.tolist(), "joints": sample.joints.tolist(),
-            "slider": sample.slider}
+    return sample
 
 
 def _require(done: bool, what: str) -> None:

@@ -9,6 +9,7 @@ from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.interface import Sample
 from limber.robot.motion.start_check import POSITION_M, ROTATION_RAD, different_joints
 from limber.robot.motion.trajectory import Trajectory, along
+from limber.robot.motion.way_file import FollowedWay, WayFile
 
 _APART_M, _APART_RAD = 1e-3, 0.005  # between the places that are kept
 _SAME = 0.3  # of what is bridged at a start: so near, two places of the way are one
@@ -22,13 +23,17 @@ class WayBack:
 
     Args:
         names: Of the arm's joints.
+        followed: The way of a program before this one, to begin with.
+        kept: Called with each place that is kept, and with what a way begins with.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self._names = names
-        self._poses: list[np.ndarray] = []
-        self._joints: list[np.ndarray] = []
-        self._speeds = _LEAST_SPEEDS
+    def __init__(self, names: Sequence[str], followed: FollowedWay | None = None,
+                 kept: WayFile | None = None) -> None:
+        self._names, self._kept = names, kept
+        self._poses: list[np.ndarray] = [] if followed is None else list(followed.poses)
+        self._joints: list[np.ndarray] = [] if followed is None else list(followed.joints)
+        self._speeds = _LEAST_SPEEDS if followed is None else np.maximum(followed.speeds,
+                                                                         _LEAST_SPEEDS)
         self._rest: np.ndarray | None = None
 
     def begin(self, sample: Sample, trajectory: Trajectory) -> None:
@@ -39,8 +44,12 @@ class WayBack:
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
         if rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0:
             self._poses, self._joints, self._speeds = [], [], _LEAST_SPEEDS
+            if self._kept is not None:
+                self._kept.begin()
         self._rest = rest
         self._speeds = np.maximum(self._speeds, trajectory.greatest_speeds)
+        if self._kept is not None:
+            self._kept.add(speeds=self._speeds)
         self._keep(sample)
 
     def note(self, sample: Sample) -> None:
@@ -53,6 +62,8 @@ class WayBack:
     def _keep(self, sample: Sample) -> None:
         self._poses.append(sample.pose.copy())
         self._joints.append(sample.joints.copy())
+        if self._kept is not None:
+            self._kept.add(pose=self._poses[-1], joints=self._joints[-1])
 
     def from_here(self, sample: Sample, acceleration: float) -> Trajectory:
         """Return the path from ``sample`` back to its start, at half the speed of the way there.

@@ -22,7 +22,7 @@ _MOST_AT_ONCE = 8
 _NAMES = ("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_speed",
           "actual_TCP_force", "robot_mode", "safety_mode", "runtime_state",
           "target_speed_fraction")
-_TOOL = "tcp_offset"
+_NEWER = ("tcp_offset", "payload", "payload_cog")  # that not every version knows
 
 
 class SampleStream:
@@ -62,9 +62,8 @@ class SampleStream:
             raise ValueError("the controller refused protocol version 2")
         self.version = struct.unpack(">4I", self._ask(rtde.CONTROL_VERSION, b"", timeout))
         self.rate = 125.0 if self.version[0] <= 3 else 500.0
-        names: tuple[str, ...] = _NAMES
-        if rtde.output_types([_TOOL], self.version) != ["NOT_FOUND"]:
-            names = (*_NAMES, _TOOL)
+        names = (*_NAMES, *(name for name in _NEWER if rtde.output_types(
+            [name], self.version) != ["NOT_FOUND"]))
         reply = self._ask(rtde.OUTPUT_SETUP,
                           struct.pack(">d", self.rate) + ",".join(names).encode(), timeout)
         if not reply or reply[0] == 0 or b"NOT_FOUND" in reply:
@@ -131,11 +130,16 @@ class SampleStream:
             wrench=np.array(values["actual_TCP_force"]), robot_mode=values["robot_mode"],
             safety_mode=values["safety_mode"], runtime_state=values["runtime_state"],
             slider=values["target_speed_fraction"],
-            tool=np.array(values[_TOOL]) if _TOOL in values else None)
+            tool=_array(values.get("tcp_offset")), payload=values.get("payload"),
+            payload_centre=_array(values.get("payload_cog")))
 
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+
+
+def _array(numbers: Sequence[float] | None) -> np.ndarray | None:
+    return None if numbers is None else np.array(numbers)
 
 
 class Dashboard:

@@ -139,7 +139,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         _write_preview(branch, name, settings, cell, motion)
         return result | {"armed": False, "reached": None, "stop_reason": None,
                          "after_stop": None, "peak_force_n": None, "path_error_m": None}
-    require_confirmation(name, options.confirm)
+    require_confirmation(name, options.confirm, cell, progress)
     return _armed(branch, cell, name, settings, options, motion, result, progress)
 
 
@@ -362,10 +362,9 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
             with live, RobotLink(cell, take) as link:
                 event, on_path = _steps(cell, link, motion, settings, options, batches, live,
                                         progress)
-                warnings = list(link.warnings)
         finally:
             stream.close()
-        for warning in warnings:
+        for warning in link.warnings:
             progress.warn(warning)
         samples = np.concatenate(batches)[on_path[0]:on_path[1]] if on_path else None
         base = matrices(np.array(cell.base.pose))

@@ -128,7 +128,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
                          "Recover it with --recover, or give another --name.")
     require_payload(cell)
     blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
-    require_confirmation(name, options.confirm)
+    require_confirmation(name, options.confirm, cell, progress)
     with branch.writing(f"the recording {name}"):
         ended = _recorded(branch, cell, name, settings, options, blocked, progress)
         result = _finish(branch, name, settings, ended)
@@ -179,8 +179,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             live.at("pulling")
             link.start(trajectory)
             event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
-            ended = {"ended": "reached" if event["event"] == "reached" else event["reason"],
-                     "warnings": list(link.warnings)}
+            ended = {"ended": "reached" if event["event"] == "reached" else event["reason"]}
             if event["event"] == "reached":
                 # What was seen last comes a little later.
                 time.sleep(0.5)
@@ -188,8 +187,8 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 grip(cell, link, close=False, progress=progress)
             else:
                 ended["after_stop"] = retreat_if_chosen(cell, link, options.after_stop, progress)
-            ended |= {"peak_force_n": recorder.peak_force, "sample_count": recorder.count}
-            return ended
+        return ended | {"peak_force_n": recorder.peak_force, "sample_count": recorder.count,
+                        "warnings": list(link.warnings)}
     finally:
         for lines in (stream, entry_lines, marker_lines):
             if lines is not None:

@@ -1,0 +1,1 @@
+"""The commands of `limber robot`, one a module."""

@@ -1,0 +1,205 @@
+"""Find where a robot stands beside a branch: `limber robot calibrate`."""
+
+import csv
+import shlex
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+import numpy as np
+
+from limber.cli.main import Run, stage_command
+
+
+@stage_command("calibrate")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+@click.option("--points", "points_file", type=click.Path(path_type=Path),
+              help="CSV of points on the branch to touch: name,x_m,y_m,z_m in the branch's frame. "
+              "With six more columns, robot_x_m to robot_rz_rad, the robot's pose is read from "
+              "the file.")
+@click.option("--views", "views_file", type=click.Path(path_type=Path),
+              help="CSV of a board or marker seen by the camera that scanned the branch, one line "
+              "for each pose of the arm: robot_x_m to robot_rz_rad of the gripper's middle, "
+              "seen_x_m, seen_y_m, seen_z_m in the camera's frame, and seen_rx_rad, seen_ry_rad, "
+              "seen_rz_rad for a board.")
+@click.option("--camera-on", type=click.Choice(["stand", "gripper"]), default="stand",
+              show_default=True, help="With --views: what carries the camera. The other one "
+              "carries the board.")
+@click.option("--scan-pose", type=float, nargs=6, metavar="X Y Z RX RY RZ",
+              help="With --camera-on gripper: pose of the gripper in the base frame [m, rad] when "
+              "the camera scanned the branch. Default: the scan is in the board's frame.")
+@click.option("--largest-residual", default=0.01, show_default=True,
+              help="Largest residual of a point or view [m]; a larger one is refused.")
+def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path | None,
+              views_file: Path | None, camera_on: Literal["stand", "gripper"],
+              scan_pose: tuple[float, ...] | None, largest_residual: float) -> dict[str, Any]:
+    """Write the robot's base in the branch's frame into the cell file, from points or views.
+
+    Points are touched with the middle of the gripper, the robot guided by hand; the controller's
+    own pose is read when Enter is pressed. Four or more points that lie in no plane are needed:
+    others fit a mirrored frame as well. Views are of a board or marker, found in the camera's
+    pictures by another program (OpenCV's solvePnP gives such poses): the branch's scan is in the
+    frame of that camera, so nothing need be touched.
+    """
+    from limber.core.errors import InputError
+    from limber.robot.cell.cell import read_cell
+    from limber.store import Branch
+
+    cell, branch = read_cell(cell_file), Branch.read(branch_folder)
+    if (points_file is None) == (views_file is None):
+        raise InputError("Exactly one of --points and --views must be given.",
+                         "The base is found from touched points or from a camera's views.",
+                         "Give one of them.")
+    if views_file is None:
+        assert points_file is not None
+        return _by_touching(run, cell_file, cell, branch, points_file, largest_residual)
+    if scan_pose is not None and camera_on == "stand":
+        raise InputError("--scan-pose was given, but the camera is fixed.",
+                         "The position of a fixed camera does not follow from a pose of the arm.",
+                         "Omit it, or give --camera-on gripper.")
+    return _by_seeing(run, cell_file, cell, branch, views_file, camera_on, scan_pose,
+                      largest_residual)
+
+
+def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Path,
+               camera_on: Literal["stand", "gripper"], scan_pose: tuple[float, ...] | None,
+               largest_residual: float) -> dict[str, Any]:
+    from limber.core.files.reading import read_columns
+    from limber.core.numerics.rigid import matrices, pose_vectors
+    from limber.recordings.recording import POSE_COLUMNS
+    from limber.robot.cell.hand_eye import base_from_camera, fit_camera
+    from limber.store.loading import load_skeleton
+
+    robot_columns = [f"robot_{name}" for name in POSE_COLUMNS]
+    seen_columns = [f"seen_{name}" for name in POSE_COLUMNS]
+    table = read_columns(views_file, [*robot_columns, *seen_columns[:3]],
+                         "a table of views (robot_x_m .. robot_rz_rad, seen_x_m .. seen_rz_rad)")
+    is_board = all(name in table for name in seen_columns)
+    robot = np.column_stack([table[name] for name in robot_columns])
+    seen = np.column_stack([table[name] for name in seen_columns[:6 if is_board else 3]])
+    fit = fit_camera(robot, seen, camera_on, largest_residual=largest_residual)
+    alignment = branch.manifest.alignment
+    scan = np.eye(4)
+    scan[:3, :3] = np.array(alignment.rotation)
+    scan[:3, 3] = -scan[:3, :3] @ np.array(alignment.origin)
+    pose, position_sigma, rotation_sigma = base_from_camera(
+        fit, scan, camera_on, None if scan_pose is None else np.array(scan_pose),
+        load_skeleton(branch).nodes.mean(axis=0))
+    camera = matrices(fit.camera)
+    camera = (matrices(pose) if camera_on == "stand"
+              else matrices(np.array(cell.tool.grasp_pose))) @ camera
+    mounted = {"pose": tuple(map(float, pose_vectors(camera))),
+               "mount": "branch" if camera_on == "stand" else "flange"}
+    if cell.camera is not None:
+        cell = cell.model_copy(update={"camera": cell.camera.model_copy(update=mounted)})
+    _write_base(cell_file, cell, branch.uuid, pose, position_sigma, rotation_sigma, fit.residual)
+    run.show("Views", [["view", "off [mm]"], *(
+        [str(number + 1), f"{1000 * off:.2f}"] for number, off in enumerate(fit.residuals))])
+    _close(run, cell_file, fit.residual, position_sigma)
+    return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": pose,
+            "residual_m": fit.residual, "position_sigma_m": position_sigma,
+            "rotation_sigma_rad": rotation_sigma, "camera_pose": mounted["pose"],
+            "camera_mount": mounted["mount"]}
+
+
+def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
+                 largest_residual: float) -> dict[str, Any]:
+    from limber.core.errors import InputError
+    from limber.robot.cell.base_calibration import fit_base, require_frame
+
+    names, on_branch, touched = _points(points_file)
+    # Before anybody touches them.
+    require_frame(on_branch, names, "on the branch", largest_residual)
+    version = cell.robot.version
+    if touched is None:
+        if not sys.stdin.isatty():
+            raise InputError("Touching points needs a terminal, and standard input is "
+                             "none.", "", "Run it in a terminal, or give the robot's poses "
+                             "in the points file.")
+        touched, version = _touch(run, cell, names)
+    fit = fit_base(touched, on_branch, largest_residual=largest_residual, names=names)
+    cell = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": version})})
+    _write_base(cell_file, cell, branch.uuid, fit.pose, fit.position_sigma, fit.rotation_sigma,
+                fit.residual)
+    run.show("Touched points", [["point", "off [mm]"], *(
+        [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))])
+    _close(run, cell_file, fit.residual, fit.position_sigma)
+    return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": fit.pose,
+            "residual_m": fit.residual,
+            "points": [{"name": name, "residual_m": float(off)}
+                       for name, off in zip(names, fit.residuals, strict=True)],
+            "position_sigma_m": fit.position_sigma, "rotation_sigma_rad": fit.rotation_sigma}
+
+
+def _close(run: Run, cell_file: Path, residual: float, sigma: float) -> None:
+    run.close(f"The base's position is known to {1e3 * sigma:.2g} mm (standard deviation); RMS "
+              f"residual {1e3 * residual:.2g} mm.", where=cell_file,
+              then=f"limber robot check {shlex.quote(str(cell_file))}")
+
+
+def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
+                rotation_sigma: float, residual: float) -> None:
+    """Write a cell whose base is calibrated for a branch, by its identity."""
+    from limber.robot.cell.cell import BaseEntry, write_cell
+
+    base = BaseEntry(pose=tuple(map(float, pose)), position_sigma_m=max(position_sigma, 1e-4),
+                     rotation_sigma_rad=max(rotation_sigma, 1e-4), residual_m=residual)
+    write_cell(cell_file, cell.model_copy(update={
+        "base": base, "branch": branch,
+        "calibrated": datetime.now(UTC).isoformat(timespec="seconds")}))
+
+
+def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
+    from limber.core.errors import InputError
+
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+        if rows and not _is_number(rows[0][1]):
+            rows = rows[1:]
+        names = [row[0] for row in rows]
+        numbers = np.array([[float(part) for part in row[1:]] for row in rows])
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{path} cannot be read as points ({error}).",
+                         "A line has name,x_m,y_m,z_m.", "Correct the file.") from error
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path} contains a number that is not finite.",
+                         "A position has three finite numbers.", "Correct the file.")
+    if numbers.ndim != 2 or numbers.shape[1] not in (3, 9):
+        raise InputError(f"{path} has {numbers.shape[-1]} numbers a line.",
+                         "Three, or nine with the robot's pose, were expected.",
+                         "Correct the file.")
+    return names, numbers[:, :3], numbers[:, 3:6] if numbers.shape[1] == 9 else None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
+    """Read the tool's position at each point; the arm is guided by hand, nothing is sent to it."""
+    from limber.core.errors import WorkError
+    from limber.robot.cell.base_calibration import touched_place
+    from limber.robot.ur.samples import SampleStream
+
+    touched = []
+    stream = SampleStream(cell.robot.address)
+    try:
+        version = ".".join(map(str, stream.version[:3]))
+        for name in names:
+            input(f"Touch {name} with the middle of the gripper, then press Enter ")
+            stream.skip()
+            samples = stream.read(1.0)
+            if not samples:
+                raise WorkError("The robot sends no data.", "", "Restart its controller.")
+            touched.append(touched_place(cell, samples[-1]))
+    finally:
+        stream.close()
+    return np.array(touched), version

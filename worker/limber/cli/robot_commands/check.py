@@ -1,0 +1,67 @@
+"""Read a robot and compare it with its cell: `limber robot check`."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli.main import Run, stage_command
+
+_SECONDS = 1.0
+
+
+@stage_command("check")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+def check(run: Run, cell_file: Path) -> dict[str, Any]:
+    """Read model, version, settings, mode and force, and compare them with the cell.
+
+    Nothing moves, and nothing is written to the controller. Each difference is stated with both
+    values; `limber record` and `limber execute` set tool and payload by themselves, after they
+    have shown them, and put them back.
+    """
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.observed import observe
+
+    cell = read_cell(cell_file)
+    seen = observe(cell, _SECONDS)
+    version = seen.facts.get("version")
+    if cell.robot.version and version and cell.robot.version != version:
+        run.progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "
+                          f"the controller now has {version}.")
+    if seen.program_runs:
+        run.progress.warn("A program is running on the controller. It has to be stopped on the "
+                          "pendant before a motion.")
+    for each in seen.differences:
+        run.progress.warn(f"{each}.")
+    for told in seen.implausible(cell):
+        run.progress.warn(f"The force sensor: {told}.")
+    computer = _computer(run)
+    force = seen.readings[:, :3]
+    run.close(f"A {cell.arm.name} with controller version {version} answers at "
+              f"{cell.robot.address}; {len(seen.samples) / _SECONDS:.0f} samples a second. "
+              "Nothing was moved or written.")
+    return seen.facts | computer | {
+        "arm": cell.arm.name, "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,
+        "differences": [vars(each) for each in seen.differences],
+        "samples_per_second": len(seen.samples) / _SECONDS,
+        "force_without_tare_n": force.mean(axis=0), "force_sigma_n": force.std(axis=0),
+        "nominal_kinematics_off_m": seen.nominal_off(cell)}
+
+
+def _computer(run: Run) -> dict[str, bool]:
+    """What this computer grants the loop that moves a robot."""
+    from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
+
+    told = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
+            "kept_awake": keep_awake()}
+    if not told["real_time"]:
+        run.progress.warn("The loop has no real-time priority. Other programs can delay it, which "
+                          "stops the robot.")
+    if not told["kept_in_memory"]:
+        run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`). Memory that "
+                          "was swapped out can delay it, which stops the robot.")
+    if not told["kept_awake"]:
+        run.progress.warn("The computer's processors may sleep while idle (on Linux, write access "
+                          "to /dev/cpu_dma_latency prevents this). Those of a virtual machine "
+                          "wake late, which stops the robot.")
+    return told

@@ -1,0 +1,143 @@
+"""What a robot and its sensor show before anything moves: it is read, and nothing is written."""
+
+import select
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import SafetyStop
+from limber.core.numerics.rigid import matrices
+from limber.robot.cell.cell import Cell
+from limber.robot.cell.controller_settings import Difference, differences, plays
+from limber.robot.driver.controls import control_of
+from limber.robot.driver.force_sensors import ForceTorqueSensor, open_sensor
+from limber.robot.interface import ArmControl, Sample
+
+_FEWEST = 3
+_FIRST_READING_SECONDS = 0.2
+_BEFORE_MOTION_SECONDS = 0.1
+_NOISE = 10.0  # times what the cell states: more is touching, shaking, or another unit
+_STILL = 1e-6  # N: a living sensor's noise never repeats so
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A robot that stands.
+
+    Attributes:
+        facts: What the controller is, as :class:`.ArmControl` tells it.
+        samples: In order.
+        readings: Of the force sensor with each, flange axes, not tared [N, N m], shape [n, 6].
+        differences: In what the controller differs from the cell.
+    """
+
+    facts: dict[str, Any]
+    samples: list[Sample]
+    readings: np.ndarray
+    differences: list[Difference]
+
+    @property
+    def program_runs(self) -> bool:
+        """Whether a program runs on the controller."""
+        return plays(self.samples[-1])
+
+    def nominal_off(self, cell: Cell) -> float | None:
+        """Return by how much the controller's pose differs from the arm's nominal measures [m].
+
+        Most of it is the arm's own calibration, which the controller knows. None where the tool
+        that its pose is of is not known.
+        """
+        sample = self.samples[-1]
+        if sample.tool is None and any(each.what == "tool centre point"
+                                       for each in self.differences):
+            return None
+        tool = np.array(cell.tool.grasp_pose) if sample.tool is None else sample.tool
+        nominal = cell.arm.forward(sample.joints) @ matrices(tool)
+        return float(np.linalg.norm(nominal[:3, 3] - sample.pose[:3]))
+
+    def implausible(self, cell: Cell) -> list[str]:
+        """Return what is wrong with the sensor's readings while the arm stands, in words."""
+        if len(self.readings) < _FEWEST:
+            return []
+        if not np.isfinite(self.readings).all():
+            return ["the sensor sends readings that are no numbers"]
+        sensor, spread = cell.sensor, self.readings.std(axis=0)
+        told = []
+        if spread.max() < _STILL:
+            told.append("the sensor repeats one reading: it is frozen or not connected")
+        for name, part, stated, unit in (("force", slice(0, 3), sensor.force_sigma_n, "N"),
+                                         ("torque", slice(3, 6), sensor.torque_sigma_nm, "N m")):
+            if (worst := float(spread[part].max())) > _NOISE * stated:
+                told.append(f"the {name} varies by {worst:.2g} {unit} while the arm stands, the "
+                            f"cell file states {stated:.2g} {unit}: the gripper is touched, or "
+                            "the unit differs")
+        for name, part, most, unit in (
+                ("force", slice(0, 3), sensor.force_range_n, "N"),
+                ("torque", slice(3, 6), sensor.torque_range_nm, "N m")):
+            if (worst := float(np.abs(self.readings[:, part]).max())) >= 0.999 * most:
+                told.append(f"the {name} of {worst:.3g} {unit} is at the end of the sensor's range "
+                            f"({most:g} {unit})")
+        return told
+
+
+def observe(cell: Cell, seconds: float) -> Observed:
+    """Read a robot and its force sensor for ``seconds`` [s].
+
+    Raises:
+        LimberError: the robot or its sensor does not answer, or cannot be moved now.
+    """
+    control = control_of(cell)
+    try:
+        sensor = open_sensor(cell)
+        try:
+            control.skip()
+            # The first reading of a sensor with a connection of its own is on its way.
+            select.select(sensor.connections, [], [], _FIRST_READING_SECONDS)
+            samples, readings = _read(control, sensor, seconds)
+        finally:
+            sensor.close()
+    except ConnectionError as error:
+        raise SafetyStop(f"{error}.", "The robot was only read, and nothing moved.",
+                         "Check its cable and network.") from error
+    finally:
+        control.close()
+    return Observed(control.facts, samples, readings, differences(cell, samples[-1]))
+
+
+def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
+    """Show what differs from the cell before anything is written or moves.
+
+    Raises:
+        LimberError: as :func:`observe`. SafetyStop: a program runs, or the sensor is implausible.
+    """
+    seen = observe(cell, _BEFORE_MOTION_SECONDS)
+    if seen.program_runs:
+        raise SafetyStop("A program is running on the controller.",
+                         "Limber's own program would end it, wherever it is.",
+                         "Stop it on the pendant.")
+    if told := seen.implausible(cell):
+        raise SafetyStop(f"The force sensor cannot be right: {'; '.join(told)}.",
+                         "The guard would not feel the branch.",
+                         "Check the sensor and the cell's [sensor] entries with `limber robot "
+                         "check`.")
+    for each in seen.differences:
+        warn(f"{each}.")
+
+
+def _read(control: ArmControl, sensor: ForceTorqueSensor, seconds: float,
+          ) -> tuple[list[Sample], np.ndarray]:
+    """Return samples and readings [n, 6] of ``seconds`` [s], one at least."""
+    samples: list[Sample] = []
+    readings: list[np.ndarray] = []
+    end = time.monotonic() + seconds
+    while not samples or time.monotonic() < end:
+        got = control.read(1.0)
+        if not got:
+            raise ConnectionError("The robot has sent no data for 1 s")
+        for sample in got:
+            samples.append(sample)
+            readings.append(sensor.read(sample).wrench)
+    return samples, np.array(readings)
