@@ -151,6 +151,7 @@ class Sample:
             its version does not tell it.
         payload: Mass that is set there [kg], and ``payload_centre`` its centre in the flange's
             frame [m], shape [3]; None likewise.
+        outputs: Digital outputs, one a bit; None where it has none.
     """
 
     clock: float
@@ -167,6 +168,7 @@ class Sample:
     tool: np.ndarray | None = None
     payload: float | None = None
     payload_centre: np.ndarray | None = None
+    outputs: int | None = None
 
 
 class ArmControl(Protocol):
@@ -224,6 +226,10 @@ class ArmControl(Protocol):
 
     def servo(self, pose: np.ndarray) -> bool:
         """Send the next target of the tool's centre [m, rad], shape [6]; whether it was taken."""
+        ...
+
+    def servo_joints(self, joints: np.ndarray) -> bool:
+        """Send the next joint angles [rad], shape [n]; whether they were taken."""
         ...
 
     def end_motion(self) -> bool:

@@ -4,6 +4,7 @@ import click
 
 from limber.cli.robot_commands.calibrate import calibrate
 from limber.cli.robot_commands.check import check
+from limber.cli.robot_commands.moves import goto_start, home, open_gripper, release, retreat
 from limber.cli.robot_commands.scan import scan
 
 
@@ -12,5 +13,5 @@ def command() -> None:
     """Check a robot, calibrate where it stands, and move it by itself."""
 
 
-for each in (scan, check, calibrate):
+for each in (scan, check, calibrate, home, goto_start, retreat, release, open_gripper):
     command.add_command(each)

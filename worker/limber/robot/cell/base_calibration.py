@@ -95,7 +95,12 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
 
 
 def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
-    """Return where the middle of the gripper is by the controller's own pose, base frame [m, 3].
+    """Return where the middle of the gripper is by :func:`gripper_pose` [m], shape [3]."""
+    return gripper_pose(cell, sample)[:3]
+
+
+def gripper_pose(cell: Cell, sample: Sample) -> np.ndarray:
+    """Return the pose of the gripper's middle by the controller's own pose, base frame [m, rad, 6].
 
     The controller knows the arm's true measures. Its pose is that of the tool that is set there:
     newer controllers tell that tool. With others the nominal measures tell which it is, the
@@ -119,7 +124,7 @@ def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
 
 
 def _carried(pose: np.ndarray, tool: np.ndarray, grasp: np.ndarray) -> np.ndarray:
-    return (matrices(pose) @ inverted(matrices(tool)) @ matrices(grasp))[:3, 3]
+    return pose_vectors(matrices(pose) @ inverted(matrices(tool)) @ matrices(grasp))
 
 
 def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: float = 0.01,

@@ -180,10 +180,11 @@ class Driver:
 
     def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
         sample = self._require_sample()
-        require_start(sample.pose, sample.joints, trajectory.poses[0], start_joints,
-                      self.cell.arm.joint_names)
+        # Poses that come of joint angles have the nominal measures of the arm, not its own.
+        start = sample.pose if trajectory.by_joints else trajectory.poses[0]
+        require_start(sample.pose, sample.joints, start, start_joints, self.cell.arm.joint_names)
         self._require_program(sample)
-        self.guard.begin()
+        self.guard.begin(by_joints=trajectory.by_joints)
         self._senses.begin(sample, trajectory)
         self._set_off(trajectory)
 
@@ -238,9 +239,14 @@ class Driver:
                                  end + self._control.lookahead)
             target = following.trajectory.pose(following.time)
             self._command = self.guard.permit(self._command, target, 1.2 * step)
+            if following.trajectory.by_joints and self._command is not target:
+                # Joint angles cannot be slowed down as a pose can.
+                self._under_way.judge(self.guard.event(
+                    "the joints' motion is faster than the cell's limits"))
+                return
         else:
             following.rate = 0.0
-        if not self._control.servo(self._command):
+        if not self._sent(following):
             self._under_way.judge(self.guard.event(
                 "the control program accepted no target: it ends when it receives nothing for "
                 f"{self._control.silence:.2g} s, for example because this computer is too busy"))
@@ -249,6 +255,11 @@ class Driver:
         still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
         if over and still:
             self._finish(following)
+
+    def _sent(self, following: Following) -> bool:
+        if following.trajectory.by_joints:
+            return self._control.servo_joints(following.trajectory.angles(following.time))
+        return self._control.servo(self._command)
 
     def _finish(self, following: Following) -> None:
         self._under_way.finish()
@@ -276,11 +287,12 @@ class Driver:
 
 def _ordered(order: dict[str, Any]) -> Trajectory:
     """The trajectory of an order to follow one."""
-    expected = order.get("expected")
+    expected, joints = order.get("expected"), order.get("joints")
     return Trajectory(
         np.array(order["times"], float), np.array(order["poses"], float),
         None if expected is None else ExpectedWrench(**{
-            part: np.array(value, float) for part, value in expected.items()}))
+            part: np.array(value, float) for part, value in expected.items()}),
+        None if joints is None else np.array(joints, float), by_joints=joints is not None)
 
 
 def _guard_of(cell: Cell, control: ArmControl) -> Guard:

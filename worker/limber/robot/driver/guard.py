@@ -136,6 +136,7 @@ class _Memory:
     grasp: np.ndarray | None = None
     way: np.ndarray | None = None
     relief: _Relief | None = None
+    by_joints: bool = False
 
 
 class Guard:
@@ -164,8 +165,11 @@ class Guard:
         """The force sensor has been tared: from now on its limits hold."""
         self._is_tared = True
 
-    def begin(self) -> None:
+    def begin(self, *, by_joints: bool = False) -> None:
         """Allow a motion.
+
+        Args:
+            by_joints: It goes from joint angles to joint angles: singularities are no limit.
 
         Raises:
             SafetyStop: after a stop that was not acknowledged, while one is paused, or before the
@@ -179,7 +183,7 @@ class Guard:
             raise SafetyStop("The force sensor is not tared.", "Its bias would be taken for a "
                              "force on the branch.", "Tare it with the gripper hanging free.")
         self.state = State.MOVING
-        self._memory = _Memory()
+        self._memory = _Memory(by_joints=by_joints)
 
     def begin_retreat(self, wrench: np.ndarray) -> None:
         """Allow a motion back along the way that was followed: a person has chosen it.
@@ -413,7 +417,7 @@ class Guard:
                          _PLACE_SLACK):
             return self._stop(f"joint {joint + 1} at its limit")
         distance = float(self._arm.singularity_distance(sample.joints).min())
-        if self.state == State.MOVING and self._is_over(
+        if self.state == State.MOVING and not self._memory.by_joints and self._is_over(
                 "singularity", 0.5 * limits.singularity - distance, _PLACE_SLACK):
             return self._stop("singularity", distance, 0.5 * limits.singularity)
         box = settings.workspace

@@ -106,6 +106,8 @@ class RobotLink:
                     poses=trajectory.poses.tolist(),
                     start_joints=None if trajectory.joints is None
                     else trajectory.joints[0].tolist(),
+                    joints=trajectory.joints.tolist()
+                    if trajectory.by_joints and trajectory.joints is not None else None,
                     expected=None if expected is None else {
                         name: value.tolist() for name, value in vars(expected).items()})
         self.wait("started", seconds=5.0)

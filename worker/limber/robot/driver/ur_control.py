@@ -122,6 +122,10 @@ class UrControl(SampleStream):
         """Send the next target of the tool's centre [m, rad], shape [6]."""
         return self._control.servoL(list(pose), 0.1, 0.1, 1.0 / self.rate, self.lookahead, _GAIN)
 
+    def servo_joints(self, joints: np.ndarray) -> bool:
+        """Send the next joint angles [rad], shape [6]."""
+        return self._control.servoJ(list(joints), 0.1, 0.1, 1.0 / self.rate, self.lookahead, _GAIN)
+
     def end_motion(self) -> bool:
         """Brake the arm: the control program's own stop."""
         return bool(self._control.servoStop(_STOP_DECELERATION))

@@ -22,12 +22,15 @@ class Trajectory:
             predicted.
         joints: Joint angles for which reach, limits and obstacles were checked at each pose [rad],
             shape [n, joints]; None where nothing was checked.
+        by_joints: The joints go from angles to angles, and the poses are what comes of it: a way
+            of the arm alone, which may pass singularities.
     """
 
     times: np.ndarray
     poses: np.ndarray
     expected: ExpectedWrench | None = None
     joints: np.ndarray | None = None
+    by_joints: bool = False
 
     def __post_init__(self) -> None:
         shaped = (self.times.ndim == 1 and len(self.times) >= 2
@@ -43,6 +46,8 @@ class Trajectory:
                     self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
             raise InputError("The expected wrenches do not match the poses.",
                              "Each pose needs a wrench of six numbers.", "Check the plan.")
+        if self.by_joints and self.joints is None:
+            raise InputError("A motion by joint angles has none.", "", "Give the angles.")
         if self.joints is not None and (self.joints.shape[:-1] != self.times.shape
                                         or not np.isfinite(self.joints).all()):
             raise InputError(f"The joint angles have shape {self.joints.shape} for "
@@ -68,6 +73,12 @@ class Trajectory:
         k, part = self._place(time)
         return pose_between(self.poses[k], self.poses[k + 1], part)
 
+    def angles(self, time: float) -> np.ndarray:
+        """Return the joint angles at a time [s]; the last ones afterwards, shape [joints]."""
+        assert self.joints is not None
+        k, part = self._place(time)
+        return (1.0 - part) * self.joints[k] + part * self.joints[k + 1]
+
     def felt(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return expected wrench [6], its slopes [6, 6] and covariance [6, 6] at a time [s]."""
         return None if self.expected is None else self.expected.at(*self._place(time))
@@ -76,7 +87,7 @@ class Trajectory:
         """Return it from its end to its start, as fast, with what is expected on it."""
         return Trajectory(self.duration - self.times[::-1], self.poses[::-1],
                           None if self.expected is None else self.expected.reversed(),
-                          None if self.joints is None else self.joints[::-1])
+                          None if self.joints is None else self.joints[::-1], self.by_joints)
 
     def _place(self, time: float) -> tuple[int, float]:
         time = min(max(time, 0.0), self.duration)
@@ -102,6 +113,26 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
     bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(way, way[-1] - way)))
     durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
     return pause + np.r_[0.0, np.cumsum(durations)]
+
+
+def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) -> np.ndarray:
+    """Return times [s] at which the places of a way are passed, from rest to rest, shape [n].
+
+    Args:
+        steps: Lengths between the places [m], shape [n - 1].
+        speeds: Greatest ones at the places [m/s], shape [n].
+        acceleration: [m/s^2].
+    """
+    steps = np.maximum(steps, 1e-9)
+    bound = np.r_[0.0, speeds[1:-1], 0.0]
+    for k in range(len(steps)):
+        bound[k + 1] = min(bound[k + 1], np.sqrt(bound[k]**2 + 2 * acceleration * steps[k]))
+    for k in range(len(steps))[::-1]:
+        bound[k] = min(bound[k], np.sqrt(bound[k + 1]**2 + 2 * acceleration * steps[k]))
+    # A single step begins and ends at rest, and is not passed at no speed.
+    durations = np.where(bound[1:] + bound[:-1] > 0, 2 * steps / np.maximum(
+        bound[1:] + bound[:-1], 1e-9), 2 * np.sqrt(steps / acceleration))
+    return np.r_[0.0, np.cumsum(durations)]
 
 
 def densely(poses: np.ndarray, spacing: float = 0.002, angle: float = 0.02) -> np.ndarray:

@@ -50,8 +50,12 @@ class FollowedWay:
 def way_path(cell: Cell) -> Path:
     """Return where the way of a cell's robot is kept."""
     key = hashlib.sha256(cell.robot.address.encode()).hexdigest()[:16]
-    folder = os.environ.get("LIMBER_STATE") or platformdirs.user_state_path("limber")
-    return Path(folder) / "robot-ways" / f"{key}.jsonl"
+    return _state_folder() / "robot-ways" / f"{key}.jsonl"
+
+
+def log_path() -> Path:
+    """Return where motions by `limber robot` are logged, a JSON object a line."""
+    return _state_folder() / "robot-moves.jsonl"
 
 
 def read_way(cell: Cell) -> FollowedWay | None:
@@ -124,6 +128,10 @@ class WayFile:
                     stream.write(json.dumps(plain(line)) + "\n")
         except OSError:
             return
+
+
+def _state_folder() -> Path:
+    return Path(os.environ.get("LIMBER_STATE") or platformdirs.user_state_path("limber"))
 
 
 def _rows(values: list[Any], count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -21,7 +21,7 @@ RTDE_PORT, DASHBOARD_PORT = 30004, 29999
 _MOST_AT_ONCE = 8
 _NAMES = ("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_speed",
           "actual_TCP_force", "robot_mode", "safety_mode", "runtime_state",
-          "target_speed_fraction")
+          "target_speed_fraction", "actual_digital_output_bits")
 _NEWER = ("tcp_offset", "payload", "payload_cog")  # that not every version knows
 
 
@@ -35,6 +35,9 @@ class SampleStream:
     Raises:
         WorkError: nothing answers at the address, or it is not an RTDE server.
     """
+
+    inputs: tuple[str, ...] = ()
+    """Names of RTDE inputs that :meth:`write` sends; a plain stream only reads."""
 
     def __init__(self, address: str, timeout: float = 2.0):
         self.address = address
@@ -69,6 +72,12 @@ class SampleStream:
         if not reply or reply[0] == 0 or b"NOT_FOUND" in reply:
             raise ValueError(f"outputs refused: {reply[1:].decode('ascii', 'replace')}")
         self._recipe = rtde.Recipe.of(reply[0], names, rtde.OUTPUT_TYPES)
+        if self.inputs:
+            reply = self._ask(rtde.INPUT_SETUP, ",".join(self.inputs).encode(), timeout)
+            if not reply or reply[0] == 0 or b"IN_USE" in reply or b"NOT_FOUND" in reply:
+                raise ValueError(f"inputs refused: {reply[1:].decode('ascii', 'replace')}; another "
+                                 "program writes them")
+            self._input_recipe = rtde.Recipe.of(reply[0], self.inputs, rtde.INPUT_TYPES)
         if self._ask(rtde.START, b"", timeout) != b"\1":
             raise ValueError("the controller did not start the data stream")
         self._socket.setblocking(False)
@@ -115,6 +124,14 @@ class SampleStream:
         taken, self._queue = self._queue[:_MOST_AT_ONCE], self._queue[_MOST_AT_ONCE:]
         return [self._sample(body) for kind, body in taken if kind == rtde.DATA]
 
+    def write(self, values: Mapping[str, float]) -> None:
+        """Send a value for each of :attr:`inputs`.
+
+        Raises:
+            OSError: the connection is broken.
+        """
+        self._socket.sendall(self._input_recipe.packed(values))
+
     def skip(self) -> None:
         """Drop what has come so far."""
         while select.select([self._socket], [], [], 0)[0]:
@@ -131,7 +148,8 @@ class SampleStream:
             safety_mode=values["safety_mode"], runtime_state=values["runtime_state"],
             slider=values["target_speed_fraction"],
             tool=_array(values.get("tcp_offset")), payload=values.get("payload"),
-            payload_centre=_array(values.get("payload_cog")))
+            payload_centre=_array(values.get("payload_cog")),
+            outputs=values["actual_digital_output_bits"])
 
     def close(self) -> None:
         """Close the connection."""

@@ -399,9 +399,9 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
            options: ExecuteOptions, batches: list[np.ndarray], live: LiveForce,
            progress: Progress) -> tuple[dict[str, Any], tuple[int, int] | None]:
     """Go through approach, grasp, path, return and leaving; stops at the first that stops."""
+    _open_at_start(cell, link, motion)
     progress(0.5, "taring: keep the gripper free")
     live.at("taring")
-    link.wait_for_samples()
     link.tare(_TARE_SECONDS)
     on_path: tuple[int, int] | None = None
     legs: list[tuple[str, Trajectory]] = [
@@ -425,6 +425,21 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
         elif title == "return":
             grip(cell, link, close=False, progress=progress)
     return event, on_path
+
+
+def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:
+    """Open the gripper where Limber drives it: it closes on the branch later, and a tare needs it
+    empty. Only at the path's start, as elsewhere it may hold something."""
+    from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+    from limber.robot.motion.start_check import require_start
+
+    row = link.wait_for_samples()
+    pose = pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ matrices(row[1:7]))
+    require_start(pose, row[19:25], motion.approach.poses[0], motion.joints.joints[0],
+                  cell.arm.joint_names)
+    if cell.tool.gripper == "digital_output":
+        link.gripper(close=False)
+        time.sleep(cell.tool.grip_seconds)
 
 
 def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:

@@ -1,0 +1,145 @@
+"""Motions of the arm by itself: past what is in its way, slow near the branch, dry by default."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.robot_cells import cell_file
+from benchmarks.robot_faults import cell_for, set_off, straight
+from limber.cli.commands.robot import command
+from limber.core.errors import NoPathError
+from limber.core.numerics.rigid import matrices
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.planning.constraints.obstacles import Box
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.link import RobotLink
+from limber.robot.motion.joint_planner import joint_way
+from limber.robot.motion.trajectory import along_bounded
+from limber.stages.paths.arm_moves import to_joints
+from limber.stages.paths.arm_surroundings import ArmSurroundings
+
+CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
+            tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0),
+                  "parts": [{"start_m": (0, 0, 0), "end_m": (0, 0, 0.15), "radius_m": 0.04}]})
+HOME = np.array(CELL.arm.home)
+ASIDE = HOME + [1.6, 0, 0, 0, 0, 0]
+
+
+def tip(joints: np.ndarray) -> np.ndarray:
+    return (CELL.arm.forward(joints) @ matrices(np.array(CELL.tool.grasp_pose)))[..., :3, 3]
+
+
+def a_box(half: float) -> Box:
+    """In the middle of the straight way from home aside."""
+    return Box("pot", np.full(3, half), tip(HOME + [0.8, 0, 0, 0, 0, 0]), np.eye(3))
+
+
+def test_a_way_leads_past_a_box_and_keeps_every_speed():
+    free_of = ArmSurroundings(CELL, (a_box(0.08),), None)
+    direct = HOME + np.linspace(0, 1, 30)[:, None] * (ASIDE - HOME)
+    assert not free_of.free(direct).all()
+    motion = to_joints(CELL, HOME, ASIDE, free_of)
+    assert motion.joints[0] == pytest.approx(HOME) and motion.joints[-1] == pytest.approx(ASIDE)
+    between = np.array([motion.angles(t) for t in np.linspace(0, motion.duration, 400)])
+    assert free_of.clearance(between).min() > 0.015
+    speeds = np.abs(np.diff(between, axis=0)) / (motion.duration / 399)
+    assert speeds.max() < 0.45
+    assert motion.greatest_speeds[0] <= CELL.limits.speed_m_s * 1.001
+    assert motion.greatest_speeds[1] <= CELL.limits.turn_speed_rad_s
+
+
+def test_a_goal_inside_something_is_refused_and_so_is_a_wall_all_around():
+    with pytest.raises(NoPathError, match="goal is in collision"):
+        to_joints(CELL, HOME, HOME + [0.8, 0, 0, 0, 0, 0],
+                  ArmSurroundings(CELL, (a_box(0.08),), None))
+    with pytest.raises(NoPathError, match="beyond its limit"):
+        to_joints(CELL, HOME, HOME + [7.0, 0, 0, 0, 0, 0], ArmSurroundings(CELL, (), None))
+    with pytest.raises(NoPathError, match="No free way"):
+        joint_way(np.zeros(2), np.ones(2), np.array([[-1.0, 2.0]] * 2),
+                  lambda angles: np.abs(angles.sum(axis=1) - 1.0) > 0.1)
+
+
+def test_an_arm_does_not_go_through_itself_or_the_branch():
+    """A folded elbow puts the gripper into the upper arm; a branch at the tip is met."""
+    around = ArmSurroundings(CELL, (), None)
+    assert around.free(HOME[None])[0]
+    folded = HOME.copy()
+    folded[2] = 2.75
+    assert not around.free(folded[None])[0]
+    place = tip(ASIDE)
+    branch = Skeleton(np.array([place - [0, 0, 0.2], place + [0, 0, 0.2]]), np.array([-1, 0]),
+                      np.array([0.01, 0.01]))
+    assert not ArmSurroundings(CELL, (), branch).free(ASIDE[None])[0]
+
+
+def test_it_is_slow_near_the_branch():
+    place = tip(ASIDE) + [0, 0, -0.12]
+    branch = Skeleton(np.array([place - [0, 0, 0.3], place]), np.array([-1, 0]),
+                      np.array([0.01, 0.01]))
+    open_air = to_joints(CELL, HOME, ASIDE, ArmSurroundings(CELL, (), None))
+    beside = to_joints(CELL, HOME, ASIDE, ArmSurroundings(CELL, (), branch))
+    assert beside.duration > 1.2 * open_air.duration
+    assert beside.joints == pytest.approx(open_air.joints)
+
+
+def test_times_on_a_bounded_way_keep_speeds_and_acceleration():
+    steps, bounds = np.full(100, 0.005), np.r_[np.full(50, 0.05), np.full(51, 0.01)]
+    times = along_bounded(steps, bounds, 0.1)
+    speeds = steps / np.diff(times)
+    assert speeds.max() <= 0.05 * (1 + 1e-9) and speeds[51:].max() <= 0.01 * (1 + 1e-9)
+    assert speeds.max() > 0.049
+    middles = 0.5 * (times[1:] + times[:-1])
+    assert np.abs(np.diff(speeds) / np.diff(middles)).max() <= 0.1 * 1.01
+    assert along_bounded(np.array([0.01]), np.full(2, 0.05), 0.1)[1] > 0
+
+
+def run(arguments: list[str], capfd) -> tuple[int, dict]:
+    with pytest.raises(SystemExit) as stop:
+        command.main([*arguments, "--json"], standalone_mode=False)
+    return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+
+
+def test_home_and_retreat_move_only_when_armed(e_series, tmp_path, capfd):
+    """Back along the way of a killed program; then home from there, joints exact."""
+    cell = cell_for(e_series.address)
+    cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
+        "mass_kg": 0.0, "gripper": "digital_output", "grip_seconds": 0.1})})
+    path = str(cell_file(cell, tmp_path))
+    with RobotLink(cell) as link:
+        begin = np.array(e_series.state["pose"])
+        set_off(e_series, link, straight(e_series, (0.0, 0.1, 0.0), expected=False))
+        link.process.kill()
+    before = e_series.state["joints"]
+    code, told = run(["retreat", path], capfd)
+    assert code == 0 and not told["armed"] and told["way_m"] > 0.002 and told["tare_known"]
+    code, told = run(["retreat", path, "--arm", "--confirm", "nothing"], capfd)
+    assert code == 2 and e_series.state["joints"] == before
+    code, told = run(["retreat", path, "--arm", "--confirm", "retreat"], capfd)
+    assert code == 0 and told["retreated"] and not told["gripper_opened"]
+    assert np.allclose(e_series.state["pose"][:3], begin[:3], atol=2e-3)
+    e_series.ask("stand", joints=list(np.array(cell.arm.home) + [0.1, 0, 0, 0.1, 0, 0]))
+    code, told = run(["home", path, "--arm", "--confirm", "home"], capfd)
+    assert code == 0 and told["reached"]
+    assert e_series.state["joints"] == pytest.approx(cell.arm.home, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_the_gripper_opens_while_the_robot_is_stopped(own_address, tmp_path, capfd):
+    """Slow: a robot in a process. After an emergency stop no program runs, and none is needed."""
+    from benchmarks.robot_faults import new_robot
+
+    cell = cell_for(own_address)
+    cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
+        "gripper": "digital_output", "grip_seconds": 0.1, "close_output": 3})})
+    path = str(cell_file(cell, tmp_path))
+    with new_robot(own_address, "ur5e", 1) as robot:
+        robot.ask("outputs", value=0b1001)
+        robot.ask("emergency_stop")
+        code, told = run(["open", path], capfd)
+        assert code == 0 and robot.state["outputs"] == 0b1001
+        began = time.monotonic()
+        code, told = run(["open", path, "--arm", "--confirm", "open"], capfd)
+        assert code == 0 and told["armed"] and robot.state["outputs"] == 0b0001
+        assert time.monotonic() - began < 2.0

@@ -1,0 +1,268 @@
+"""Motions of the arm by itself: `limber robot home`, `goto-start`, `retreat`, `release`, `open`.
+
+Each is planned from where the arm stands, and moves nothing without --arm.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from limber.cli.main import Run, stage_command
+
+if TYPE_CHECKING:
+    from limber.robot.cell.cell import Cell
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.interface import Sample
+    from limber.robot.motion.trajectory import Trajectory
+
+_OBSERVED_SECONDS = 0.1
+_TARE_SECONDS = 0.5
+
+
+def _move_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
+    """Make a command ``function(run, cell_file, armed, **options)`` of an arm's own motion."""
+    def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
+        function = click.option(
+            "--arm", "armed", is_flag=True, help="Move the robot. Default: a dry run.")(function)
+        function = click.option(
+            "--confirm", help=f"The word {name}, to confirm that the robot may move. Default: ask "
+            "at the terminal.")(function)
+        function = click.argument("cell_file", type=click.Path(path_type=Path))(function)
+        return stage_command(name)(function)
+    return wrap
+
+
+@_move_command("home")
+@click.option("--branch", "folder", type=click.Path(path_type=Path),
+              help="Branch folder, to keep away from the branch as well.")
+def home(run: Run, cell_file: Path, confirm: str | None, armed: bool, folder: Path | None,
+         ) -> dict[str, Any]:
+    """Move the empty arm to its home pose, past the cell's obstacles and the branch."""
+    from limber.robot.cell.cell import read_cell
+
+    cell = read_cell(cell_file)
+    return _to(run, cell_file, cell, folder, np.array(cell.arm.home), "home", armed, confirm)
+
+
+@_move_command("goto-start")
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+@click.option("--name", default="path", show_default=True, help="Name of the plan.")
+@click.option("--speed", default=0.03, show_default=True,
+              help="Speed that `limber execute` will be given [m/s].")
+def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, branch_folder: Path,
+               name: str, speed: float) -> dict[str, Any]:
+    """Move the empty arm to where `limber execute` begins, in the same configuration.
+
+    The plan is checked by a dry run of `limber execute` first, which states that start.
+    """
+    from limber.robot.cell.cell import read_cell
+    from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
+
+    cell = read_cell(cell_file)
+    told = execute(branch_folder, name, cell_file, ExecuteSettings(speed=speed), ExecuteOptions(),
+                   progress=run.progress)
+    goal = np.array(told["start_joints_rad"], float)
+    return _to(run, cell_file, cell, branch_folder, goal, "goto-start", armed, confirm)
+
+
+@_move_command("retreat")
+def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
+    """Go back along the way that was followed last, while the force falls; else open the gripper.
+
+    The way is on disk, so this works after a crash of the program that went it. Exit code 4 where
+    a force over the soft limit is left.
+    """
+    from limber.core.errors import InputError, SafetyStop
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.motion.retreat import WayBack
+    from limber.robot.motion.way_file import read_way
+    from limber.robot.operator_decisions import require_confirmation, retreat_if_chosen
+
+    cell = read_cell(cell_file)
+    way = read_way(cell)
+    if way is None:
+        raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
+                         "known.", "It has followed none from this account, or the cell has "
+                         "changed since.", "Free the branch: limber robot release.")
+    sample, pose = _stands(cell)
+    back = WayBack(cell.arm.joint_names, way).from_here(
+        _with_pose(sample, pose), cell.limits.acceleration_m_s2)
+    result = {"way_began": datetime.fromtimestamp(way.at, UTC).isoformat(timespec="seconds"),
+              "way_m": float(np.linalg.norm(np.diff(back.poses[:, :3], axis=0), axis=1).sum()),
+              "duration_s": back.duration, "tare_known": way.bias is not None,
+              "gripper_closed": way.gripper_closed, "armed": armed}
+    if not armed:
+        return result
+    require_confirmation("retreat", confirm, cell, run.progress)
+    with RobotLink(cell) as link:
+        link.wait_for_samples()
+        told = retreat_if_chosen(cell, link, "retreat", run.progress)
+    result |= told
+    _log(cell_file, "retreat", result)
+    force = told["force_n"]
+    if not (told["retreated"] or told["gripper_opened"]) or (
+            force is not None and force > cell.limits.soft_force_n):
+        raise SafetyStop(told["outcome"], "", "Free the branch by hand, or `limber robot "
+                         "release`.", result=result)
+    return result
+
+
+@_move_command("release")
+def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
+    """Open the gripper, and back away from the branch the way the gripper came to it."""
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.operator_decisions import grip, require_confirmation
+    from limber.stages.paths.arm_moves import away_from_branch
+
+    cell = read_cell(cell_file)
+    sample, pose = _stands(cell)
+    motion = away_from_branch(cell, sample.joints, pose)
+    result = _told(motion) | {"armed": armed}
+    if not armed:
+        return result
+    require_confirmation("release", confirm, cell, run.progress)
+    with RobotLink(cell) as link:
+        link.wait_for_samples()
+        grip(cell, link, close=False, progress=run.progress)
+        return _followed(run, cell_file, "release", link, motion, result)
+
+
+@_move_command("open")
+def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
+    """Open the gripper where the arm stands; the arm does not move.
+
+    It works while the robot is stopped: no program is needed on the controller.
+    """
+    from limber.core.errors import InputError
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.motion.way_file import WayFile
+    from limber.robot.ur.digital_output import switch_output
+
+    cell = read_cell(cell_file)
+    if cell.tool.gripper != "digital_output":
+        raise InputError("Limber does not drive the cell's gripper.",
+                         f"tool.gripper is {cell.tool.gripper}.", "Open it by hand.")
+    result = {"armed": armed, "output": cell.tool.close_output}
+    if not armed:
+        return result
+    if confirm != "open":
+        raise InputError("Nobody confirmed that the gripper may open.",
+                         "A bent branch springs back.", "Give --confirm open.")
+    switch_output(cell.robot.address, cell.tool.close_output, False)
+    time.sleep(cell.tool.grip_seconds)
+    kept = WayFile(cell)
+    kept.gripped(False)
+    kept.close()
+    _log(cell_file, "open", result)
+    return result
+
+
+def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.ndarray, word: str,
+        armed: bool, confirm: str | None) -> dict[str, Any]:
+    """Plan the way of the empty arm to joint angles ``goal`` [n], and go it with ``armed``."""
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.operator_decisions import require_confirmation
+    from limber.stages.paths.arm_moves import to_joints
+    from limber.stages.paths.arm_surroundings import ArmSurroundings
+    from limber.stages.paths.plan_cell import cell_obstacles
+    from limber.store import Branch
+    from limber.store.loading import load_skeleton
+
+    _require_empty(cell, run)
+    skeleton = None if folder is None else load_skeleton(Branch.read(folder))
+    if skeleton is None:
+        run.progress.warn("No branch was given, so the arm keeps away from the cell's obstacles "
+                          "alone (--branch).")
+    around = ArmSurroundings(cell, cell_obstacles(cell, cell_file.parent), skeleton)
+    sample, _ = _stands(cell)
+    motion = to_joints(cell, sample.joints, goal, around)
+    assert motion.joints is not None
+    result = _told(motion) | {"armed": armed, "clearance_m": float(
+        around.clearance(motion.joints).min())}
+    if not armed:
+        return result
+    require_confirmation(word, confirm, cell, run.progress)
+    with RobotLink(cell) as link:
+        link.wait_for_samples()
+        return _followed(run, cell_file, word, link, motion, result)
+
+
+def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Trajectory,
+              result: dict[str, Any]) -> dict[str, Any]:
+    """Tare, follow a motion of the empty gripper, and log it."""
+    from limber.core.errors import SafetyStop
+
+    link.tare(_TARE_SECONDS)
+    try:
+        event = link.follow(motion)
+    except KeyboardInterrupt:
+        # Ctrl-C stops the arm before anything else.
+        link.stop()
+        raise
+    result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason")}
+    _log(cell_file, word, result)
+    if not result["reached"]:
+        raise SafetyStop(f"The robot was stopped: {event['reason']}.", "The arm holds where it "
+                         "stopped.", "Check what it met, then `limber robot retreat`.",
+                         result=result)
+    return result
+
+
+def _stands(cell: Cell) -> tuple[Sample, np.ndarray]:
+    """Where the arm stands: a sample, and the pose of the gripper's middle [6]."""
+    from limber.robot.cell.base_calibration import gripper_pose
+    from limber.robot.observed import observe
+
+    sample = observe(cell, _OBSERVED_SECONDS).samples[-1]
+    return sample, gripper_pose(cell, sample)
+
+
+def _with_pose(sample: Sample, pose: np.ndarray) -> Sample:
+    from dataclasses import replace
+
+    return replace(sample, pose=pose)
+
+
+def _require_empty(cell: Cell, run: Run) -> None:
+    """Refuse a way of the arm alone while the gripper holds the branch, as far as that is known."""
+    from limber.core.errors import SafetyStop
+    from limber.robot.motion.way_file import read_way
+
+    way = read_way(cell)
+    if way is not None and way.gripper_closed:
+        raise SafetyStop("The gripper was closed last, and may hold the branch.",
+                         "The arm would pull at it.",
+                         "Use `limber robot retreat` or `limber robot release` first.")
+    if cell.tool.gripper == "by_hand":
+        run.progress.warn("The gripper is opened by hand: check that it is open.")
+
+
+def _told(motion: Trajectory) -> dict[str, Any]:
+    assert motion.joints is not None
+    return {"duration_s": motion.duration, "start_joints_rad": motion.joints[0],
+            "end_joints_rad": motion.joints[-1], "pose_count": len(motion.times),
+            "greatest_speed_m_s": float(motion.greatest_speeds[0])}
+
+
+def _log(cell_file: Path, word: str, result: dict[str, Any]) -> None:
+    """Add a line to the log of this user's robots."""
+    import json
+
+    from limber.core.json_values import plain
+    from limber.robot.motion.way_file import log_path
+
+    path = log_path()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = {"at": datetime.now(UTC).isoformat(timespec="seconds"), "command": word,
+            "cell": str(cell_file.absolute())} | result
+    with open(path, "a", encoding="utf-8") as stream:
+        stream.write(json.dumps(plain(line)) + "\n")

@@ -1,0 +1,76 @@
+"""Motions of an arm by itself: to joint angles past cell and branch, and back from the branch."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from limber.core.errors import NoPathError
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.joint_path import joint_path
+from limber.robot.motion.joint_planner import joint_way
+from limber.robot.motion.trajectory import Trajectory, along, along_bounded, densely
+from limber.stages.paths.arm_surroundings import ArmSurroundings
+
+_NEAR_M = 0.15  # from the branch: from there on the arm is slower
+_SLOWEST = 0.25
+_JOINT_SPEED = 0.4  # rad/s: an elbow is as fast as a gripper, and nobody looks at it
+
+
+def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurroundings,
+              ) -> Trajectory:
+    """Return the motion from joint angles ``start`` [n] to ``goal`` [n], the gripper empty.
+
+    It keeps away from cell, branch and the arm itself, and is slow near the branch.
+
+    Raises:
+        NoPathError: there is no such way, or start or goal touch something.
+    """
+    _require_limits(cell, goal)
+    if np.abs(goal - start).max() < 1e-3:
+        raise NoPathError("The arm is there already.", "", "")
+    joints = joint_way(start, goal, cell.joint_limits, around.free)
+    poses = pose_vectors(cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose)))
+    limits = cell.limits
+    ways = np.array([max(length(second[:3] - first[:3]), limits.speed_m_s * max(
+        length(turn_between(first, second)) / (0.8 * limits.turn_speed_rad_s),
+        float(np.abs(turned).max()) / _JOINT_SPEED))
+        for (first, second), turned in zip(pairwise(poses), np.diff(joints, axis=0), strict=True)])
+    share = np.clip(around.from_branch(joints) / _NEAR_M, _SLOWEST, 1.0)
+    times = along_bounded(ways, share * limits.speed_m_s, limits.acceleration_m_s2)
+    return Trajectory(times, poses, ExpectedWrench.nothing(poses), joints, by_joints=True)
+
+
+def away_from_branch(cell: Cell, joints: np.ndarray, pose: np.ndarray) -> Trajectory:
+    """Return the straight motion of an open gripper back from the branch, as it came there.
+
+    Args:
+        joints: Where the arm is [rad], shape [n].
+        pose: Of the gripper's middle by the controller, base frame [m, rad], shape [6].
+
+    Raises:
+        NoPathError: the arm cannot go so far.
+    """
+    here = matrices(pose)
+    back = here.copy()
+    back[:3, 3] -= cell.approach.distance_m * here[:3, :3] @ np.array(cell.approach.direction)
+    poses = densely(pose_vectors(np.array([here, back])))
+    flange = matrices(poses) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
+    taken = joint_path(cell.arm, flange, start=joints, joint_limits=cell.joint_limits,
+                       singularity_margin=cell.limits.singularity,
+                       joint_margin=cell.limits.joint_margin_rad)
+    times = along(poses, _SLOWEST * cell.limits.speed_m_s, cell.limits.acceleration_m_s2)
+    return Trajectory(times, poses, ExpectedWrench.nothing(poses), taken.joints)
+
+
+def _require_limits(cell: Cell, goal: np.ndarray) -> None:
+    """Refuse joint angles [n] beyond the limits."""
+    limits = cell.joint_limits
+    outside = (goal < limits[:, 0]) | (goal > limits[:, 1])
+    if outside.any():
+        joint = int(outside.argmax())
+        raise NoPathError(f"Joint {joint + 1} ({cell.arm.joint_names[joint]}) would be at "
+                          f"{np.degrees(goal[joint]):.0f} degrees, beyond its limit.", "",
+                          "Widen robot.joint_limits_rad in the cell file, or choose another goal.")

@@ -1,0 +1,121 @@
+"""What an arm must not meet on a way of its own: cell, branch and its own links."""
+
+from itertools import combinations
+
+import numpy as np
+
+from limber.core.numerics.rigid import matrices
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.planning.constraints.obstacles import Obstacle
+from limber.robot.cell.cell import Cell
+
+_CLEAR_M = 0.02  # kept between the arm and everything
+_SPACING_M = 0.03  # of points along a rod
+
+
+class ArmSurroundings:
+    """Tells how far an arm with its gripper is from all that it could meet.
+
+    Args:
+        cell: Arm, gripper and base.
+        obstacles: Of the cell, branch frame.
+        branch: The branch, which is met as well; None: there is none.
+    """
+
+    def __init__(self, cell: Cell, obstacles: tuple[Obstacle, ...], branch: Skeleton | None):
+        self._cell, self._obstacles = cell, obstacles
+        self._base = matrices(np.array(cell.base.pose))
+        self._branch = None if branch is None else Limbs.of(branch)
+        rods = self._rods(np.array(cell.arm.home)[None])
+        # Neighbours overlap by their shape; so do links that touch when the arm stands at home.
+        self._pairs = [pair for pair in combinations(range(rods[0].shape[1]), 2)
+                       if pair[1] - pair[0] > 1 and _apart(rods, *pair)[0] > 0.0]
+
+    def free(self, joints: np.ndarray) -> np.ndarray:
+        """Return whether joint angles [n, joints] leave :data:`_CLEAR_M`, shape [n]."""
+        return self.clearance(joints) > _CLEAR_M
+
+    def clearance(self, joints: np.ndarray) -> np.ndarray:
+        """Return the least distance from anything at joint angles [n, joints] [m], shape [n]."""
+        rods = self._rods(joints)
+        found = np.full(len(joints), np.inf)
+        for pair in self._pairs:
+            # Links of one arm may come closer to each other than to what is not known exactly.
+            found = np.minimum(found, _apart(rods, *pair) + _CLEAR_M)
+        places, radii = self._places(rods)
+        for obstacle in self._obstacles:
+            far = obstacle.clearance(places.reshape(-1, 3)).reshape(len(joints), -1) - radii
+            found = np.minimum(found, far.min(axis=1))
+        return np.minimum(found, self.from_branch(joints))
+
+    def from_branch(self, joints: np.ndarray) -> np.ndarray:
+        """Return the least distance from the branch at joint angles [n, joints] [m], shape [n]."""
+        if self._branch is None:
+            return np.full(len(joints), np.inf)
+        places, radii = self._places(self._rods(joints))
+        far = self._branch.clearance(places.reshape(-1, 3)).reshape(len(joints), -1) - radii
+        return far.min(axis=1)
+
+    def _rods(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Starts and ends [n, rods, 3] of links and gripper in the base frame, and radii."""
+        arm, flange = self._cell.arm.rods(joints), self._cell.arm.forward(joints)
+        starts, ends, radii = [arm.starts], [arm.ends], [np.asarray(arm.radii, float)]
+        for part in self._cell.tool.parts:
+            for found, place in ((starts, part.start_m), (ends, part.end_m)):
+                found.append((flange[:, :3, :3] @ np.array(place) + flange[:, :3, 3])[:, None])
+            radii.append(np.array([part.radius_m]))
+        return np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), np.concatenate(radii)
+
+    def _places(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray],
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Points along the rods, branch frame, shape [n, k, 3], and the radius at each, [k]."""
+        starts, ends, radii = rods
+        places, thick = [], []
+        for k, radius in enumerate(radii):
+            length = float(np.linalg.norm(ends[0, k] - starts[0, k]))
+            share = np.linspace(0.0, 1.0, int(np.ceil(length / _SPACING_M)) + 1)[:, None]
+            places.append(starts[:, None, k] + share * (ends[:, None, k] - starts[:, None, k]))
+            thick.append(np.full(len(share), radius + 0.5 * _SPACING_M))
+        found = np.concatenate(places, axis=1) @ self._base[:3, :3].T + self._base[:3, 3]
+        return found, np.concatenate(thick)
+
+
+class Limbs:
+    """The axes of a branch as rods, an :class:`.Obstacle`."""
+
+    name = "the branch"
+
+    def __init__(self, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray):
+        self._starts, self._ways, self._radii = starts, ends - starts, radii
+        self._squares = np.maximum((self._ways**2).sum(axis=1), 1e-18)
+
+    @classmethod
+    def of(cls, skeleton: Skeleton) -> "Limbs":
+        """Return those of a skeleton."""
+        child = np.flatnonzero(np.asarray(skeleton.parent) >= 0)
+        parent = np.asarray(skeleton.parent)[child]
+        return cls(skeleton.nodes[parent], skeleton.nodes[child],
+                   np.maximum(skeleton.radius[child], skeleton.radius[parent]))
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """Return how far ``points`` [n, 3] are outside [m], shape [n]."""
+        found = np.full(len(points), np.inf)
+        for start, way, square, radius in zip(self._starts, self._ways, self._squares,
+                                              self._radii, strict=True):
+            off = points - start
+            part = np.clip(off @ way / square, 0.0, 1.0)
+            found = np.minimum(found, np.linalg.norm(off - part[:, None] * way, axis=1) - radius)
+        return found
+
+
+def _apart(rods: tuple[np.ndarray, np.ndarray, np.ndarray], first: int, second: int) -> np.ndarray:
+    """Distance of two rods [m], shape [n], from points along the one to the other."""
+    starts, ends, radii = rods
+    way = ends[:, second] - starts[:, second]
+    square = np.maximum((way**2).sum(axis=1), 1e-18)
+    found = np.full(len(way), np.inf)
+    for share in np.linspace(0.0, 1.0, 9):
+        off = (starts[:, first] + share * (ends[:, first] - starts[:, first])) - starts[:, second]
+        part = np.clip((off * way).sum(axis=1) / square, 0.0, 1.0)
+        found = np.minimum(found, np.linalg.norm(off - part[:, None] * way, axis=1))
+    return found - radii[first] - radii[second]
