@@ -13,7 +13,7 @@ from .bridge import animation, materials, meshes
 from .scene_data import SceneData
 
 _HALF_BALL = (0.35, 0.45, 0.55)
-MEASURED = (0.0, 0.55, 0.75)
+MEASURED = (0.0, 0.376, 0.509)
 """Linear colour of what was measured."""
 _SHARE = 0.011
 """Radius of a measured point in sizes of the branch."""

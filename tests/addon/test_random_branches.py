@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from limber.store import Branch
-
 COUNT = int(os.environ.get("LIMBER_RANDOM_OPERATORS", "40"))
 WRITTEN = "written-by-the-test.json"
 

@@ -16,3 +16,8 @@ FOUND_SKELETON = "scan_skeleton"
 PATH_COLOURS = {"plan": "#e52145", "baseline": "#1965ce"}
 """Of the planned path and of the one that it is compared with, in report and scene; the add-on's
 ``COLORS`` are the same, linear."""
+DATA_COLOURS = {"measured": "#00a5bd", "simulated": "#222222", "true": "#c0602a"}
+"""Of what was measured, what the model says, and what is known or assumed to be so."""
+MARK_COLOURS = {"grasp": "#f98900", "control_points": "#ce27c4", "targets": "#e1b300",
+                "base": "#594e45"}
+"""Of marks on the branch, in report and scene alike."""

@@ -5,11 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from limber.core.constants import DATA_COLOURS
 from limber.estimation.uncertainty.covariance import OUTLIER
 from limber.estimation.uncertainty.identifiability import UNRESOLVED_DEVIATION
 from limber.results.report.charts import chart
 
-OBSERVED, SIMULATED, TRUE = "#222222", "#2a6fb0", "#c0602a"
+OBSERVED, SIMULATED, TRUE = (DATA_COLOURS[key] for key in ("measured", "simulated", "true"))
+FORCE = "#2e8b57"
+_BEFORE = "#bbbbbb"
+AXIS_LINES = {"x": "-", "y": "--", "z": ":"}
+"""A direction is a kind of line, so that colours are left for what was measured and simulated."""
+AXIS_DOTS = {"x": "o", "y": "s", "z": "^"}
 
 
 def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
@@ -20,16 +26,16 @@ def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
     """
     yield (young_along_branch(estimate), _interval_caption(estimate))
     yield (what_the_pulls_tell(estimate),
-           "How well the pulls determine each parameter: standard deviation before the fit (at "
-           f"its start) and after it. Above {UNRESOLVED_DEVIATION:g} (line) a modulus is linked "
-           "to its neighbour.")
+           "How well the pulls determine each parameter: standard deviation (of a modulus E: of "
+           "its logarithm) before the fit, at its start, and after it. Above "
+           f"{UNRESOLVED_DEVIATION:g} (line) a modulus is linked to its neighbour.")
     yield (loss_over_evaluations(estimate),
            "Loss against forward simulations; the line is the lowest so far.")
     for pull in estimate["pulls"]:
         if np.size(pull["observed_m"]):
             yield (simulated_over_observed(pull, estimate),
-                   f"Pull {pull['name']}: simulated (blue) over observed (black) at several "
-                   "frames; bars are residuals, ten times enlarged.")
+                   f"Pull {pull['name']}: the model (black) over the observed points "
+                   "(turquoise) at several frames; orange bars are residuals, ten times enlarged.")
         if np.size(pull.get("point_residual", ())):
             yield (residuals_over_time(pull),
                    f"Pull {pull['name']}: residuals of each point and of the force, divided by "
@@ -69,28 +75,31 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
     else:
         axes.set_ylim(bottom=0)
     axes.set_xlim(0, 1)
-    axes.legend(frameon=False)
+    figure.legend(frameon=False, ncols=2, fontsize=8, loc="outside upper left")
     return figure
 
 
 def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
-    """Standard deviations of the parameters before and after the fit."""
-    figure, axes = chart(5.2, 3.0, "", "standard deviation of log E")
+    """Standard deviations of the parameters before and after the fit, one a row."""
     before = np.array(estimate["deviations_before_fit"], float)
     after = np.sqrt(np.abs(np.diag(np.array(estimate["covariance"], float))))
     groups = [*estimate["groups"]]
     extra = estimate["parameters"][len(set(groups)):]
     names = [f"E{k + 1}" for k in range(len(groups))] + list(extra)
     after = np.concatenate([after[groups], after[len(set(groups)):]])
+    # Names of parameters are words: below each other they never overlap.
+    figure, axes = chart(6.0, 1.2 + 0.3 * len(names), "standard deviation", "")
     place = np.arange(len(names))
     least = 1e-4
-    axes.bar(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color="#bbbbbb",
-             label="before the fit")
-    axes.bar(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after the fit")
-    axes.axhline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
-    axes.set_yscale("log")
-    axes.set_xticks(place, names)
-    axes.legend(frameon=False)
+    axes.barh(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color=_BEFORE,
+              label="before the fit")
+    axes.barh(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED,
+              label="after the fit")
+    axes.axvline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
+    axes.set_xscale("log")
+    axes.set_yticks(place, names)
+    axes.invert_yaxis()
+    figure.legend(frameon=False, ncols=2, loc="outside upper right")
     return figure
 
 
@@ -100,10 +109,10 @@ def residuals_over_time(pull: dict[str, Any]) -> Any:
     points = _numbers(pull["point_residual"])
     time = np.array(pull["all_times_s"])
     force = _numbers(pull["force_residual"])
-    shades = ["#16324f", "#2a6fb0", "#6aa5d8", "#a9cdea"]
+    shades = ["#222222", "#666666", "#999999", "#c4c4c4"]
     columns = [(f"point {k + 1}", points[:, k], shades[k % 4]) for k in range(points.shape[1])]
     if np.isfinite(force).any():
-        columns.append(("force", force, "#2e8b57"))
+        columns.append(("force", force, FORCE))
     for label, values, colour in columns[:9]:
         axes.plot(time, values, ".-", ms=3, lw=0.7, color=colour, label=label)
         far = np.where(np.isfinite(values), values, 0.0) > OUTLIER
@@ -121,7 +130,7 @@ def held_out_scores(estimate: dict[str, Any]) -> Any:
     place = np.arange(len(scores))
     for shift, key, colour, label in (
             (0.2, "relative_distance", SIMULATED, "points, relative to travel"),
-            (-0.2, "relative_force", "#2e8b57", "force, relative to its peak")):
+            (-0.2, "relative_force", FORCE, "force, relative to its peak")):
         values = 100 * np.array([_number(score.get(key)) for score in scores.values()])
         axes.barh(place + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
     axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
@@ -172,13 +181,15 @@ def simulated_over_observed(pull: dict[str, Any], estimate: dict[str, Any]) -> A
 
 def force_over_time(pull: dict[str, Any]) -> Any:
     """Measured and simulated force of the gripper on the branch."""
-    figure, axes = chart(5.2, 3.0, "time [s]", "force [N], dots measured")
+    figure, axes = chart(5.2, 3.0, "time [s]", "force [N]")
     measured, simulated = _numbers(pull["measured_force_n"]), _numbers(pull["simulated_force_n"])
     time = np.array(pull["all_times_s"])
-    for axis, colour in zip(range(3), ("#b03a2e", "#2e8b57", "#2a6fb0"), strict=True):
-        axes.plot(time, measured[:, axis], ".", ms=4, color=colour, alpha=0.6)
-        axes.plot(time, simulated[:, axis], color=colour, label="xyz"[axis])
-    axes.legend(frameon=False, ncol=3)
+    for column, name in enumerate("xyz"):
+        axes.plot(time, measured[:, column], AXIS_DOTS[name], ms=3, color=OBSERVED,
+                  label=f"{name} measured")
+        axes.plot(time, simulated[:, column], AXIS_LINES[name], color=SIMULATED,
+                  label=f"{name} simulated")
+    figure.legend(frameon=False, ncols=3, fontsize=8, loc="outside upper left")
     return figure
 
 

@@ -5,16 +5,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from limber.core.constants import MARK_COLOURS
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.report.charts import chart, draw_faces, two_views
+from limber.results.report.estimate_figures import AXIS_DOTS, AXIS_LINES, OBSERVED, SIMULATED
+from limber.results.report.findings import modulus_origin
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ORDER_COLOURS = ("#1f6f43", "#c7632a", "#3a63a8", "#8c4f9f", "#5d6a63")
+ORDER_COLOURS = ("#1f6f43", "#8a6d1d", "#6a4c93", "#7fb685", "#5d6a63")
 _CLOUD = "#a9b3ad"
 # More points than this only darken a picture, and slow it.
 _SHOWN_POINTS = 30_000
@@ -32,11 +35,11 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
         if mesh is not None and "control_point" in mesh.point_data:
             nodes = mesh.nodes[mesh.point_data["control_point"] >= 0]
             axis.scatter(nodes[:, first], nodes[:, 2], s=60, facecolors="none",
-                         edgecolors="#b0126b", linewidths=1.4, zorder=5)
+                         edgecolors=MARK_COLOURS["control_points"], linewidths=1.4, zorder=5)
         for target in targets:
             place = target["position_m"]
-            axis.plot(place[first], place[2], marker="*", markersize=13, color="#e0a100",
-                      markeredgecolor="#5c4300", zorder=6)
+            axis.plot(place[first], place[2], marker="*", markersize=13,
+                      color=MARK_COLOURS["targets"], markeredgecolor="#5c4300", zorder=6)
             axis.annotate(target["name"], (place[first], place[2]), (7, 5), fontsize=9,
                           textcoords="offset points", zorder=6)
     return figure
@@ -57,7 +60,7 @@ def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Fig
                       linewidth=0)
     if compared:
         axis.plot([row["along_m"] for row in compared],
-                  [1e3 * row["measured_m"] for row in compared], "o", color="#b0126b",
+                  [1e3 * row["measured_m"] for row in compared], "o", color=OBSERVED,
                   markersize=6, label="calipers")
         axis.legend(frameon=False)
     axis.set_ylim(bottom=0)
@@ -84,7 +87,7 @@ def radii(branch: Branch) -> "Figure":
 
 
 def mesh_by_modulus(branch: Branch) -> "Figure":
-    """The mesh's surface, shaded, coloured by Young's modulus; base black, grasp patch red."""
+    """The mesh's surface, shaded, coloured by Young's modulus; base and grasp patch marked."""
     import matplotlib.pyplot as plt
     from matplotlib.colors import LogNorm, Normalize
 
@@ -99,14 +102,15 @@ def mesh_by_modulus(branch: Branch) -> "Figure":
         colours = plt.get_cmap("viridis")(norm(young / 1e6))
         colours[:, :3] *= _shade(corners, depth)[:, None]
         draw_faces(axis, corners, colours, first, depth)
-        for name, colour in (("fixed", "black"), ("grasp", "#d1242f")):
+        for name, colour in (("fixed", MARK_COLOURS["base"]), ("grasp", MARK_COLOURS["grasp"])):
             marked = mesh.nodes[np.asarray(mesh.point_data.get(name, [])).nonzero()[0]]
             axis.scatter(marked[:, first], marked[:, 2], s=3, color=colour, zorder=4)
+    title = f"Young's modulus ({modulus_origin(branch)})"
     if spread > 1.001:
         scale = plt.cm.ScalarMappable(norm, "viridis")
-        figure.colorbar(scale, ax=figure.axes, label="Young's modulus [MPa]", shrink=0.7)
+        figure.colorbar(scale, ax=figure.axes, label=f"{title} [MPa]", shrink=0.7)
     else:
-        figure.suptitle(f"Young's modulus {young.mean() / 1e6:.4g} MPa everywhere", fontsize=10)
+        figure.suptitle(f"{title} {young.mean() / 1e6:.4g} MPa everywhere", fontsize=10)
     return figure
 
 
@@ -115,16 +119,17 @@ def pull(recording: Any) -> "Figure":
     import matplotlib.pyplot as plt
 
     time = recording.times
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(9, 5), sharex=True)
+    figure, (upper, lower) = plt.subplots(2, 1, figsize=(9, 5), sharex=True, layout="constrained")
     moved = recording.poses[:, :3] - recording.poses[0, :3]
-    for column, (name, colour) in enumerate(zip("xyz", ORDER_COLOURS, strict=False)):
-        upper.plot(time, recording.wrenches[:, column], ".-", color=colour, label=name)
-        lower.plot(time, 1e3 * moved[:, column], ".-", color=colour, label=name)
+    for column, (name, line) in enumerate(AXIS_LINES.items()):
+        style = {"color": OBSERVED, "ls": line, "marker": AXIS_DOTS[name], "ms": 3, "label": name}
+        upper.plot(time, recording.wrenches[:, column], **style)
+        lower.plot(time, 1e3 * moved[:, column], **style)
     upper.set(ylabel="force on the branch [N]")
     lower.set(ylabel="displacement of the grasp [mm]", xlabel="time [s]")
     for axis in (upper, lower):
         axis.grid(alpha=0.25)
-    upper.legend(ncols=3, frameon=False)
+    upper.legend(ncols=3, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 
@@ -133,20 +138,19 @@ def motion(frames: Mapping[str, Any]) -> "Figure":
     import matplotlib.pyplot as plt
 
     time = frames["times_s"]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6))
-    left.plot(time, 1e3 * np.array(frames["energies_j"]), color=ORDER_COLOURS[0], label="strain")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
+    left.plot(time, 1e3 * np.array(frames["energies_j"]), color=SIMULATED, label="strain")
     kinetic = 1e3 * np.array(frames["kinetic_energies_j"])
     if kinetic.any():
-        left.plot(time, kinetic, color=ORDER_COLOURS[1], label="kinetic")
+        left.plot(time, kinetic, "--", color=SIMULATED, label="kinetic")
     left.set(xlabel="time [s]", ylabel="energy [mJ]")
-    left.legend(frameon=False)
     force = np.array(frames["grasp_forces_n"])
-    for name, column, colour in zip("xyz", force.T, ORDER_COLOURS, strict=False):
-        right.plot(time, column, color=colour, label=name)
+    for (name, line), column in zip(AXIS_LINES.items(), force.T, strict=True):
+        right.plot(time, column, line, color=SIMULATED, label=name)
     right.set(xlabel="time [s]", ylabel="force on the grasp [N]")
-    right.legend(ncols=3, frameon=False)
     for axis in (left, right):
         axis.grid(alpha=0.25)
+        axis.legend(ncols=3, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 
@@ -157,10 +161,10 @@ def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
     rest = data["rest_pose"][:3] if "rest_pose" in data else data["poses"][:, :3].mean(axis=0)
     distance = 1e3 * np.linalg.norm(data["poses"][:, :3] - rest, axis=1)
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8))
-    left.scatter(distance, 1e3 * data["energies_j"], s=9, color=ORDER_COLOURS[0])
+    left.scatter(distance, 1e3 * data["energies_j"], s=9, color=SIMULATED)
     left.set(xlabel="displacement of the grasp [mm]", ylabel="strain energy [mJ]")
     force = np.linalg.norm(data["forces_n"], axis=1)
-    right.scatter(distance, force, s=9, color=ORDER_COLOURS[1])
+    right.scatter(distance, force, s=9, color=SIMULATED)
     right.set(xlabel="displacement of the grasp [mm]", ylabel="force [N]")
     for axis in (left, right):
         axis.set_ylim(bottom=0)

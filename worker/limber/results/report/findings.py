@@ -8,11 +8,35 @@ from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
 from limber.robot.known_arms import arm_named
 from limber.robot.ur.arms import ARMS
+from limber.store import Branch
 
+ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is assumed. The "
+           "estimate shows only that the assumed modulus is recovered. It states nothing about "
+           "the real branch.")
 _MOST_NAMED = 6
 """Control points whose moduli stand one by one in a sentence."""
+_SAME = 0.05
+"""Percent of energy and length by which two paths that count as one differ at most."""
 PATH_NAMES = {"baseline": "shortest", "plan": "gentle"}
 """Of the two paths of a plan, in text, tables and figures."""
+
+
+def simulated_pull(branch: Branch) -> dict[str, Any] | None:
+    """Return the result of a branch's first simulated pull, ``young_assumed`` where the branch
+    was not generated and nothing is known of its modulus; None where all pulls were measured."""
+    stages = branch.manifest.stages
+    found = [stages[key].result for key in (f"pull:{name}" for name in branch.names("pulls"))
+             if key in stages and stages[key].result.get("young_true_pa") is not None]
+    return found[0] | {"young_assumed": not branch.has("truth/truth.json")} if found else None
+
+
+def modulus_origin(branch: Branch) -> str:
+    """Return where the mesh's modulus is from: one that was assumed looks the same in colours."""
+    made = branch.manifest.files.get("mesh.vtu")
+    if made is None or made.stage in ("reconstruct", "mesh"):
+        return "assumed"
+    pull = simulated_pull(branch) if made.stage == "estimate" else None
+    return "assumed, from a simulated pull" if pull and pull["young_assumed"] else "estimated"
 
 
 def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
@@ -51,6 +75,8 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
     saved, added = plan.get("energy_saved_percent"), plan.get("length_added_percent")
     if saved is None or added is None:
         return f"{told}."
+    if max(abs(saved), abs(added)) < _SAME:
+        return f"{told}; no shorter one was found."
     return (f"{told}; it saves {saved:.3g} % of the shortest path's energy for {added:+.2g} % of "
             "length.")
 
@@ -94,11 +120,6 @@ def beyond_sentence(plan: Mapping[str, Any]) -> str:
     return " ".join(f"{labels[key]}, {words}." for key, words in remarks_on(plan).items())
 
 
-def breaks_wood(plan: Mapping[str, Any]) -> bool:
-    """Whether the gentle path strains the wood beyond where it is known, or assumed, to break."""
-    return bool(_over_wood("plan", plan))
-
-
 def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
     """Say which arm cannot carry a path's force: the plan's, or the strongest known that cannot."""
     force, model = float(plan[path]["peak_force_n"]), (plan.get("robot") or {}).get("model")
@@ -126,8 +147,13 @@ def _over_wood(path: str, plan: Mapping[str, Any]) -> str:
 def _with_interval(young: float, interval: Sequence[float | None] | None) -> str:
     low, high = interval or (None, None)
     if low is None or high is None:
-        return f"{young / 1e6:.3g} (not determined)"
-    return f"{young / 1e6:.3g} ({low / 1e6:.3g} to {high / 1e6:.3g})"
+        return f"{_mpa(young)} (not determined)"
+    return f"{_mpa(young)} ({_mpa(low)} to {_mpa(high)})"
+
+
+def _mpa(value: float) -> str:
+    """Three digits [MPa], never with an exponent."""
+    return f"{float(f'{value / 1e6:.3g}'):,.10g}"
 
 
 def _listed(parts: Sequence[str]) -> str:

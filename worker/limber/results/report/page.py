@@ -16,9 +16,16 @@ from limber.geometry.skeleton.qsm_tables import Caliper
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.motion_files import read_frames_file
 from limber.results.report import figures, loads_section, swing_section
+from limber.results.report.findings import (
+    ASSUMED,
+    beyond_sentence,
+    certificate_sentence,
+    modulus_sentence,
+    path_sentence,
+    simulated_pull,
+)
 from limber.results.report.path_sections import energy_section, execution_section, plan_section
 from limber.results.report.report_tables import (
-    ASSUMED,
     cause_rows,
     deviation_rows,
     held_out_rows,
@@ -52,7 +59,7 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
         MissingDependencyError: what the extra ``report`` brings is not installed.
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
-    page = [*_held_back(branch), _summary(branch, picture)]
+    page = [_found(branch, picture), *_held_back(branch), _summary(branch)]
     loads = [name.removesuffix(".json") for name in branch.names("loads")
              if name.endswith(".json")]
     motions = [key for key in branch.manifest.stages if key.split(":")[0] == "simulate"]
@@ -86,6 +93,30 @@ def _names(branch: Branch, stage: str) -> list[str]:
                   if key.startswith(f"{stage}:"))
 
 
+def _found(branch: Branch, picture: Path | None) -> Section:
+    """What was found in one paragraph, what it must not be taken for, and a picture of it."""
+    section, pull = Section("What was found"), simulated_pull(branch)
+    if pull is not None:
+        section.text.append(ASSUMED if pull["young_assumed"] else (
+            "The branch was generated and its pull simulated, so that the true modulus is known."))
+    told = []
+    if branch.has("estimate.json"):
+        told.append(modulus_sentence(
+            read_estimate(branch.path("estimate.json")),
+            "from a simulated pull with an assumed modulus" if is_assumed(pull) else ""))
+    else:
+        told.append("Young's modulus has not been estimated from a pull: what follows holds for "
+                    "the modulus that the mesh has.")
+    plans = [branch.manifest.stages[f"plan:{name}"] for name in _names(branch, "plan")]
+    if plans:
+        newest = max(plans, key=lambda entry: entry.finished).result
+        told += [path_sentence(newest), certificate_sentence(newest), beyond_sentence(newest)]
+    section.text.append(" ".join(filter(None, told)))
+    if picture is not None:
+        section.pictures.append((inline_png(read_png(picture)), "Rendered scene."))
+    return section
+
+
 def _held_back(branch: Branch) -> list[Section]:
     """The causes of the estimate's uncertainty and their remedies: the first section."""
     if not branch.has("estimate.json"):
@@ -101,12 +132,8 @@ def _held_back(branch: Branch) -> list[Section]:
         tables=[("", rows)])]
 
 
-def _summary(branch: Branch, picture: Path | None) -> Section:
+def _summary(branch: Branch) -> Section:
     section = Section("Summary")
-    if picture is not None:
-        section.pictures.append((inline_png(read_png(picture)), "Rendered scene."))
-    if is_assumed(_virtual_result(branch)):
-        section.text.append(ASSUMED)
     result = branch.made.result if branch.made else {}
     rows = [["item", "value"]]
     source = branch.manifest.source
@@ -153,7 +180,7 @@ def _estimate(branch: Branch) -> Section:
     from limber.results.report import estimate_figures
 
     estimate = read_estimate(branch.path("estimate.json"))
-    virtual = _virtual_result(branch)
+    virtual = simulated_pull(branch)
     section.tables.append((
         "Estimated" if not virtual else "Estimated against assumed" if is_assumed(virtual)
         else "Estimated against true", modulus_rows(estimate, virtual)))
@@ -248,14 +275,6 @@ def _setting(value: Any) -> str:
 def _is_virtual(branch: Branch, name: str) -> bool:
     entry = branch.manifest.stages.get(f"pull:{name}")
     return entry is not None and entry.result.get("young_true_pa") is not None
-
-
-def _virtual_result(branch: Branch) -> dict[str, Any] | None:
-    names = [name for name in branch.names("pulls") if _is_virtual(branch, name)]
-    if not names:
-        return None
-    return branch.manifest.stages[f"pull:{names[0]}"].result | {
-        "young_assumed": not _has_truth(branch)}
 
 
 def _has_truth(branch: Branch) -> bool:

@@ -1,7 +1,8 @@
 """Figures of a plan: energy along both paths, and both paths over a slice of the energy field."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LABELS = {"baseline": "shortest (length alone)", "plan": "gentle (deformation-aware)"}
+_FLAT = 1e-3  # a cost that changes by less along the search draws a line and says nothing
 _STILL = 1e-9  # [m] a path that is no longer has no length
 _GRID = 160  # points of the slice along its longer side
 
@@ -37,9 +39,10 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
          "Both paths over the energy field, in the plane that fits them best; white where the "
          "branch was not sampled. The cross is the rest pose. Grey: the search tree of D-RRT*, "
          "projected onto that plane."),
-        (convergence(plan), "Cost of the best path so far over the planner's iterations, relative "
-                            "to the final cost."),
     ]
+    if moved := searched(plan.summary["convergence"]):
+        shown.append((convergence(moved), "Cost of the best path so far over the planner's "
+                                             "iterations, relative to the final cost."))
     if plan.summary.get("certificate"):
         if branch.has(f"plans/{name}-bound.npz"):
             bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
@@ -58,7 +61,7 @@ def along_paths(plan: PlanFile) -> "Figure":
     """Draw energy, force and strain over the length of both paths."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
     axes = figure.subplots(1, 3)
     for key, path in _ways(plan).items():
         along = 1e3 * arc_lengths(path.poses[:, :3])
@@ -72,7 +75,8 @@ def along_paths(plan: PlanFile) -> "Figure":
                                   "largest strain [%]"), strict=True):
         axis.set(xlabel="along the path [mm]", ylabel=label)
         axis.grid(alpha=0.25)
-    axes[0].legend(frameon=False, fontsize=8)
+    lines, labels = axes[1].get_legend_handles_labels()
+    figure.legend(lines, labels, frameon=False, ncols=2, loc="outside upper left")
     return figure
 
 
@@ -178,7 +182,7 @@ class _View:
         axis.plot(*(1e3 * self.paths["plan"][0]), "s", color="black", mec="white", label="start")
         axis.plot(*(1e3 * self.rest), "x", color="black", ms=9, mew=2, label="rest pose")
         axis.set(xlim=1e3 * self.x[[0, -1]], ylim=1e3 * self.y[[0, -1]])
-        axis.legend(loc="best", fontsize=8, framealpha=0.85)
+        axis.figure.legend(loc="outside upper left", ncols=4, fontsize=8, frameon=False)
 
 
 def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
@@ -187,16 +191,23 @@ def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
     return read_trees(branch.path(file)).get("D-RRT*") if branch.has(file) else None
 
 
-def convergence(plan: PlanFile) -> "Figure":
+def searched(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, np.ndarray]:
+    """Return iterations and cost over the last cost, [n, 2], of the searches that improved."""
+    found = {}
+    for key, history in histories.items():
+        # On a first, coarse grid there may be no path yet.
+        known = np.array([[entry["iteration"], entry["cost"]] for entry in history
+                          if entry["cost"] is not None], float).reshape(-1, 2)
+        if len(known) and np.ptp(known[:, 1]) > _FLAT * abs(known[-1, 1]):
+            found[key] = known / [1.0, known[-1, 1]]
+    return found
+
+
+def convergence(histories: dict[str, np.ndarray]) -> "Figure":
     """Draw the cost of the best path over iterations, both relative to their last."""
     figure, axis = chart(6, 3.2, "iterations", "cost / final cost", has_grid=True)
-    for key, history in plan.summary["convergence"].items():
-        # On a first, coarse grid there may be no path yet.
-        history = [entry for entry in history if entry["cost"] is not None]
-        if history:
-            cost = np.array([entry["cost"] for entry in history])
-            axis.plot([entry["iteration"] for entry in history], cost / cost[-1],
-                      color=PATH_COLOURS[key], label=_LABELS[key])
+    for key, history in histories.items():
+        axis.plot(*history.T, color=PATH_COLOURS[key], label=_LABELS[key])
     axis.legend(frameon=False)
     return figure
 

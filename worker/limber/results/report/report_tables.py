@@ -4,9 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is assumed. The "
-           "estimate shows only that the assumed modulus is recovered. It states nothing about "
-           "the real branch.")
+from limber.results.report.findings import ASSUMED, remarks_on
 
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
@@ -45,22 +43,29 @@ def is_assumed(pull: Mapping[str, Any] | None) -> bool:
 
 
 def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
-    """Return shortest against gentle path, with peaks and changes in percent."""
+    """Return shortest against gentle path, with peaks and changes in percent; a last column says
+    what is beyond an arm's or the wood's reach, where anything is."""
     rows = [["measure", "shortest", "gentle", "change"]]
+    remarks, told = remarks_on(plan), []
     for label, key, unit in [
             ("path length", "length_m", "m"),
             ("energy along the path", "energy_integral_jm", "J m"),
             ("sum of energy, 5 mm steps", "energy_sum_nmm", "N mm"),
-            ("peak energy", "peak_energy_j", "J"), ("peak force", "peak_force_n", "N")]:
+            ("peak energy", "peak_energy_j", "J"), ("peak force", "peak_force_n", "N"),
+            ("largest strain", "peak_strain", "m/m")]:
         before, after = plan["baseline"].get(key), plan["plan"].get(key)
         if before is None or after is None:
             continue
         change = f"{100 * (after / before - 1):+.1f} %" if before else "-"
         rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
+        told.append(remarks.get(key, ""))
     gap = (plan.get("certificate") or {}).get("gap_percent")
     if gap is not None:
         rows.append(["above the best possible path, at most [%]", "", f"{gap:.1f}", ""])
-    return rows
+        told.append("")
+    if not any(told):
+        return rows
+    return [[*row, remark] for row, remark in zip(rows, ["beyond reach", *told], strict=True)]
 
 
 def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:

@@ -113,7 +113,7 @@ def mesh_section(branch: Branch) -> Section:
         section.missing = "limber reconstruct or limber mesh"
         return section
     section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
-                                                  "modulus; base in black, grasp patch in red.")
+                                                  "modulus; base in brown, grasp patch in orange.")
     result = branch.made.result if branch.made else {}
     quality = result.get("mesh_quality") or {}
     rows = [["quantity", "value"]]

@@ -59,6 +59,7 @@ import numpy as np
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loads.loaded_branch import NamedTarget
 from limber.results.motion_files import node_average
+from limber.results.report.findings import modulus_origin
 from limber.results.scene.animation import add_motion
 from limber.results.scene.arrays import FORMAT, SceneData
 from limber.results.scene.colours import colour_scale
@@ -107,8 +108,8 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
                  "alignment": matrix, "map_offset": map_offset(matrix)}
     if "young" in mesh.cell_data:
         young = (node_average(mesh) @ mesh.cell_data["young"])[used]
-        add_scalar(data, "young", young,
-                   colour_scale(young, f"Young's modulus ({_origin(branch)})", "Pa", "viridis"))
+        title = f"Young's modulus ({modulus_origin(branch)})"
+        add_scalar(data, "young", young, colour_scale(young, title, "Pa", "viridis"))
     add_cloud(data, branch)
     add_skeleton(data, branch)
     add_skeleton_rods(data)
@@ -123,12 +124,6 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     add_view(data)
     data.arrays = {name: np.ascontiguousarray(array) for name, array in data.arrays.items()}
     return data
-
-
-def _origin(branch: Branch) -> str:
-    """Return where the mesh's modulus is from: one that was assumed looks the same in colours."""
-    made = branch.manifest.files.get("mesh.vtu")
-    return "assumed" if made is None or made.stage in ("reconstruct", "mesh") else "estimated"
 
 
 def _size_note(branch: Branch, mesh: TetMesh) -> str:

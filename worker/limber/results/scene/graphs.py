@@ -17,7 +17,8 @@ import numpy as np
 from limber.planning.cost import arc_lengths
 from limber.results.scene.colours import with_unit
 
-MEASURED, SIMULATED, TRUE = (0.95, 0.95, 0.95), (0.40, 0.71, 1.0), (1.0, 0.62, 0.30)
+MEASURED, SIMULATED, TRUE = (0.25, 0.85, 0.95), (0.95, 0.95, 0.95), (1.0, 0.62, 0.30)
+"""As in the report (:data:`limber.core.constants.DATA_COLOURS`), on the graph's dark ground."""
 FIRST, SECOND = (0.93, 0.36, 0.42), (0.45, 0.62, 1.0)
 """Of the planned path and of the one that it is compared with: as the paths themselves
 (:data:`limber.core.constants.PATH_COLOURS`), lighter on the graph's dark ground."""
