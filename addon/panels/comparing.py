@@ -37,7 +37,12 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
                  f"Proven: at most {gap:.1f} % above the minimum",
-                 icon="QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
+                 icon="QUESTION" if gap is None else
+                 "DOT" if (result.get("strength") or {}).get("over") else "CHECKMARK")
+    strength = result.get("strength") or {}
+    if strength.get("over"):
+        layout.label(text=f"Strain {strength['peak_strain'] / strength['median_strain']:.1f} x "
+                     f"the strength ({strength['source']})", icon="ERROR")
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (
         record.stages.items() if record else ()) if key.startswith(_PLAN)}
     if len(others) > 1:

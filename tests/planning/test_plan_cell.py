@@ -9,6 +9,7 @@ from limber.core.errors import InputError, NoPathError
 from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
+from limber.robot.known_arms import arm_named
 from limber.stages.paths.plan import plan as plan_paths
 from limber.stages.paths.plan_cell import places_in
 from limber.store import Branch
@@ -109,13 +110,18 @@ def test_a_branch_is_led_around_an_obstacle(copied):
 
 
 def test_a_second_arm_reaches_as_far_as_it_can():
-    """Its region is the ball about its shoulder; within it inverse kinematics decides."""
+    """Its region is a ball about its shoulder that holds all that it takes, with its tool; within
+    it inverse kinematics decides."""
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)}, second_arm={
-        "model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0)})
+        "model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0), "grasp_pose": (0, 0, 0.1, 0, 0, 0)})
     place = places_in(cell)["second_arm"]
     region = place.region
     assert region.middle == pytest.approx([1.0, 0.0, 0.15185])
-    assert 0.5 < region.radius < 0.6
+    joints = np.random.default_rng(0).uniform(-np.pi, np.pi, (20_000, 6))
+    flange = arm_named("ur3e").forward(joints)
+    taken = flange[:, :3, 3] + 0.1 * flange[:, :3, 2] + [1.0, 0.0, 0.0]
+    away = np.linalg.norm(taken - region.middle, axis=1)
+    assert 0.75 * region.radius < away.max() <= region.radius
     place.require("the tip", np.array([1.0, 0.3, 0.3]), None)
     with pytest.raises(NoPathError, match="second arm"):
         place.require("the tip", np.array([1.0, 0.9, 0.3]), None)

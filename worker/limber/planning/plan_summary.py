@@ -122,15 +122,15 @@ def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath)
         if (error := 100.0 * summary[key]["field_energy_error"]) > most]
     gap = summary["certificate"]["gap_percent"]
     if gap is not None and gap > _WIDE_GAP:
-        takes = "cost" if summary["certificate"]["quantity"] == COST else "take"
+        takes = "cost" if summary["certificate"].get("quantity", COST) == COST else "take"
         energy = "" if takes == "cost" else "energy "
         doubts.append(f"The path may {takes} up to {gap:.1f} % more {energy}than the best "
-                      "possible one" + ("." if summary["planner"] == "eikonal" else "; `--planner eikonal` comes closest."))
+                      "possible one" + ("." if summary["planner"] == "eikonal" else
+                                        "; `--planner eikonal` comes closest."))
     shortest, gentle = (summary[key]["length_m"] for key in ("baseline", "plan"))
     if shortest > _LONGER * gentle:
-        doubts.append("The path called shortest is longer than the gentle one: in a large goal "
-                      "region RRT* aims at only a few random poses. The saving against it means "
-                      "little. Give one goal pose (--goal) to compare paths.")
+        doubts.append("The path called shortest is longer than the gentle one: RRT* found no "
+                      "shorter one. The saving against it means little. Allow more --iterations.")
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
         doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution. Its "

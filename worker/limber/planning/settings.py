@@ -41,8 +41,8 @@ class PlanSettings(Settings):
                            "goal_seed", "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
-                               "wood", "max_stress", "workspace_low", "workspace_high",
-                               "confidence"),
+                               "wood", "max_damage", "max_stress", "workspace_low",
+                               "workspace_high", "confidence"),
         "timing": ("speed", "acceleration", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
@@ -92,6 +92,9 @@ class PlanSettings(Settings):
     wood: Literal["ash", "cherry", "maple", "oak", "walnut"] | None = Field(None, description=(
         "Limit the strain to half of the breaking strain of green wood of this species (0.3 %; "
         "Wood Handbook FPL-GTR-190). Young shoots withstand more; give --max-strain for them."))
+    max_damage: float | None = Field(None, gt=0, lt=1, description=(
+        "Largest probability that the largest strain along the path breaks the branch (0.01 is "
+        "1 %), by --break-tests or --wood. It replaces the limit of --wood."))
     max_stress: float | None = Field(None, gt=0, description=(
         "Largest principal stress anywhere in the branch at any pose [Pa], for the stiff end of "
         "the estimate's intervals."))

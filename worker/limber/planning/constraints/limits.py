@@ -92,7 +92,7 @@ class Limits:
             InputError: the workspace is empty, or the strain limited twice.
         """
         strain = settings.max_strain or np.inf
-        if settings.wood is not None:
+        if settings.wood is not None and settings.max_damage is None:
             if settings.max_strain is not None:
                 raise InputError("Both --max-strain and --wood are given.",
                                  "Both limit the strain.",

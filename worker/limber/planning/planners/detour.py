@@ -19,15 +19,17 @@ import scipy
 
 from limber.core.errors import NoPathError
 from limber.core.progress import SILENT, Progress
-from limber.planning.certificate.lower_bound import ENERGY, ENOUGH
+from limber.planning.certificate.lower_bound import ENERGY
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.refine import refine
 
 _LIGHT = 1e-2  # of the weight of a metre that was given: the energy alone counts, nearly
+_HEAVY = 1e3  # likewise: the length alone counts
 _SHORTER = (0.99, 0.97)  # of the length allowed: for the slope of the energy over it
 _BINDS = 0.998  # of the length allowed: a longer path is held back by it
+_ENOUGH = 0.03  # gap of the energy below which no finer grid is worth its time
 _UNUSED = 0.004  # of the energy, that the weight of a length left over may cost the bound
 _FINEST_GAP = 1e-3  # of the weighed cost, that is asked for
 _MOST_BOUNDS = 3
@@ -133,25 +135,32 @@ class _Search:
             path, cost = refine(self.path, replace(light, longest=share * self.longest))
             if np.isfinite(cost):
                 length, integral = _measured(path, self.problem)
-                self._note(0.0, length, integral)
                 if length < self.length:
                     self.slope = max((integral - self.integral) / (self.length - length), 0.0)
+                    self._note(self._own_weight(), length, integral)
                     break
 
     def first_weight(self) -> float:
         """Return the weight whose bound is asked for first."""
-        metre = self.problem.weights.length / self.problem.weights.energy
         spare = max(self.longest - self.length, (1.0 - _BINDS) * self.longest)
         light = _UNUSED * self.integral / spare
-        return max(self.slope, min(light, self.integral / self.longest)) / metre
+        return max(self.slope, min(light, self.integral / self.longest)) / self._metre
+
+    @property
+    def _metre(self) -> float:
+        """What a metre weighs by the problem's own weights [J]."""
+        return self.problem.weights.length / self.problem.weights.energy
+
+    def _own_weight(self) -> float:
+        """Return the weight at which the path would be the gentlest."""
+        return max(self.slope / self._metre, _LIGHT)
 
     def bound(self, weight: float, progress: Progress) -> float | None:
         """Bound at a weight; return the next one, None where none is worth its time."""
-        energy, metre = self.problem.weights.energy, (
-            weight * self.problem.weights.length / self.problem.weights.energy)
+        energy, metre = self.problem.weights.energy, weight * self._metre
         asked = replace(_weighed(self.problem, weight), longest=self.longest)
         # The gap that is asked for is the energy's: of the weighed cost it is a part.
-        wanted = self.integral / (1.0 + ENOUGH) + metre * self.longest
+        wanted = self.integral / (1.0 + _ENOUGH) + metre * self.longest
         enough = max((self.integral + metre * self.length) / wanted - 1.0, _FINEST_GAP)
         found = plan_gentle(asked, [self.path], enough=enough, progress=progress)
         self._take(found.points)
@@ -164,7 +173,7 @@ class _Search:
             self.levels = [level | {"lower": max(
                 level["lower"] / energy - metre * self.longest, 0.0), "upper": self.integral}
                 for level in found.certificate.levels]
-        if found.certificate.stopped or self.integral <= (1.0 + ENOUGH) * value:
+        if found.certificate.stopped or self.integral <= (1.0 + _ENOUGH) * value:
             return None
         spare = metre * (self.longest - length)
         unsure = found.cost / energy - lower
@@ -196,11 +205,11 @@ class _Search:
         proof = replace(self.best.certificate, lower=bound, upper=self.integral,
                         levels=self.levels, quantity=ENERGY)
         cost = _weighed(self.problem, self.best_weight).cost(self.path)
-        self._note(0.0, *_measured(self.shortest, self.problem))
-        self._note(0.0, self.length, self.integral)
+        self._note(_HEAVY, *_measured(self.shortest, self.problem))
+        self._note(self._own_weight(), self.length, self.integral)
         return DetourPath(GentlePath(self.path, cost, proof), self.best_weight, least,
                           self.longest, self.integral, bound,
-                          tuple(sorted(self.curve, key=lambda point: point.length_m)))
+                          tuple(sorted(self.curve, key=lambda point: point.weight)))
 
 
 def _weighed(problem: GentleProblem, weight: float) -> GentleProblem:

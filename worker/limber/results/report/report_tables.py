@@ -59,13 +59,28 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
         change = f"{100 * (after / before - 1):+.1f} %" if before else "-"
         rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
         told.append(remarks.get(key, ""))
+    below = _below(plan)
+    if not any(told):
+        return rows + below
+    told += [""] * len(below)
+    return [[*row, remark] for row, remark in zip(
+        rows + below, ["beyond reach", *told], strict=True)]
+
+
+def _below(plan: Mapping[str, Any]) -> list[list[str]]:
+    """Rows of what is known of the gentle path alone."""
+    rows = []
     gap = (plan.get("certificate") or {}).get("gap_percent")
     if gap is not None:
         rows.append(["above the best possible path, at most [%]", "", f"{gap:.1f}", ""])
-        told.append("")
-    if not any(told):
-        return rows
-    return [[*row, remark] for row, remark in zip(rows, ["beyond reach", *told], strict=True)]
+    if strength := plan.get("strength"):
+        share = strength["peak_strain"] / strength["median_strain"]
+        rows.append([f"largest strain over that at break ({strength['source']})", "",
+                     f"{share:.2g}", ""])
+        if strength["damage_probability"] is not None:
+            rows.append(["probability of damage [%]", "",
+                         f"{100 * strength['damage_probability']:.2g}", ""])
+    return rows
 
 
 def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:

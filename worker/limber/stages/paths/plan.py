@@ -52,17 +52,21 @@ _MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx
 class PlanInputs(BranchInputs):
     """A branch folder, and the plan's name."""
 
-    groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
+    groups: ClassVar[Groups] = {"input": ("cell", "break_tests"), "output": ("name",)}
     common = ("cell", "name")
 
     cell: Path | None = Field(None, description=(
         "The robot's cell file. Its workspace, force limit and obstacles apply, and its arm must "
         "reach the whole path."))
+    break_tests: Path | None = Field(None, description=(
+        "CSV of break tests on shoots of the same plant: a column strain_at_break (0.05 is 5 %). "
+        "They state the branch's strength."))
     name: str = Field("path", description="Name of the plan's files.")
 
 
 def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
-         cell_file: Path | None = None, workers: int | None = None, force: bool = False,
+         cell_file: Path | None = None, break_tests: Path | None = None,
+         workers: int | None = None, force: bool = False,
          progress: Progress = SILENT) -> dict[str, Any]:
     """Plan paths on the branch's energy field.
 
@@ -82,6 +86,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
     from limber.stages.paths.plan_cell import reached_by
+    from limber.stages.paths.plan_strength import strength_for, strength_of_plan, with_damage
     from limber.stages.paths.plan_uncertainty import young_uncertainty
     from limber.store.loading import known_damping, load_grasp_model
 
@@ -108,7 +113,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     digests = digests | {"damping": repr(grasp_model.model.damping)}
     stiffer = _stiffer(branch) if settings.max_stress else 1.0
     digests = digests | {"stiffer": f"{stiffer:.6f}"}
-    asked = Limits.of(settings, stiffer)
+    strength = strength_for(branch, settings, break_tests)
+    if break_tests is not None:
+        digests = digests | {"break tests": file_digest(break_tests)}
+    asked = with_damage(Limits.of(settings, stiffer), settings, strength)
     uncertainty = (
         None if settings.confidence is None else young_uncertainty(branch, grasp_model, asked)
     )
@@ -146,6 +154,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         if found.summary["stopped"] and finished:
             raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
                             "Run it again when there is time for it.")
+        found.summary["strength"] = strength_of_plan(
+            strength, found.plan, found.summary.get("in_motion"), progress)
         pace = found.pace
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:

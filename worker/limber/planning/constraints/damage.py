@@ -1,0 +1,170 @@
+"""The probability that a branch breaks, by the strain at which such branches broke.
+
+A branch breaks where its largest strain exceeds what it bears: a Weibull variable, as the strength
+of brittle and fibrous parts is (Weibull 1951). Its shape and scale come from the user's own break
+tests, or from a species. Of few tests they are not known well: with shape k and scale s fitted by
+maximum likelihood, ``k_fit / k`` and ``k_fit log(s_fit / s)`` have distributions that do not depend
+on the truth (Thoman, Bain and Antle 1969). Drawn from samples of the fit, they give shapes and
+scales as likely as the tests leave them, and the probability of damage is the mean over those.
+
+The gripper prescribes the pose: the strain there hardly depends on the stiffness, and grows with
+the branch's radius.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from limber.core.errors import InputError
+from limber.core.numerics.compiled import compiled
+from limber.mechanics.materials.species import SPECIES, STRENGTH_OVER_YOUNG
+
+_FEWEST = 5  # tests
+_DRAWS = 500
+_COLUMN = "strain_at_break"
+_STEPS = 60  # of Newton's method, at most
+_SPREAD = 0.27
+"""Coefficient of variation of a species' strain at rupture: those of modulus of rupture, 16 %, and
+of elasticity, 22 %, together (Wood Handbook, FPL-GTR-190, table 5-6)."""
+_RADII = np.array([-1.8, -1.1, -0.4, 0.4, 1.1, 1.8])  # deviations of the radius, evenly likely
+
+
+@dataclass(frozen=True)
+class Strength:
+    """The strain that branches like this one bear.
+
+    Attributes:
+        shapes, scales: Of Weibull distributions, all as likely, shapes [d]; scales are strains.
+        radius_deviation: Of the branch's radius, relative.
+        source: Where it is from, in words.
+        tests: How many break tests; 0: none.
+    """
+
+    shapes: np.ndarray
+    scales: np.ndarray
+    radius_deviation: float
+    source: str
+    tests: int = 0
+
+    @classmethod
+    def of_tests(cls, strains: np.ndarray, source: str, radius_deviation: float = 0.0,
+                 ) -> "Strength":
+        """Return what break tests at ``strains`` [n] say.
+
+        Raises:
+            InputError: they are too few, or all the same.
+        """
+        if len(strains) < _FEWEST:
+            raise InputError(f"{source} has {len(strains)} break tests.",
+                             "The scatter of the strength cannot be told from so few.",
+                             f"Break at least {_FEWEST} shoots, or give --wood.")
+        if np.ptp(strains) <= 1e-6 * strains.max():
+            raise InputError(f"All {len(strains)} break tests of {source} have the same strain.",
+                             "Strengths scatter, so these are no measurements.",
+                             "State each shoot's own strain at break.")
+        shape, scale = (float(one[0]) for one in _fitted(np.log(strains)[None]))
+        generator = np.random.default_rng(0)
+        standard = np.log(generator.weibull(1.0, (_DRAWS, len(strains))))
+        shapes, scales = _fitted(standard)  # of shape 1, scale 1
+        return cls(shape / shapes, scale * scales ** (-shapes / shape), radius_deviation, source,
+                   len(strains))
+
+    @classmethod
+    def of_species(cls, name: str, radius_deviation: float = 0.0) -> "Strength":
+        """Return that of green wood of a species with a known strain at rupture."""
+        mean = SPECIES[name].rupture_strain
+        if mean is None:
+            raise KeyError(name)
+        shape = float(scipy.optimize.brentq(lambda k: _variation(k) - _SPREAD, 1.0, 50.0))
+        scale = mean / scipy.special.gamma(1.0 + 1.0 / shape)
+        return cls(np.array([shape]), np.array([scale]), radius_deviation,
+                   f"green wood of {name} (Wood Handbook)")
+
+    def damage(self, strain: float) -> float:
+        """Return the probability that a branch breaks which is strained so much."""
+        felt = max(strain, 0.0) * np.exp(self.radius_deviation * _RADII)
+        return float(-np.expm1(-(felt[:, None] / self.scales) ** self.shapes).mean())
+
+    def strain_limit(self, damage: float) -> float:
+        """Return the strain at which the probability is ``damage``, between 0 and 1."""
+        high = 10.0 * float(self.scales.max())
+        return float(np.exp(scipy.optimize.brentq(
+            lambda log: self.damage(np.exp(log)) - damage, np.log(1e-9 * high), np.log(high))))
+
+    @property
+    def median(self) -> float:
+        """The strain that half of such branches bear."""
+        return self.strain_limit(0.5)
+
+    def describe(self, strain: float) -> dict[str, Any]:
+        """Return as plain data what this says of a largest ``strain``."""
+        return {"source": self.source, "tests": self.tests, "median_strain": self.median,
+                "peak_strain": strain, "damage_probability": self.damage(strain)}
+
+
+def assumed(strain: float) -> dict[str, Any]:
+    """Return as plain data what is said of a largest ``strain`` where no strength is known."""
+    return {"source": "green wood, assumed", "tests": 0, "median_strain": STRENGTH_OVER_YOUNG,
+            "peak_strain": strain, "damage_probability": None}
+
+
+def read_break_tests(path: Path) -> np.ndarray:
+    """Return strains at break [n] of a CSV with a column ``strain_at_break``.
+
+    Raises:
+        InputError: there is no such file or column, or a value that is no strain.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read ({error}).", "It holds the break tests.",
+                         "Give a CSV file.") from error
+    if not rows or _COLUMN not in rows[0]:
+        raise InputError(f"{path} has no column {_COLUMN}.",
+                         "It states the largest strain of each shoot when it broke (0.05 is 5 %).",
+                         f"Name that column {_COLUMN}.")
+    strains = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            strain = float(row[_COLUMN])
+        except (TypeError, ValueError):
+            strain = np.nan
+        if not 0.0 < strain < 1.0:
+            raise InputError(f"Line {number} of {path} has the strain {row[_COLUMN]!r}.",
+                             "A strain at break lies between 0 and 1; 0.05 is 5 %.",
+                             "Correct or remove the line.")
+        strains.append(strain)
+    return np.array(strains)
+
+
+def _variation(shape: float) -> float:
+    """Return the coefficient of variation of a Weibull variable."""
+    first, second = scipy.special.gamma(1.0 + np.array([1.0, 2.0]) / shape)
+    return float(np.sqrt(second / first**2 - 1.0))
+
+
+@compiled
+def _fitted(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return shapes and scales [d] of most likelihood for ``logs`` [d, n] of Weibull variables."""
+    shapes, scales = np.empty(len(logs)), np.empty(len(logs))
+    for d in range(len(logs)):
+        row = logs[d]
+        top, mean = row.max(), row.mean()
+        shape = 1.2825 / max(row.std(), 1e-12)
+        for _ in range(_STEPS):
+            weights = np.exp(shape * (row - top))
+            total = weights.sum()
+            first, second = (weights * row).sum() / total, (weights * row**2).sum() / total
+            off = first - 1.0 / shape - mean
+            step = off / (second - first**2 + 1.0 / shape**2)
+            shape = max(shape - step, 0.5 * shape)
+            if abs(step) < 1e-12 * shape:
+                break
+        shapes[d] = shape
+        scales[d] = np.exp(top + np.log(np.exp(shape * (row - top)).mean()) / shape)
+    return shapes, scales

@@ -1,0 +1,70 @@
+"""What a plan knows of the strain that breaks the branch."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from limber.core.errors import InputError
+from limber.core.progress import Progress
+from limber.planning.constraints.damage import Strength, assumed, read_break_tests
+from limber.planning.constraints.limits import Limits
+from limber.planning.path_on_full_model import ResolvedPath
+from limber.planning.settings import PlanSettings
+from limber.store import Branch
+
+
+def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | None,
+                 ) -> Strength | None:
+    """Return the strength by the user's break tests, else by --wood; None where neither is given.
+
+    Raises:
+        InputError: the tests cannot be used, or --max-damage is given without a strength.
+    """
+    deviation = _radius_deviation(branch)
+    if break_tests is not None:
+        return Strength.of_tests(read_break_tests(break_tests), str(break_tests), deviation)
+    if settings.wood is not None:
+        return Strength.of_species(settings.wood, deviation)
+    if settings.max_damage is not None:
+        raise InputError("--max-damage is given, but the branch's strength is not known.",
+                         "It is the probability that the largest strain breaks the branch.",
+                         "Also give --break-tests, a CSV of strains at break, or --wood.")
+    return None
+
+
+def with_damage(limits: Limits, settings: PlanSettings, strength: Strength | None) -> Limits:
+    """Return the limits, the strain's no higher than the allowed probability of damage has it."""
+    if strength is None or settings.max_damage is None:
+        return limits
+    return replace(limits, strain=min(limits.strain, strength.strain_limit(settings.max_damage)))
+
+
+def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
+                     in_motion: dict[str, Any] | None, progress: Progress) -> dict[str, Any]:
+    """Return what the strength says of a plan's largest strain; warn where it is over one that is
+    known."""
+    states = plan.ahead
+    at = int(states.strains.argmax())
+    peak = float(states.strains[at])
+    moving = ((in_motion or {}).get("peaks") or {}).get("strain")
+    peak = max(peak, float(moving["moving"])) if moving else peak
+    told = assumed(peak) if strength is None else strength.describe(peak)
+    told |= {"place_m": states.strain_places[at], "grasp_m": states.poses[at, :3],
+             "over": peak > told["median_strain"]}
+    if told["over"] and strength is not None:
+        progress.warn(
+            f"The largest strain along the plan is {peak:.2g}, "
+            f"{peak / told['median_strain']:.1f} times that at which half of such branches break "
+            f"({told['median_strain']:.2g}, {told['source']}). Lower it with --max-damage.")
+    return told
+
+
+def _radius_deviation(branch: Branch) -> float:
+    """Return the relative standard deviation of the branch's radius by its reconstruction; 0 where
+    there is none."""
+    stage = branch.manifest.stages.get("reconstruct")
+    result = {} if stage is None else stage.result
+    sigma = result.get("radius_sigma_median_m")
+    if not sigma:
+        return 0.0
+    return float(sigma) / (0.5 * (float(result["radius_min_m"]) + float(result["radius_max_m"])))
