@@ -102,9 +102,12 @@ def test_large_goals_are_aimed_at_from_the_near_side(field, small_model):
 
 def test_walking_into_a_large_region_stays_among_the_samples(field):
     """Poses outside it step to its border, not to places far beyond the branch's reach."""
-    tip = field.tip(field.rest[None])[0]
+    rest = field.tip(field.rest[None])[0]
+    tips = field.tip(field.region.draw(500, np.random.default_rng(3)))
+    far = tips[np.argsort(np.linalg.norm(tips - rest, axis=1))[400]]
+    outward = (far - rest) / np.linalg.norm(far - rest)
     for radius in (0.005, 0.05, 1.0):
-        goal = TargetGoal(Ball(tuple(tip + [0.0, radius + 0.05, 0.0]), radius))
+        goal = TargetGoal(Ball(tuple(far + (radius - 0.004) * outward), radius))
         points = goal.guess(field, 100, np.random.default_rng(0))
         reached = points[goal.distance(field, points) <= goal.tolerance]
         assert field.region.contains(reached).sum() > 20

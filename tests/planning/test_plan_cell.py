@@ -112,10 +112,11 @@ def test_a_branch_is_led_around_an_obstacle(copied):
 def test_a_second_arm_reaches_as_far_as_it_can():
     """Its region is a ball about its shoulder that holds all that it takes, with its tool; within
     it inverse kinematics decides."""
-    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)}, second_arm={
-        "model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0), "grasp_pose": (0, 0, 0.1, 0, 0, 0)})
-    place = places_in(cell)["second_arm"]
-    region = place.region
+    entry = {"model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0)}
+    place, held = (places_in(Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)},
+                                  second_arm=entry | tool))["second_arm"]
+                   for tool in ({}, {"grasp_pose": (0, 0, 0.1, 0, 0, 0)}))
+    region = held.region
     assert region.middle == pytest.approx([1.0, 0.0, 0.15185])
     joints = np.random.default_rng(0).uniform(-np.pi, np.pi, (20_000, 6))
     flange = arm_named("ur3e").forward(joints)

@@ -3,8 +3,8 @@
 The region is an outer bound: within it the arm may not reach every place, and the branch may hide
 the target. Which grasp poses do is asked of poses of the field (of an arm, whose kinematics are of
 the target's place alone) or of the branch model (of a view, past the branch's own surface). Between
-them a pose counts as one that does where it is twice as near to one that does as to one that does
-not. Each planned path adds its own states, so that the border is refined where paths end.
+them a pose counts as one that does where it is nearer to one that does than to one that does not.
+Each planned path adds its own states, so that the border is refined where paths end.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,6 +24,7 @@ from limber.planning.path_on_full_model import SolvedPoses
 
 _DRAWN = 2000  # poses of the field among which those in the region are looked for
 _ASKED = 150  # of these at most, where the target's place alone counts
+_PAIRS, _HALVINGS = 40, 5  # of these and others, between which the border is looked for
 _SOLVED = 16  # states of the branch model at most, where its surface counts as well
 _NOWHERE = np.empty((0, 3))
 
@@ -49,8 +50,8 @@ class CellGoal(TargetGoal):
         if not len(self.refused) or not len(self.taken):
             return within
         points = np.ascontiguousarray(points, float).reshape(-1, 3)
-        nearer = 2.0 * nearest_of(points, self.taken)[0] - nearest_of(points, self.refused)[0]
-        return np.maximum(within, self.tolerance + nearer / 3.0)
+        nearer = nearest_of(points, self.taken)[0] - nearest_of(points, self.refused)[0]
+        return np.maximum(within, self.tolerance + 0.5 * nearer)
 
     def uncertainty(self, field: EnergyField) -> float:
         # Between poses that do not do there may be one that does: then nothing is proven.
@@ -76,10 +77,27 @@ class CellGoal(TargetGoal):
             points = np.concatenate([field.rest[None], field.region.draw(
                 _DRAWN, np.random.default_rng(0))])
             points = points[TargetGoal.distance(self, field, points) <= self.tolerance][:_ASKED]
-            found = self._asked(points, field.tip(points, self.target), None)
+            found = self._asked(points, field.tip(points, self.target), None)._sharpened(field)
         if len(found.refused) and not len(found.taken):
             raise self._refusal(found, field)
         return found
+
+    def _sharpened(self, field: EnergyField) -> Self:
+        """Return the goal with poses near its border: between each that does not do and the
+        nearest that does, where the target's place alone counts."""
+        if not len(self.taken) or not len(self.refused):
+            return self
+        chosen = _far_apart(self.refused, _PAIRS)
+        wrong = self.refused[chosen]
+        apart = np.linalg.norm(wrong[:, None] - self.taken[None], axis=2)
+        right = self.taken[apart.argmin(axis=1)]
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (wrong + right)
+            places = field.tip(middle, self.target)
+            does = np.array([self._does(place, None) for place in places])[:, None]
+            wrong, right = np.where(does, wrong, middle), np.where(does, middle, right)
+        return replace(self, taken=np.concatenate([self.taken, right]),
+                       refused=np.concatenate([self.refused, wrong]))
 
     def _of_states(self, field: EnergyField) -> Self:
         """Ask states of the branch model at samples of the field in the region, far apart."""
