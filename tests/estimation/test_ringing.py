@@ -1,10 +1,12 @@
 """Frequencies and damping of records whose vibrations are known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.estimation.vibration.ringing import identify
+from limber.estimation.vibration.ringing import identify, read_record
 
 
 def record(rng, *, frequencies=(2.3, 7.9), damping=(0.02, 0.03), size=(1.0, 0.4), noise=0.05,
@@ -49,3 +51,105 @@ def test_what_does_not_ring_is_told(change, told):
     times, channels = record(np.random.default_rng(3), **change)
     with pytest.raises(InputError, match=told):
         identify(times, channels, start=1.0)
+
+
+def decays(rng, *, starts=(1.0, 5.0, 9.0), frequency=5.0, ratio=0.03, sizes=None, noise=0.01,
+           seconds=14.0, rate=200.0, limit=None, offset=0.0):
+    """A branch that is plucked again and again; each pluck takes it over from what still rings."""
+    times = np.arange(0.0, seconds, 1 / rate)
+    omega, found = 2 * np.pi * frequency, np.zeros(len(times))
+    for start, size in zip(starts, sizes or [1.0] * len(starts), strict=True):
+        since = times - start
+        found = np.where(since >= 0, size * np.exp(-ratio * omega * since) * np.cos(
+            omega * np.sqrt(1 - ratio**2) * since), found)
+    found = offset + found + noise * rng.standard_normal(len(times))
+    return times, (found if limit is None else np.clip(found, -limit, limit))[:, None]
+
+
+@pytest.mark.parametrize(("change", "count"), [
+    ({}, 3), ({"starts": (0.5, 7.0)}, 2), ({"starts": (0.0, 7.0)}, 2),
+    ({"sizes": (1.0, 0.5, 0.8), "offset": 40.0}, 3), ({"starts": (2.0,)}, 1),
+    ({"starts": (1.0, 4.0, 7.0, 10.0), "frequency": 21.7, "ratio": 0.1, "rate": 533.0}, 4),
+    ({"starts": (1.0, 4.0, 7.0), "frequency": 2.0, "ratio": 0.08}, 3)])
+def test_each_of_several_plucks_is_used(change, count):
+    """Frequency and damping are right, and the number of plucks is stated."""
+    wanted = {"frequency": 5.0, "ratio": 0.03} | change
+    found = identify(*decays(np.random.default_rng(4), **change))
+    assert found.frequencies[0] == pytest.approx(wanted["frequency"], rel=3e-3)
+    assert found.damping[0] == pytest.approx(wanted["ratio"], rel=0.05)
+    low, high = found.damping_intervals[0]
+    assert 0 < low < found.damping[0] < high < 2 * low
+    assert len(found.pluck_frequencies) == (count if count > 1 else 0)
+    assert any(f"plucked {count} times" in text for text in found.warnings) == (count > 1)
+
+
+def test_several_plucks_tell_more_than_one():
+    """The mean of three decays is surer than each of them."""
+    once = identify(*decays(np.random.default_rng(5), starts=(1.0,), seconds=5.0, noise=0.05))
+    often = identify(*decays(np.random.default_rng(5), noise=0.05))
+    assert often.damping_deviations[0] < once.damping_deviations[0]
+
+
+@pytest.mark.parametrize("change", [{"starts": (1.0,)}, {}, {"sizes": (1.0, 0.4, 1.0)}])
+def test_what_a_sensor_cut_off_is_not_used(change):
+    """Clipped at half of its amplitude; the converter's steps at the turns are no clipping."""
+    found = identify(*decays(np.random.default_rng(6), limit=0.5, **change))
+    assert any("range was too small" in text for text in found.warnings)
+    assert found.frequencies[0] == pytest.approx(5.0, rel=2e-3)
+    assert found.damping[0] == pytest.approx(0.03, rel=0.03)
+    times, whole = decays(np.random.default_rng(6), **change)
+    rounded = identify(times, np.round(whole / 0.02) * 0.02)
+    assert not any("range" in text for text in rounded.warnings)
+
+
+def test_beats_are_no_plucks():
+    """Two close vibrations of one size swell again and again."""
+    found = identify(*record(np.random.default_rng(2), frequencies=(2.3, 2.5), damping=(2e-3, 2e-3),
+                             size=(1.0, 1.0), seconds=30.0, noise=0.02))
+    assert not found.pluck_frequencies and len(found.frequencies) == 2
+
+
+def test_plucks_of_a_branch_that_changed_are_named():
+    rng = np.random.default_rng(7)
+    one, two = (decays(rng, starts=(1.0,), frequency=f, seconds=6.0)[1] for f in (5.0, 5.2))
+    values = np.vstack([one, two])
+    found = identify(np.arange(len(values)) / 200.0, values)
+    assert any("different first frequencies: 5, 5.2 Hz" in text for text in found.warnings)
+
+
+REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
+
+
+@pytest.mark.parametrize(("name", "frequency", "ratio"), [
+    ("12-arduino-micros/arduino_ring.csv", 21.64, 0.004),
+    ("21-logger-ring/logger_ring.csv", 21.64, 0.004),
+    ("22-repeated-plucks/four_plucks.csv", 21.70, 0.10)])
+def test_reported_records(name, frequency, ratio):
+    """An Arduino's clock, a tree logger's columns, four plucks that the sensor cut off."""
+    if not (REPORTS / name).exists():
+        pytest.skip("the reports are not beside this checkout")
+    record = read_record(REPORTS / name)
+    found = identify(record.times, record.values)
+    assert found.frequencies[0] == pytest.approx(frequency, abs=0.01)
+    assert found.damping[0] == pytest.approx(ratio, rel=0.03)
+
+
+@pytest.mark.parametrize("stamp", [("TIMESTAMP", lambda k: f"2024-05-01 10:11:{k / 200:09.6f}"),
+                                   ("millis", lambda k: 5 * k + 1000),
+                                   ("Time (s)", lambda k: k / 200)])
+def test_the_readings_of_a_logger_are_found(tmp_path, stamp):
+    """Beside a counter, a drifting temperature, mains hum, noise and constant columns."""
+    rng = np.random.default_rng(9)
+    times, values = decays(rng, starts=(1.0,), seconds=8.0)
+    title, written = stamp
+    rows = [f"{title},record,temp,volt,hum,ax,ay,az,status"]
+    for k, (time, (value,)) in enumerate(zip(times, values, strict=True)):
+        rows.append(",".join(map(str, [
+            written(k), k, round(25 + 0.1 * np.sin(0.5 * time) + 0.01 * time, 4), 3.3,
+            round(np.sin(2 * np.pi * 50 * time), 4), round(9.8 + value, 5),
+            round(0.05 * rng.standard_normal(), 5), round(0.4 * value, 5), "OK"])))
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    record = read_record(tmp_path / "a.csv")
+    assert record.columns == ("ax", "az")
+    assert any("taken as readings, because they ring: ax, az" in text for text in record.warnings)
+    assert identify(record.times, record.values).frequencies[0] == pytest.approx(5.0, rel=2e-3)

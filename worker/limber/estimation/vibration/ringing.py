@@ -16,6 +16,7 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.present import present
+from limber.estimation.vibration.readings import cut_off, plucks, ringing_columns
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.importing.recording_formats import RECORDINGS
 from limber.recordings.tables import read_table, split_title, time_stream
@@ -32,6 +33,8 @@ _PERIODS = 60
 _LEAST_SHARE = 0.005
 """Of the record's power; a vibration below it is not taken for the first one."""
 _DAMPING = (1e-4, 0.5)
+_SAME, _CHANGED = 0.05, 0.03
+"""Plucks whose frequencies differ by less are of one vibration; by more, of a changed branch."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,10 @@ class Ringing:
         damping_deviations: Shape [k].
         shares: Of the record's power, shape [k].
         left_over: RMS of what they do not explain over that of the record.
-        start: When the decay that was used begins [s].
-        duration: [s].
+        start: When the decay that was used begins [s]; of several the first.
+        duration: Of all decays that were used [s].
+        pluck_frequencies: The first frequency of each decay, where there are several [Hz].
+        warnings: What of the record was not used.
     """
 
     frequencies: np.ndarray
@@ -57,12 +62,21 @@ class Ringing:
     left_over: float
     start: float
     duration: float
+    pluck_frequencies: tuple[float, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def damping_intervals(self) -> np.ndarray:
+        """95 % intervals of the damping, which is positive, shape [k, 2]."""
+        wide = 1.96 * self.damping_deviations / np.maximum(self.damping, 1e-12)
+        return self.damping[:, None] * np.exp(np.clip(wide, 0, 30)[:, None] * np.array([-1, 1]))
 
 
 def read_record(path: Path) -> Stream:
     """Read a record: a table of times and readings in any unit, or a C3D file's marker tracks.
 
-    Columns with gaps, such as those of a hidden marker, are discarded.
+    Columns with gaps, such as those of a hidden marker, are discarded, and those that do not ring
+    (:func:`.readings.ringing_columns`).
 
     Raises:
         InputError: it cannot be read, has no times or no readings, or its times do not ascend in
@@ -85,8 +99,8 @@ def read_record(path: Path) -> Stream:
         raise InputError(f"{path} has gaps that are far longer than its time steps.",
                          "The analysis needs uniform time steps.",
                          "Give a part of the record without gaps.")
-    return replace(stream, values=stream.values[:, used],
-                   columns=tuple(stream.columns[number] for number in used))
+    return ringing_columns(replace(stream, values=stream.values[:, used],
+                                   columns=tuple(stream.columns[number] for number in used)))
 
 
 def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None) -> Ringing:
@@ -95,20 +109,101 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     Args:
         times: [s], ascending, shape [n].
         channels: Displacements, accelerations or strains, shape [n, c].
-        start: Start of the free decay [s]. Default: the time of the largest motion.
+        start: Start of the free decay [s]. Default: the time of the largest motion. Where the
+            branch is plucked again, each decay is used.
 
     Raises:
         InputError: the record is too short, shows no free vibration, or is sampled too slowly.
     """
-    step = float(np.median(np.diff(times)))
     channels = channels / np.maximum(channels.std(axis=0), 1e-300)
+    begin = 0 if start is None else int(np.searchsorted(times, start))
+    if len(times) - begin < _LEAST_READINGS:
+        raise _too_short(len(times) - begin)
+    step = float(np.median(np.diff(times)))
+    period = 1 / (_peak(times[begin:], channels[begin:], step) * step)
+    cut = cut_off(channels, period)
     away = np.abs(channels - np.median(channels, axis=0)).max(axis=1)
-    first = int(np.argmax(away)) if start is None else int(np.searchsorted(times, start))
-    times, channels = times[first:], channels[first:] - channels[first:].mean(axis=0)
+    parts = plucks(channels[begin:], period)
+    found, failed = [], []
+    for number, (first, stop) in enumerate(parts):
+        first, stop = first + begin, min(stop + begin, len(times))
+        # From the largest motion, or from where the user says that it was released.
+        if start is None or number or first > begin:
+            first += int(np.argmax(away[first:stop]))
+        if cut[first:stop].any():
+            first += int(np.flatnonzero(cut[first:stop])[-1]) + 1
+        try:
+            found.append(_decay(times[first:stop], channels[first:stop], step))
+        except InputError as error:
+            failed.append(error)
+    if not found:
+        raise failed[0]
+    best = min(found, key=lambda one: float(one.frequency_deviations[0] / one.frequencies[0]))
+    alike = [one for one in found
+             if abs(one.frequencies[0] / best.frequencies[0] - 1) < _SAME]
+    return _told(_united(best, alike), len(parts), len(alike), int(cut.sum()))
+
+
+def _too_short(count: int) -> InputError:
+    return InputError(f"The record has {count} readings of a free decay.",
+                      f"At least {_LEAST_READINGS} are needed.",
+                      "Record longer, or state the start of the decay with --start.")
+
+
+def _told(found: Ringing, count: int, used: int, cut: int) -> Ringing:
+    """The vibrations, and what of the record the user should know."""
+    warnings = []
+    if count > 1:
+        others = "" if used == count else (
+            f" {count - used} of them are too short, too weak or of another frequency.")
+        warnings.append(f"The branch was plucked {count} times. {used} decays were used, each from "
+                        f"its largest motion, and their means taken.{others}")
+    if cut:
+        warnings.append(f"The sensor's range was too small for {cut} readings, which all have its "
+                        "largest value. Each decay was used from where its readings are whole.")
+    first = found.pluck_frequencies
+    if len(first) > 1 and np.ptp(first) > _CHANGED * found.frequencies[0]:
+        warnings.append("The plucks have different first frequencies: "
+                        f"{', '.join(f'{value:.4g}' for value in first)} Hz. The branch, or what "
+                        "holds it, changed between them.")
+    return replace(found, warnings=tuple(warnings))
+
+
+def _united(best: Ringing, found: list[Ringing]) -> Ringing:
+    """The weighted mean of several decays of one branch; one alone as it is."""
+    if len(found) == 1:
+        return best
+    columns = []
+    for frequency in best.frequencies:
+        near = [(one, int(np.argmin(np.abs(one.frequencies - frequency)))) for one in found]
+        same = [(one, k) for one, k in near
+                if abs(one.frequencies[k] - frequency) < _SAME * frequency]
+        columns.append((*_mean([(one.frequencies[k], one.frequency_deviations[k])
+                                for one, k in same]),
+                        *_mean([(one.damping[k], one.damping_deviations[k]) for one, k in same])))
+    frequencies, frequency_deviations, damping, damping_deviations = np.array(columns).T
+    return replace(
+        best, frequencies=frequencies, frequency_deviations=frequency_deviations, damping=damping,
+        damping_deviations=damping_deviations, start=found[0].start,
+        left_over=float(np.sqrt(np.mean([one.left_over**2 for one in found]))),
+        duration=float(sum(one.duration for one in found)),
+        pluck_frequencies=tuple(float(one.frequencies[0]) for one in found))
+
+
+def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
+    """The weighted mean of values with deviations, and its own: by those, or by the scatter."""
+    value, deviation = np.array(values).T
+    weight = 1 / np.maximum(deviation, 1e-9 * np.abs(value))**2
+    mean = float(weight @ value / weight.sum())
+    scatter = float(np.std(value, ddof=1) / np.sqrt(len(value))) if len(value) > 1 else 0.0
+    return mean, max(float(1 / np.sqrt(weight.sum())), scatter)
+
+
+def _decay(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
+    """The vibrations of one decay, which begins with the first reading."""
     if len(times) < _LEAST_READINGS:
-        raise InputError(f"The record has {len(times)} readings of a free decay.",
-                         f"At least {_LEAST_READINGS} are needed.",
-                         "Record longer, or state the start of the decay with --start.")
+        raise _too_short(len(times))
+    channels = channels - channels.mean(axis=0)
     guess = _peak(times, channels, step)
     used = times <= times[0] + _PERIODS / guess
     times, channels = times[used], channels[used] - channels[used].mean(axis=0)
@@ -123,8 +218,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
                          f"Decaying vibrations explain only {100 * (1 - found.left_over**2):.0f} "
                          "% of it.",
                          "Release the branch abruptly, and state the time of release with --start.")
-    return Ringing(**{**vars(found), "start": float(times[0]),
-                      "duration": float(times[-1] - times[0])})
+    return replace(found, start=float(times[0]), duration=float(times[-1] - times[0]))
 
 
 def _fitted(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:

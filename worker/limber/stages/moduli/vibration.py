@@ -68,7 +68,7 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
     Returns:
         ``young_pa`` (mean of the branch) with ``young_interval_pa`` (95 %) and ``young_factor``;
         ``frequencies_hz``, ``frequency_deviations_hz``, ``damping_ratios`` and
-        ``damping_ratio_deviations`` of the record; ``model_frequencies_hz`` with that modulus;
+        ``damping_ratio_deviations`` of the record, ``damping_ratio_intervals`` (95 %); ``model_frequencies_hz`` with that modulus;
         ``left_over``; ``damping_mass_per_s`` (0) and ``damping_stiffness_s``, which give the first
         vibration its damping.
 
@@ -92,6 +92,8 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
         if not force and branch.is_current("vibration", settings, digests=digests):
             return branch.manifest.stages["vibration"].result
         seen = identify(rung.times, rung.values, settings.start)
+        for text in seen.warnings:
+            progress.warn(text)
         progress(0.3, "modulus of that frequency")
         model = load_branch(branch, progress=progress).model
         told = young_of(_with_sensor(model, settings), seen, settings)
@@ -167,6 +169,7 @@ def _summary(seen: Ringing, told: dict[str, Any], level: float) -> dict[str, Any
         "young_factor": told["young_factor"], "young_deviation": told["deviation"],
         "frequencies_hz": seen.frequencies, "frequency_deviations_hz": seen.frequency_deviations,
         "damping_ratios": seen.damping, "damping_ratio_deviations": seen.damping_deviations,
+        "damping_ratio_intervals": seen.damping_intervals,
         "model_frequencies_hz": told["model_frequencies_hz"], "left_over": seen.left_over,
         "damping_mass_per_s": 0.0, "damping_stiffness_s": float(2 * seen.damping[0] / omega),
         "start_s": seen.start, "duration_s": seen.duration})
