@@ -25,6 +25,7 @@ from benchmarks.worker_hostile import HOSTILE_ROWS, hostile
 from benchmarks.worker_kills import KILLS_ROW, killed
 from benchmarks.worker_readers import READERS
 from benchmarks.worker_readme import README_ROW, run_readme
+from benchmarks.worker_reports import REPORT_ROWS, reported
 from benchmarks.worker_ringing import RINGING_ROW, rung
 
 TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
@@ -90,6 +91,7 @@ def _fuzzed(setting: Setting, names: tuple[str, ...] = tuple(READERS)) -> list[R
 PARTS = {
     "hostile": Part(_hostile, 60, HOSTILE_ROWS, grows=True),
     "fuzz": Part(_fuzzed, 60, (_FUZZED, *map(_fuzz_asked, READERS)), grows=True),
+    "readers": Part(reported, 120, REPORT_ROWS),
     "start-up": Part(_start_up, 15, tuple(_START_UP.values())),
     "exports": Part(exported, 60, EXPORT_ROWS, grows=True),
     "ringing": Part(rung, 30, (RINGING_ROW,), grows=True),

@@ -86,8 +86,8 @@ def _known(titles: list[Title]) -> list[Title]:
     plain = [title.plain for title in titles]
     if {"tx", "ty", "tz", "qx", "qy", "qz", "qw"} <= set(plain) and not {"x", "px"} & set(plain):
         # TUM's translation; with no quaternion it is a torque.
-        ours = {f"t{a}": f"p{a}" for a in "xyz"}
-        return [Title(ours.get(title.plain, title.name), title.unit) for title in titles]
+        places = {f"t{a}": f"p{a}" for a in "xyz"}
+        return [Title(places.get(title.plain, title.name), title.unit) for title in titles]
     renamed = list(titles)
     for name, aliases in _ALIASES.items():
         end = _IN_TOPICS.get(name)

@@ -7,7 +7,7 @@ import numpy as np
 from limber.recordings.time_series import Stream
 
 _BAND = 0.15
-"""Around a frequency, as a fraction of it: a vibration of a tenth of critical damping is so wide."""
+"""Around a frequency, as a fraction of it: as wide as a tenth of critical damping makes it."""
 _PROMINENT, _SHARE = 6.0, 0.1
 """Density of power in that band over that beside it, and the band's share of all of it."""
 _BURST = 2.0

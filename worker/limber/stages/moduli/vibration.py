@@ -68,7 +68,8 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
     Returns:
         ``young_pa`` (mean of the branch) with ``young_interval_pa`` (95 %) and ``young_factor``;
         ``frequencies_hz``, ``frequency_deviations_hz``, ``damping_ratios`` and
-        ``damping_ratio_deviations`` of the record, ``damping_ratio_intervals`` (95 %); ``model_frequencies_hz`` with that modulus;
+        ``damping_ratio_deviations`` of the record, ``damping_ratio_intervals`` (95 %);
+        ``model_frequencies_hz`` with that modulus;
         ``left_over``; ``damping_mass_per_s`` (0) and ``damping_stiffness_s``, which give the first
         vibration its damping.
 
