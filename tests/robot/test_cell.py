@@ -1,9 +1,13 @@
 """The cell file: round trip, frames, and errors that name line and field."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 import tomlkit
 
+from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell, read_cell, write_cell
@@ -151,3 +155,39 @@ def test_joint_limits_only_narrow_the_arms_own():
     wide = tuple((-9.0, 1.0) for _ in range(6))
     cell = Cell(robot={"model": "ur5", "joint_limits_rad": wide}, base={"pose": (0,) * 6})
     assert cell.joint_limits == pytest.approx(np.tile([-2 * np.pi, 1.0], (6, 1)))
+
+
+def test_a_new_cell_shows_every_section_and_key(tmp_path, capfd):
+    """As written, and with every example in force, it is a cell; an old file is kept."""
+    path = tmp_path / "new.toml"
+
+    def run(*options: str) -> int:
+        with pytest.raises(SystemExit) as stop:
+            command.main(["new-cell", str(path), *options], standalone_mode=False)
+        capfd.readouterr()
+        return stop.value.code
+    assert run("--model", "ur10", "--mass-kg", "1.1", "--gripper", "digital_output") == 0
+    cell = read_cell(path)
+    assert (cell.arm.name, cell.tool.mass_kg, cell.sensor.kind) == ("ur10", 1.1, "ft300")
+    assert cell.camera is cell.second_arm is cell.workspace is None and not cell.obstacles
+    text = path.read_text(encoding="utf-8")
+    assert run() == 2 and path.read_text(encoding="utf-8") == text
+    told = re.sub(r"^# (?=[a-z_]+ = |\[)", "", text, flags=re.MULTILINE)
+    path.write_text(told.replace('kind = "ft300"', 'kind = "replay"'), encoding="utf-8")
+    whole = read_cell(path)
+    assert whole.camera and whole.second_arm and whole.workspace and len(whole.obstacles) == 2
+    sections = set(Cell.model_fields) - {"branch", "calibrated"}
+    assert {f"[{name}]" for name in sections - {"format_version", "obstacles"}} <= set(
+        told.splitlines())
+    keys = set(re.findall(r"(\w+) = ", told))
+    schema = Cell.model_json_schema()
+    wanted = {key for entry in schema["$defs"].values() for key in entry["properties"]}
+    assert wanted <= keys
+
+
+def test_the_schema_of_a_cell_names_its_sections(capfd):
+    from limber.cli.commands.schema import command as schema
+
+    schema.main(["cell"], standalone_mode=False)
+    told = json.loads(capfd.readouterr().out)
+    assert {"robot", "sensor", "camera", "second_arm", "obstacles"} <= set(told["properties"])

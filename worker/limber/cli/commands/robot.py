@@ -5,6 +5,7 @@ import click
 from limber.cli.robot_commands.calibrate import calibrate
 from limber.cli.robot_commands.check import check
 from limber.cli.robot_commands.moves import goto_start, home, open_gripper, release, retreat
+from limber.cli.robot_commands.new_cell import new_cell
 from limber.cli.robot_commands.scan import scan
 
 
@@ -13,5 +14,5 @@ def command() -> None:
     """Check a robot, calibrate where it stands, and move it by itself."""
 
 
-for each in (scan, check, calibrate, home, goto_start, retreat, release, open_gripper):
+for each in (new_cell, check, calibrate, scan, home, goto_start, retreat, release, open_gripper):
     command.add_command(each)
