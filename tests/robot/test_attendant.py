@@ -1,6 +1,7 @@
 """What follows a stop: what was done and what force is left is told, also where nothing worked."""
 
 import json
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ class Link:
     def __init__(self, ends=None, left=0.0, gone=False):
         self._ends, self._left, self._gone = ends, left, gone
         self._force = 38.0
-        self.opened = False
+        self.opened = self.has_ended = False
 
     def retreat(self):
         if isinstance(self._ends, Exception):
@@ -68,6 +69,31 @@ def test_the_outcome_of_a_retreat_is_told(link, gripper, retreated, opened, told
     found = retreat_if_chosen(cell_with(gripper), link, "retreat", SILENT)
     assert found["retreated"] == retreated and found["gripper_opened"] == opened == link.opened
     assert told in found["outcome"]
+
+
+def test_where_the_driver_is_gone_another_takes_its_place(monkeypatch):
+    """It finds the way on disk; where nothing answers, the gripper's output is tried alone."""
+    gone, other, switched = Link(), Link(left=0.4), []
+    gone.has_ended = True
+
+    @contextmanager
+    def opened_link(cell):
+        yield other
+    monkeypatch.setattr("limber.robot.operator_decisions.RobotLink", opened_link)
+    found = retreat_if_chosen(cell_with("digital_output"), gone, "retreat", SILENT)
+    assert found["retreated"] and found["force_n"] == 0.4
+
+    def no_link(cell):
+        raise WorkError("No robot answers.")
+    monkeypatch.setattr("limber.robot.operator_decisions.RobotLink", no_link)
+    monkeypatch.setattr("limber.robot.operator_decisions.switch_output",
+                        lambda *arguments: switched.append(arguments))
+    found = retreat_if_chosen(cell_with("digital_output"), gone, "retreat", SILENT)
+    assert not found["retreated"] and found["gripper_opened"] and found["force_n"] is None
+    assert switched == [("127.0.0.1", 0, False)]
+    assert "none could take its place (No robot answers)" in found["outcome"]
+    assert "by hand" in retreat_if_chosen(cell_with("by_hand"), gone, "retreat",
+                                          SILENT)["outcome"]
 
 
 @pytest.mark.parametrize("choice", ["hold", "ask"])

@@ -37,6 +37,16 @@ def test_a_call_that_never_comes_back_is_told_as_a_safety_stop(resting_robot):
         link.process.send_signal(signal.SIGALRM)
         with pytest.raises(SafetyStop, match="did not answer its driver"):
             link.wait("stopped", seconds=5)
+    # The dashboard is tried once more, on a connection of its own.
+    assert any("dashboard was asked to stop" in each for each in link.warnings)
+    assert any("program stopped: dashboard" in line for line in resting_robot.state["log"])
+
+
+def test_a_driver_that_does_not_start_is_told_from_a_robot_that_is_silent(resting_robot,
+                                                                          monkeypatch):
+    monkeypatch.setattr("limber.robot.driver.link._CONNECT_SECONDS", 0.01)
+    with pytest.raises(WorkError, match=r"did not start within.*This computer is too busy"):
+        RobotLink(cell_for(resting_robot.address))
 
 
 def test_a_path_that_starts_elsewhere_is_refused(resting_robot):

@@ -9,18 +9,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from limber.core.errors import InputError, LimberError
-from limber.robot.driver.link import COLUMNS
+from limber.robot.driver.link import COLUMNS, RobotLink
 from limber.robot.observed import show_before_motion
+from limber.robot.ur.digital_output import switch_output
 
 if TYPE_CHECKING:
     from limber.core.progress import Progress
     from limber.robot.cell.cell import Cell
-    from limber.robot.driver.link import RobotLink
 
 AfterStop = Literal["ask", "hold", "retreat"]
 
 _FORCE = slice(COLUMNS.index("smooth_fx_n"), COLUMNS.index("smooth_fx_n") + 3)
 _FORCE_SECONDS = 1.0
+_CONNECTED_SECONDS = 5.0
 
 
 def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Progress) -> None:
@@ -61,9 +62,27 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
     if choice != "retreat":
         told |= {"force_n": _force_left(link)}
         return told | {"outcome": f"The arm holds where it stopped; {_left(told['force_n'])}."}
+    if not link.has_ended:
+        found = _gone_back(cell, link, progress)
+        if found["retreated"] or not link.has_ended:
+            return told | found
+    try:
+        # The driver of the link is gone. What it followed and its tare are on disk.
+        with RobotLink(cell) as other:
+            other.wait_for_samples(_CONNECTED_SECONDS)
+            return told | _gone_back(cell, other, progress)
+    except LimberError as error:
+        opened, how = _opened_without_driver(cell)
+        return told | {"choice": "retreat", "gripper_opened": opened, "force_n": None, "outcome":
+                       "The arm could not return: its driver has ended, and none could take its "
+                       f"place ({str(error).rstrip('.')}); {_left(None)}. {how}."}
+
+
+def _gone_back(cell: Cell, link: RobotLink, progress: Progress) -> dict[str, Any]:
+    """Go back; where that leaves a force over the soft limit, open the gripper."""
     event = _retreated(link)
     force = _force_left(link)
-    told |= {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
+    told = {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
     went = ("The arm returned along its path" if told["retreated"] else
             f"The arm could not return: {event['reason'].rstrip('.')}")
     if told["retreated"] and force is not None and force <= cell.limits.soft_force_n:
@@ -71,6 +90,18 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
     opened, how = _opened(cell, link, progress)
     told |= {"gripper_opened": opened, "force_n": _force_left(link)}
     return told | {"outcome": f"{went}; {_left(force)}. {how}; {_left(told['force_n'])}."}
+
+
+def _opened_without_driver(cell: Cell) -> tuple[bool, str]:
+    """Open the gripper by its output alone; returns whether that was done, and what was done."""
+    if cell.tool.gripper != "digital_output":
+        return False, f"Free the branch by hand (tool.gripper is {cell.tool.gripper})"
+    try:
+        switch_output(cell.robot.address, cell.tool.close_output, False)
+    except LimberError as error:
+        return False, (f"The gripper did not open ({str(error).rstrip('.')}): free the branch by "
+                       "hand")
+    return True, "The gripper was opened"
 
 
 def _retreated(link: RobotLink) -> dict[str, Any]:

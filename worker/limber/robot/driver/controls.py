@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, WorkError
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.ur_control import UrControl
 from limber.robot.interface import ArmControl
+from limber.robot.ur.samples import Dashboard
 
 _JOINTS = 6  # of which samples and recordings have columns
 
@@ -30,6 +31,28 @@ def register_control(kind: str, opened: Callable[[Cell], ArmControl]) -> None:
         opened: Takes the cell, connects to its controller, and raises if the arm cannot move now.
     """
     _CONTROLS[kind] = opened
+
+
+def stop_from_outside(cell: Cell, seconds: float) -> bool:
+    """Stop an arm whose driver has ended, by its controller's dashboard.
+
+    Args:
+        seconds: Longest wait for the connection [s].
+
+    Returns:
+        Whether the stop was sent; a controller of another kind has no such way.
+    """
+    if _CONTROLS.get(cell.arm.controller) not in (UrControl, _virtual):
+        return False
+    try:
+        dashboard = Dashboard(cell.robot.address, seconds)
+        try:
+            dashboard.stop()
+        finally:
+            dashboard.close()
+    except (WorkError, OSError):
+        return False
+    return True
 
 
 def control_of(cell: Cell) -> ArmControl:

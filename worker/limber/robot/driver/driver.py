@@ -42,6 +42,8 @@ def main() -> int:
     words = Words(os.fdopen(os.dup(1), "w", encoding="utf-8"))
     os.dup2(2, 1)
     driver: Driver | None = None
+    # From here on it is the robot that is waited for, not this computer.
+    words.tell(event="starting")
     try:
         driver = Driver(Cell.model_validate_json(sys.stdin.readline()), words)
         driver.tell(event="connected", **driver.facts)

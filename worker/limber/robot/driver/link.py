@@ -14,12 +14,14 @@ from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.json_lines import json_objects
 from limber.core.processes.ending import end_by_closing
 from limber.robot.cell.cell import Cell
+from limber.robot.driver.controls import stop_from_outside
 from limber.robot.driver.deadline import CALL_SECONDS, ended_by_deadline
 from limber.robot.motion.trajectory import Trajectory
 
 _CONNECT_SECONDS = 25.0
 _BEAT_SECONDS = 0.2
 _STANDS_SECONDS = 0.3
+_DASHBOARD_SECONDS = 0.5
 _LAST_WORDS_SECONDS = 1.0  # that are in the pipe still when the process has ended
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop}
 
@@ -57,7 +59,8 @@ class RobotLink:
         self._latest = np.empty(0)
         self._events: list[dict[str, Any]] = []
         self.warnings: list[str] = []
-        self._ended = False
+        self._ended = self._has_started = False
+        self._cell = cell
         command = [python or sys.executable, "-m", "limber.robot.driver.driver"]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                                         stderr=subprocess.DEVNULL, text=True, encoding="utf-8")
@@ -67,10 +70,20 @@ class RobotLink:
         threading.Thread(target=self._read, name="robot samples", daemon=True).start()
         try:
             self.facts = self.wait("connected", seconds=_CONNECT_SECONDS)
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if isinstance(error, WorkError) and not self._has_started:
+                raise WorkError(f"The robot's driver did not start within {_CONNECT_SECONDS:.0f} "
+                                "s; the robot was not asked yet.", "This computer is too busy, or "
+                                "its disk is slow: loading the driver takes about two seconds.",
+                                "End other programs and try again.") from error
             raise
         threading.Thread(target=self._beat, name="robot keep-alive", daemon=True).start()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether its process is gone; another link can then take its place."""
+        return self._ended
 
     def __enter__(self) -> "RobotLink":
         return self
@@ -250,8 +263,19 @@ class RobotLink:
                 self._sampled.set()
                 continue
             with self._news:
+                self._has_started = True
                 self._events.append(content)
                 self._news.notify_all()
         with self._news:
             self._ended = True
             self._news.notify_all()
+        if ended_by_deadline(self.process.wait()):
+            self._stop_from_outside()
+
+    def _stop_from_outside(self) -> None:
+        """The driver got no answer and could send no stop: try the dashboard anew."""
+        sent = stop_from_outside(self._cell, _DASHBOARD_SECONDS)
+        self.warnings.append("The driver got no answer from the controller. The dashboard was "
+                             "asked to stop the arm as well." if sent else
+                             "The driver got no answer from the controller, and the dashboard "
+                             "does not answer either: the arm's own watchdog has stopped it.")
