@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from . import annotations
+from . import annotations, goal_ball
 from .branches import (
     ENERGY_KEY,
     FOLDER_KEY,
@@ -32,7 +32,7 @@ from .skeleton_edits import Skeleton
 COLORS = {
     "path:plan": (0.78, 0.015, 0.06),
     "path:baseline": (0.01, 0.13, 0.62),
-    "goal": (0.02, 0.42, 0.08),
+    "goal": goal_ball.COLOUR,
     "grasp": (0.95, 0.25, 0.0),
     "control_points": (0.62, 0.02, 0.55),
     "targets": (0.75, 0.45, 0.0),
@@ -259,12 +259,7 @@ def _add_goal(shown: ShownBranch, data: SceneData) -> None:
     # Never smaller than what shall reach it; the legend says how near is near enough.
     least = 1.6 * data.arrays["grasp_radius"][0] if "grasp_radius" in data.arrays else (
         0.02 * data.info["size_m"])
-    ball = meshes.new_sphere("Goal", max(goal["radius_m"] or 0.0, least))
-    meshes.set_one_color(ball, COLORS["goal"])
-    material = materials.plain_material("Goal", COLORS["goal"], alpha=0.3)
-    thing = add_object(shown.collection, "Goal", ball, material)
-    thing.location = goal["centre_m"]
-    shown.objects["goal"] = [thing]
+    goal_ball.add(shown, goal["kind"], goal["centre_m"], max(goal["radius_m"] or 0.0, least))
 
 
 def _add_base(shown: ShownBranch, data: SceneData) -> None:

@@ -16,6 +16,9 @@ REGIONS = ("goal", "tip_goal", "target_box", "workspace_low")
 PLACES = {"fruit": (0.1,), "cut": ()}
 """Lists of places on the branch, and what stands behind a place: the mass [kg] of a fruit."""
 
+FIRST = {"plan": "energy"}
+"""What is run before a stage where the branch lacks it, or has it of an earlier shape."""
+
 
 class StepState(enum.Enum):
     """How far a stage is, with what the user reads and the icon beside it."""
@@ -48,7 +51,7 @@ class StageView:
 
 @dataclass(frozen=True)
 class Step:
-    """One panel: its first stage, and the groups of another that belong to it.
+    """One panel: its first stage. ``fields`` of it stand above its button, the rest is folded in.
 
     ``scene_operator`` stands instead of the stage's button where the step itself runs none.
     """
@@ -56,7 +59,7 @@ class Step:
     name: str
     title: str
     view: StageView
-    settings_of: tuple[StageView, ...] = ()
+    fields: tuple[str, ...] = ()
     scene_operator: tuple[str, str] = ()
     hint: str = ""
 
@@ -68,7 +71,7 @@ class Step:
 
 
 STEPS = (
-    Step("scan", "Scan", StageView("reconstruct", ("input",)),
+    Step("scan", "Scan", StageView("reconstruct", ("input",)), fields=("cloud", "unit"),
          scene_operator=("limber.import_cloud", "Import Scan")),
     Step("skeleton", "Skeleton", StageView("reconstruct", ("shape", "running"))),
     Step("mesh", "Mesh", StageView("reconstruct", ("mesh",)),
@@ -77,10 +80,9 @@ STEPS = (
          scene_operator=("limber.color_by", "Show Young's Modulus")),
     Step("pulls", "Pulls", StageView("import-pull")),
     Step("estimate", "Estimate", StageView("estimate")),
-    Step("goal", "Goal", StageView("energy"),
-         settings_of=(StageView("plan", ("start and goal",)),)),
-    Step("plan", "Plan", StageView("plan", (
-        "output", "weights and limits", "timing", "solver", "running"))),
+    Step("plan", "Plan", StageView("plan"),
+         fields=("goal", "max_detour", "max_force", "max_strain"),
+         hint="Samples the energy first where needed"),
     Step("robot", "Robot", StageView("execute"), hint="A dry run comes first and moves nothing"),
     Step("report", "Report", StageView("report")),
 )

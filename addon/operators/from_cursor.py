@@ -5,9 +5,12 @@ from typing import ClassVar
 import bpy
 from mathutils import Vector
 
-from .. import branches, properties
+from .. import branches, goal_ball, properties
 from ..stages import stages
 from ..steps import PLACES, REGIONS
+
+_BALLS = ("goal", "tip_goal")
+"""Regions that are a ball; the others are boxes."""
 
 
 class LIMBER_OT_from_cursor(bpy.types.Operator):
@@ -55,13 +58,19 @@ class LIMBER_OT_from_object(bpy.types.Operator):
     @classmethod
     def poll(cls, context):
         thing = context.active_object
-        if thing is None or branches.branch_of(thing) is not None:
+        if thing is None or (branches.branch_of(thing) is not None
+                             and goal_ball.place_of(thing) is None):
             cls.poll_message_set("Add an object that marks the region, and select it")
             return False
         return True
 
     def execute(self, context):
         thing, plan = context.active_object, context.scene.limber.plan
+        if (place := goal_ball.place_of(thing)) is not None and self.region in _BALLS:
+            # Its size is for the eye; the tolerance stays.
+            setattr(plan, self.region, place)
+            setattr(plan, properties.OPEN + self.region, True)
+            return {"FINISHED"}
         corners = [branches.in_branch(context.scene, thing.matrix_world @ Vector(corner))
                    for corner in thing.bound_box]
         low, high = (tuple(bound(corner[axis] for corner in corners) for axis in range(3))

@@ -6,6 +6,7 @@ import bpy
 
 from .. import branch_folder, branches, properties
 from ..stages import SettingError, Stage, stages
+from ..steps import FIRST
 from .needs_result import branch_property, check_identity, needed_folder
 from .worker_operator import WorkerOperator
 
@@ -70,6 +71,29 @@ class StageOperator(WorkerOperator):
         self._given = properties.arguments_of(context.scene, stage, str(self._folder))
         self._name = getattr(properties.group_of(context.scene, stage), "name", "")
         return self._given
+
+    def _start(self, context):
+        first = FIRST.get(self.stage_name, "")
+        if not first:
+            return super()._start(context)
+        try:
+            # What is wrong with the settings is said before anything runs.
+            self.arguments(context)
+            if self._lacks(context, stages()[first]):
+                how = "INVOKE_DEFAULT" if self._is_beside else "EXEC_DEFAULT"
+                getattr(bpy.ops.limber, properties.attribute_name(first))(
+                    how, branch_uuid=self.branch_uuid)
+        except (ValueError, OSError, RuntimeError) as error:
+            self.report({"ERROR"}, str(error))
+            return False
+        return super()._start(context)
+
+    def _lacks(self, context, stage: Stage) -> bool:
+        """Whether the branch has no result of a stage, or one of another input."""
+        record = branch_folder.read_record(self._folder)
+        entry = record and record.of(stage, properties.values_of(
+            properties.group_of(context.scene, stage), stage, {"name"}))
+        return record is not None and (entry is None or record.is_stale(stage, entry))
 
     def folder(self, context):
         return str(self._folder)

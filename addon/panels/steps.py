@@ -40,8 +40,9 @@ class StepPanel(SidebarPanel):
             layout.label(text=f"Branch: {branches.current_name(context.scene)}", icon="OUTLINER")
         if step.hint:
             layout.label(text=step.hint, icon="INFO")
-        if step.name == "scan":
-            _draw_fields(layout, context, view, names=("cloud", "unit"))
+        _draw_fields(layout, context, view, names=step.fields)
+        if step.name == "plan":
+            layout.operator("limber.place_goal", icon="SPHERE")
         elif step.name == "material":
             _draw_origin(layout, context)
             layout.operator_menu_enum("limber.material", "material", text="Known Materials")
@@ -57,9 +58,7 @@ class StepPanel(SidebarPanel):
             draw_robot(layout, context)
         if step.name == "report":
             layout.operator("limber.open_report", icon="URL")
-        _draw_groups(layout, context, view)
-        for more in step.settings_of:
-            _draw_groups(layout, context, more)
+        _draw_groups(layout, context, view, but=step.fields)
         for other in step.others:
             header, body = layout.panel(f"limber_{step.name}_{other.stage}", default_closed=True)
             header.label(text=stages()[other.stage].label,
@@ -165,12 +164,13 @@ def _draw_origin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
                  icon="CHECKMARK" if is_estimated else "QUESTION")
 
 
-def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView) -> None:
+def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView,
+                 but: tuple[str, ...] = ()) -> None:
     stage = stages()[view.stage]
     for title, fields in stage.groups().items():
         shown = [field for field in fields if not field.is_required
                  and (context.scene.limber.show_expert or not field.is_expert)
-                 and not (view.stage == "reconstruct" and field.name == "unit")]
+                 and field.name not in but]
         if not shown or (view.groups is not None and title not in view.groups):
             continue
         header, body = layout.panel(f"limber_{view.stage}_{title}", default_closed=True)

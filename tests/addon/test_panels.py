@@ -94,7 +94,7 @@ def panels(worker_here):
     return panel
 
 
-STEPS = ("scan", "skeleton", "mesh", "material", "pulls", "estimate", "goal", "plan", "robot",
+STEPS = ("scan", "skeleton", "mesh", "material", "pulls", "estimate", "plan", "robot",
          "report")
 
 
@@ -123,7 +123,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("scan", "limber.import_cloud", ()), ("skeleton", "limber.reconstruct", ()),
     ("mesh", "limber.reconstruct", ()), ("material", "limber.color_by", ()),
     ("pulls", "limber.import_pull", ()), ("estimate", "limber.estimate", ()),
-    ("goal", "limber.energy", ()), ("plan", "limber.plan", ()),
+    ("plan", "limber.place_goal", ("limber.plan",)),
     ("robot", "limber.execute", ("limber.arm",)),
     ("report", "limber.report", ("limber.open_report",))])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, first, more):
@@ -134,7 +134,8 @@ def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, first
         "limber.from_cursor", "limber.from_object")]
     others = [f"limber.{stage.name.replace('-', '_')}" for stage in stages.values()
               if stage.step == name]
-    assert shown == [first, *more, *(button for button in others if button != first)]
+    assert shown == [first, *more,
+                     *(button for button in others if button not in (first, *more))]
     step = _step(bpy, name).step
     common = drawn.names("prop")
     bpy.context.scene.limber.show_expert = True

@@ -4,6 +4,7 @@
 """
 
 import importlib
+import io
 import json
 import os
 import random
@@ -132,7 +133,7 @@ def quick_worker(worker_here, monkeypatch):
         path.write_text(json.dumps([*names, name]))
         job._lines.put(("out", json.dumps({"status": "done", "seconds": 0.0})))
         job._process, job._readers = type("Ended", (), {
-            "stdin": type("In", (), {"close": lambda self: None})(), "poll": lambda self: 0})(), []
+            "stdin": io.StringIO(), "poll": lambda self: 0})(), []
         job.state = jobs.JobState.RUNNING
         return None
     monkeypatch.setattr(jobs.Job, "launch", launch_here)

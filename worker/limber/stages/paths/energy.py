@@ -87,4 +87,4 @@ STAGE = StageDescription(
     writes=("energy.npz",),
     found=("{sample_count} poses solved, {rejected_count} rejected.",
            "Error of the field: energy {energy_error:share}, force {force_error:share}."),
-    then="limber plan {branch_folder}", step="goal", label="Sample the Energy")
+    then="limber plan {branch_folder}", step="plan", label="Sample the Energy")

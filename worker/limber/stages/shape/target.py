@@ -144,4 +144,4 @@ STAGE = StageDescription(
     key="target:{name}", reads=("mesh.vtu",), writes=("targets.json",),
     found=("{target} is at {position_m} m, {distance_m:m} from the branch, and weighs "
            "{mass_kg:kg}.",),
-    then="limber energy {branch_folder}", step="goal", label="Name a Target")
+    then="limber energy {branch_folder}", step="plan", label="Name a Target")

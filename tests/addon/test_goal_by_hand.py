@@ -1,0 +1,102 @@
+"""The goal's ball in the view and the goal of the plan are one; a plan samples what it lacks."""
+
+import importlib
+import io
+import json
+
+import pytest
+
+pytestmark = pytest.mark.usefixtures("worker_here")
+
+
+def part(name):
+    return importlib.import_module(f"limber_addon.{name}")
+
+
+@pytest.fixture()
+def ball(bpy, registered, beam):
+    """An opened branch with a plan, and the ball of its goal."""
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    surface = part("branches").find_surface(bpy.context.scene)
+    return part("goal_ball").of(part("branches").branch_of(surface))
+
+
+@pytest.mark.slow
+def test_moving_the_ball_moves_the_plans_goal(bpy, ball, monkeypatch):
+    """As G does; in the branch's frame where it was put aside. Then the plan is out of date."""
+    plan = bpy.context.scene.limber.plan
+    assert not plan.use_goal, "opening moves nothing"
+    plan.use_goal_seed = True
+    for thing in ball.users_collection[0].objects:
+        thing.delta_location = (2.0, 0.0, 0.0)
+    bpy.context.view_layer.update()
+    assert not plan.use_goal
+    ball.location = (0.1, 0.2, 0.3)
+    bpy.context.view_layer.update()
+    assert plan.use_goal and not plan.use_goal_seed
+    assert list(plan.goal) == pytest.approx([0.1, 0.2, 0.3])
+    stage = part("stages").stages()["plan"]
+    assert part("properties").differs(plan, stage, {"goal": [0.1, 0.2, 0.31]})
+    assert not part("properties").differs(plan, stage, {"goal": [0.1, 0.2, 0.3]})
+
+
+@pytest.mark.slow
+def test_the_ball_is_an_active_object_that_gives_the_goal(bpy, ball):
+    """From Active Object takes its place; the tolerance is not the size of what is seen."""
+    plan = bpy.context.scene.limber.plan
+    tolerance = plan.goal_tolerance
+    part("branches").activate(bpy.context.scene, ball)
+    assert bpy.ops.limber.from_object(region="goal") == {"FINISHED"}
+    assert list(plan.goal) == pytest.approx(list(ball.location))
+    assert plan.use_goal and plan.goal_tolerance == tolerance
+
+
+@pytest.mark.slow
+def test_a_branch_without_a_plan_gets_a_ball(bpy, registered, bare_beam):
+    """At the plan's goal; selected, so that G moves it. Pressed again, it is the same one."""
+    bpy.ops.limber.open_result(directory=str(bare_beam.folder))
+    scene = bpy.context.scene
+    scene.limber.plan.goal, scene.limber.plan.use_goal = (0.0, 0.1, 0.5), True
+    for _ in range(2):
+        assert bpy.ops.limber.place_goal() == {"FINISHED"}
+    balls = [thing for thing in bpy.data.objects if thing.name.startswith("Goal")]
+    assert balls == [bpy.context.view_layer.objects.active] and balls[0].select_get()
+    assert list(balls[0].location) == pytest.approx([0.0, 0.1, 0.5])
+
+
+@pytest.mark.slow
+def test_a_plan_samples_the_energy_that_it_lacks(bpy, registered, bare_beam, monkeypatch):
+    """Once, before it; nothing is sampled where it is there. Where it fails, no plan is begun."""
+    bpy.ops.limber.open_result(directory=str(bare_beam.folder))
+    jobs = part("jobs")
+    ran, code, launch = [], [0], jobs.Job.launch
+
+    def launch_here(job):
+        stage = job.command[job.command.index("limber") + 1]
+        if stage not in ("energy", "plan"):
+            return launch(job)
+        ran.append(stage)
+        if stage == "energy":
+            path = bare_beam.folder / "branch.json"
+            content = json.loads(path.read_text())
+            content["stages"]["energy"] = {"settings": {}, "reads": {}, "result": {},
+                                           "finished": "2030-01-01"}
+            path.write_text(json.dumps(content))
+        if not code[-1]:
+            job._lines.put(("out", json.dumps({"status": "done", "seconds": 0.0})))
+        job._process, job._readers = type("Ended", (), {
+            "stdin": io.StringIO(), "poll": lambda self: code[-1]})(), []
+        job.state = jobs.JobState.RUNNING
+        return None
+    monkeypatch.setattr(jobs.Job, "launch", launch_here)
+    for _ in range(2):
+        assert bpy.ops.limber.plan(name="first") == {"FINISHED"}
+    assert ran == ["energy", "plan", "plan"]
+    path = bare_beam.folder / "branch.json"
+    content = json.loads(path.read_text())
+    del content["stages"]["energy"]
+    path.write_text(json.dumps(content))
+    code.append(3)
+    with pytest.raises(RuntimeError, match="exit code 3"):
+        bpy.ops.limber.plan(name="first")
+    assert ran == ["energy", "plan", "plan", "energy"]
