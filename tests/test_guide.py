@@ -1,21 +1,30 @@
 """The guide builds without a warning, and explains every option and public name."""
 
+import datetime
+import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 
 ROOT = Path(__file__).parents[1]
+GUIDE = ROOT / "worker" / "docs"
 
 
 @pytest.mark.slow
 def test_the_guide_builds_without_a_warning(tmp_path):
-    """Warnings are errors: dead references, pages in no table of contents, bad tables."""
-    pytest.importorskip("sphinx", reason="the extra docs is not installed")
+    """Warnings are errors: dead references, pages in no table of contents, bad tables.
+
+    `scripts/docs` builds it with its tutorials and pictures executed.
+    """
+    pytest.importorskip("sphinx_gallery", reason="the extra docs is not installed")
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "-d",
-         tmp_path / "doctrees", ROOT / "worker" / "docs", tmp_path / "html"],
+         tmp_path / "doctrees", "-D", "run_commands=0", "-D", "plot_gallery=0",
+         GUIDE, tmp_path / "html"],
         capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     commands = (tmp_path / "html" / "reference" / "commands.html").read_text(encoding="utf-8")
@@ -29,3 +38,99 @@ def test_every_public_name_says_what_it_is():
     for name in limber.__all__:
         if name != "__version__":
             assert (getattr(limber, name).__doc__ or "").strip(), name
+
+
+@pytest.fixture
+def written_pages(monkeypatch) -> dict[str, str]:
+    """The pages that are written from code and data, by their path in the guide."""
+    monkeypatch.syspath_prepend(GUIDE)
+    import reference_tables
+
+    return reference_tables.pages()
+
+
+def test_every_option_of_help_is_explained(written_pages):
+    """What `limber COMMAND --help` lists has a row with a meaning in the page of commands."""
+    from limber.cli.main import main
+
+    page = written_pages["reference/commands.md"]
+    sections = dict(section.split("\n", 1) for section in re.split(r"^##+ limber ", page,
+                                                                  flags=re.MULTILINE)[1:])
+
+    def check(command: click.Command, words: str) -> int:
+        if isinstance(command, click.Group):
+            return sum(check(child, f"{words} {name}".strip())
+                       for name, child in command.commands.items())
+        told = command.get_help(click.Context(command, info_name=words))
+        seen = set(re.findall(r"^ +(?:-\w, )?(--[a-z][a-z-]*)", told, re.MULTILINE))
+        rows = {word: line.split(" | ")[1] for line in sections[words].splitlines()
+                if line.startswith("| `") for word in re.findall(r"--[a-z-]+", line.split(" | ")[0])}
+        lacking = [word for word in seen - {"--help", "--help-all"}
+                   if len(rows.get(word, "").split()) < 3]
+        assert not lacking, f"limber {words}: {lacking}"
+        return len(seen)
+    names = main.list_commands(click.Context(main))
+    found = [check(main.get_command(click.Context(main), name), name) for name in names]
+    assert sum(found) > 150
+
+
+def test_the_page_of_accuracy_is_that_of_its_data(written_pages):
+    """`scripts/docs` writes it; a new table in worker/docs/data needs it again."""
+    assert (GUIDE / "explanation" / "accuracy.md").read_text(encoding="utf-8") == (
+        written_pages["explanation/accuracy.md"])
+
+
+@pytest.mark.parametrize("path", sorted((GUIDE / "data").glob("*.json")), ids=lambda p: p.stem)
+def test_data_of_accuracy_say_where_they_are_from(path):
+    """Date, commit, seed and the number of trials: without them nobody can measure again."""
+    record = json.loads(path.read_text(encoding="utf-8"))
+    assert record["bench"] == path.stem and re.fullmatch(r"[0-9a-f]{10}", record["commit"])
+    assert datetime.date.fromisoformat(record["date"]) and record["seed"] >= 0
+    assert all(row["measure"] and row["measured"] for row in record["rows"] if row["count"])
+    assert any(row["count"] for row in record["rows"])
+
+
+def test_tutorials_are_executed_and_pictures_have_scripts():
+    """Seven tutorials whose commands run when the guide is built; twelve pictures."""
+    tutorials = sorted((GUIDE / "tutorials").glob("*.md"))
+    assert len(tutorials) >= 7
+    assert all("```{run}" in path.read_text(encoding="utf-8") for path in tutorials)
+    pictures = sorted((GUIDE / "gallery").glob("plot_*.py"))
+    assert len(pictures) >= 12
+    for path in pictures:
+        assert "plt.show()" in path.read_text(encoding="utf-8"), path.name
+
+
+PAGE = """# A
+
+```{file} say.py
+import sys
+print("said", 6 * 7)
+sys.exit(int(sys.argv[1]))
+```
+
+```{run}
+python say.py 0
+```
+
+```{run}
+:exit: 3
+python say.py 3
+python say.py 4
+```
+"""
+
+
+@pytest.mark.slow
+def test_a_tutorials_commands_run_and_must_end_as_stated(tmp_path):
+    """What they print is shown; another exit code is a warning, which fails `scripts/docs`."""
+    pytest.importorskip("sphinx", reason="the extra docs is not installed")
+    (tmp_path / "conf.py").write_text(f"import sys\nsys.path.insert(0, {str(GUIDE)!r})\n"
+                                      "extensions = ['myst_parser', 'executed_commands']\n")
+    (tmp_path / "index.md").write_text(PAGE, encoding="utf-8")
+    done = subprocess.run([sys.executable, "-m", "sphinx", "-q", "-b", "text", tmp_path,
+                           tmp_path / "out"], capture_output=True, text=True, check=False)
+    shown = (tmp_path / "out" / "index.txt").read_text(encoding="utf-8")
+    assert shown.count("said 42") == 3
+    assert "`python say.py 4` ended with exit code 4" in done.stderr
+    assert done.stderr.count("WARNING") == 1

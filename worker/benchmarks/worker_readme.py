@@ -23,7 +23,7 @@ _YOUNG_PA, _DENSITY, _LOAD_N = 3e5, 1070.0, 0.51
 
 def shown_commands(text: str) -> list[str]:
     """Return the lines of a README's code blocks that begin with limber, continued lines joined."""
-    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    blocks = re.findall(r"^```(?:[a-z]*|\{run\})\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
     return [line.split(" #")[0].strip() for line in lines if line.startswith("limber ")]
 

@@ -1,13 +1,15 @@
 """A Sphinx extension: reference pages written from the code, so that they cannot go stale.
 
 `commands.md` comes from the stages' schemas and the other commands' options; `pull_toml.md` and
-`cell_toml.md` from the models that read those files.
+`cell_toml.md` from the models that read those files; ``explanation/accuracy.md`` from the tables of
+the benches.
 """
 
 from pathlib import Path
 from typing import Any
 
 import click
+from accuracy_page import accuracy_page
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -16,7 +18,7 @@ HERE = Path(__file__).parent
 
 def setup(app: Any) -> dict[str, Any]:
     """Write the pages before Sphinx reads its sources."""
-    app.connect("builder-inited", lambda _app: write_pages(HERE / "reference"))
+    app.connect("builder-inited", lambda _app: write_pages(HERE))
     return {"parallel_read_safe": True}
 
 
@@ -29,16 +31,17 @@ def write_pages(folder: Path) -> None:
 
 
 def pages() -> dict[str, str]:
-    """Return the text of each generated page by its file name."""
+    """Return the text of each generated page by its path in the guide."""
     from limber.recordings.recording import PullEntry
     from limber.robot.cell.cell import Cell
 
     return {
-        "commands.md": commands_page(),
-        "pull_toml.md": _model_page("pull.toml", PullEntry, (
+        "explanation/accuracy.md": accuracy_page(),
+        "reference/commands.md": commands_page(),
+        "reference/pull_toml.md": _model_page("pull.toml", PullEntry, (
             "The settings of a recording, in `pulls/NAME/pull.toml`. `limber import-pull` and "
             "`limber record` write it; you may also write it by hand.")),
-        "cell_toml.md": _model_page("The cell file", Cell, (
+        "reference/cell_toml.md": _model_page("The cell file", Cell, (
             "`cell.toml` says which robot stands where, what it holds, and what it must not "
             "exceed. Lengths are in metres, angles in radians, masses in kilograms.")),
     }

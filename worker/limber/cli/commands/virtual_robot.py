@@ -17,7 +17,8 @@ from limber.cli.main import Run, stage_command
 @click.option("--model", default="ur5e", show_default=True,
               help="ur3, ur5, ur10 (125 Hz), ur3e, ur5e, ur10e, ur16e (500 Hz); or the URDF file "
                    "of another arm with six joints (500 Hz).")
-@click.option("--address", default="127.0.0.1", show_default=True, help="Loopback address.")
+@click.option("--address", default="127.0.0.1", show_default=True,
+              help="Loopback address on which the controller listens.")
 @click.option("--young", help="True Young's moduli of the branch [Pa], A,B,C,D.")
 @click.option("--joints", type=float, nargs=6, help="Initial joint angles [rad].")
 @click.option("--seed", default=0, show_default=True, help="Seed of the sensors' noise.")

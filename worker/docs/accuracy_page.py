@@ -1,0 +1,82 @@
+"""The page "How right is it", from the benches' own tables.
+
+``data/BENCH.json`` is the last line of ``scripts/bench BENCH --json``: rows with date, commit, seed
+and count. Nothing is written here by hand but what each bench measures against.
+"""
+
+import datetime
+import json
+from pathlib import Path
+from typing import Any
+
+DATA = Path(__file__).parent / "data"
+
+CHAPTERS = {
+    "scans": ("Skeletons, radii and volume", (
+        "Branches with known axes and radii are generated and scanned with noise, gaps and uneven "
+        "density, from all around, from one side or as one depth image. What is reconstructed is "
+        "held against the truth. `real scans` are a coffee tree branch, an apple tree and a "
+        "tomato seedling: there the truth is not known, so points and surface are compared.")),
+    "geometry": ("Skeletons against programs and real scans", (
+        "Generated branches again, and real scans on which other programs (TreeQSM, aRchi) have "
+        "published cylinder models.")),
+    "mechanics": ("Bending and motion", (
+        "The finite elements against solutions that are known: rigid motions, the elastica by "
+        "shooting, a manufactured solution for the order of convergence, a beam's frequency.")),
+    "estimation": ("Young's modulus", (
+        "Pulls are simulated on a finer mesh with known moduli and the noise of sensors, and the "
+        "moduli are estimated from them; `silicone_beam` is a recording of a real beam under a "
+        "weight.")),
+    "truth": ("Young's modulus where more is wrong", (
+        "As above, with all that a real cell does: wrong gain and zero of the force sensor, a "
+        "gripper and a camera that are off, drift, scans instead of the true shape. The intervals "
+        "must still hold the truth in 95 % of the cases.")),
+    "planning": ("Energy, force and paths", (
+        "The energy field on poses that it has not seen, the paths against an independent "
+        "optimum, the limits on the full model, and the certified bound.")),
+    "robot": ("The robot", (
+        "The real client library against the controller in software. No real robot was used.")),
+}
+"""What each bench is about, in the page's order."""
+
+
+def record(bench: str) -> dict[str, Any]:
+    """Return what a bench has found."""
+    return json.loads((DATA / f"{bench}.json").read_text(encoding="utf-8"))
+
+
+def accuracy_page() -> str:
+    """Return the page as MyST."""
+    parts = ["# How right is it\n", (
+        "These tables are what the project's own benches have measured. `asked` is the limit that "
+        "was set before, `met` compares the two, and `count` is the number of trials. A row that "
+        "a run had no time for is not listed. The page is written from `worker/docs/data` by "
+        "`scripts/docs`, and a test holds it to that.\n"), (
+        "`scripts/bench NAME` measures anew, with fresh seeds. `--seed` repeats a run. Times are "
+        "those of two shared cores.\n")]
+    for bench, (title, about) in CHAPTERS.items():
+        if (DATA / f"{bench}.json").is_file():
+            parts.extend(_chapter(bench, title, about))
+    parts += ["## What was not measured\n", (
+        "Wood in the field: no modulus of a real plant was compared with a test in a laboratory. "
+        "A real robot: nothing but the controller in software was moved. Leaves in the wind: the "
+        "drag is that of bare wood.\n")]
+    return "\n".join(parts)
+
+
+def _chapter(bench: str, title: str, about: str) -> list[str]:
+    found = record(bench)
+    rows = [row for row in found["rows"] if row["count"]]
+    date = datetime.date.fromisoformat(found["date"])
+    missing = len(found["rows"]) - len(rows)
+    told = (f"`scripts/bench {bench} --seed {found['seed']}`, {date:%-d %B %Y}, commit "
+            f"`{found['commit']}`, {found['budget_s'] / 60:.0f} minutes"
+            + (f"; {missing} rows had no time" if missing else "") + ".\n")
+    return [f"## {title}\n", f"{about}\n", told, "| measure | asked | measured | met | count |",
+            "|---|---|---|---|---|", *map(_row, rows), ""]
+
+
+def _row(row: dict[str, Any]) -> str:
+    met = {True: "yes", False: "**no**", None: ""}[row["met"]]
+    cells = (row["measure"], row["asked"], row["measured"], met, str(row["count"]))
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("<", "&lt;") for cell in cells) + " |"

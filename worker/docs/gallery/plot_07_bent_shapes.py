@@ -1,0 +1,49 @@
+"""
+A branch bent step by step
+==========================
+
+Equilibria with the grasp led aside, coloured by the largest principal strain. The grasp holds a
+position and leaves the branch free to turn in it; at each step it keeps the distance from the base
+that costs the least energy.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from branch_pictures import Camera, draw_surface, frame, outer_faces, per_face
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+
+import limber
+from limber.store import Branch
+from limber.store.loading import load_branch
+
+folder = "../../../blend_files/mature"
+field = limber.open(folder).results["energy"]
+loaded = load_branch(Branch.open(folder))
+grasp = loaded.marked_grasp("pinned")
+mesh, faces = loaded.mesh, outer_faces(loaded.mesh)
+
+base = mesh.nodes[mesh.point_data["fixed"] > 0].mean(0)
+arm = grasp.rest_pose[:3] - base
+scale, camera = ScalarMappable(Normalize(0, 4), "viridis"), Camera(azimuth=-5)
+figure, axes = plt.subplots(figsize=(7, 5.5), layout="constrained")
+shapes, state = [], None
+for angle in np.radians([0, 8, 16, 24]):
+    turned = [arm[0] * np.cos(angle) + arm[2] * np.sin(angle), arm[1],
+              arm[2] * np.cos(angle) - arm[0] * np.sin(angle)]
+    tried = base + np.linspace(0.93, 1.01, 161)[:, None] * turned
+    pose = grasp.rest_pose.copy()
+    if angle:
+        pose[:3] = tried[np.argmin(field.energy(tried))]
+    state = loaded.equilibrium(grasp, pose, start=state).require()
+    strain = 100 * loaded.model.largest_principal_strains(state.displacement)
+    shapes.append(mesh.nodes + state.displacement)
+    draw_surface(axes, camera, shapes[-1], faces,
+                 scale.to_rgba(per_face(mesh, faces, strain))[:, :3])
+    place = camera(state.pose[None, :3])[0][0]
+    axes.plot(*place, "o", ms=10, mfc="none", mec="#e08214", mew=2)
+    axes.annotate(f"{np.linalg.norm(state.reaction_force):.2f} N", place, xytext=(12, -4),
+                  textcoords="offset points")
+frame(axes, camera, *shapes)
+figure.colorbar(scale, label="largest principal strain [%]", shrink=0.8)
+plt.show()
