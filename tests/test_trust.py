@@ -41,7 +41,10 @@ def _changed(name: str, *path: object, value: object) -> bytes:
 
 
 @pytest.mark.parametrize(("name", "path", "value"), [
-    ("plans/to-goal.json", ["goal"], []), ("plans/to-goal.json", ["plan", "length_m"], "x"),
+    ("plans/to-goal.json", ["goal"], []), ("plans/to-goal.json", ["paths_on_field"], True),
+    ("plans/to-goal.json", ["detour"], True), ("plans/to-goal.json", ["certificate"], True),
+    ("plans/to-goal.json", ["energy_saved_percent"], "12"),
+    ("plans/to-goal.json", ["plan", "length_m"], "x"),
     ("frames/to-goal.json", ["rate"], -1), ("frames/to-goal.json", ["energies_j"], [1.0, None]),
     ("frames/to-goal.json", ["frame_count"], 10**30)])
 def test_json_of_plans_and_frames(damaged, name, path, value):
@@ -61,6 +64,7 @@ def test_files_of_noise(damaged, name):
 
 @pytest.mark.parametrize(("path", "value"), [
     (["fractions"], [0.2]), (["young_pa", 1], -5.0), (["covariance", 2], None),
+    (["covariance", 0, 0], "0.01"), (["young_pa", 0], True), (["loss_m2"], "1e-6"),
     (["poisson"], 3), (["groups", 0], 99), (["causes"], [1])])
 def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
     """`limber predict` and the report refuse it, and say where."""

@@ -232,3 +232,31 @@ def test_markers_in_another_unit_are_refused(branch_folder, capsys):
     line = estimated(branch_folder, capsys, "--pull", "millimetres", code=2)
     assert "another unit" in line["error"] and "--unit" in line["error"]
     assert (branch_folder / "mesh.vtu").read_bytes() == before
+
+
+@pytest.mark.parametrize(("table", "column", "value", "told"), [
+    ("robot.csv", 2, np.nan, "no row with a complete pose"),
+    ("robot.csv", 0, 1e308, "gripper's position reaches"),
+    ("robot.csv", 6, 1e200, "force reaches 1e+200 N"), ("robot.csv", 9, -1e30, "torque reaches"),
+    ("markers.csv", 1, 1e308, "marker's position reaches"),
+    ("markers.csv", 1, 1e200, "marker's position reaches 1e+200 m")])
+def test_impossible_columns_are_refused(bare_folder, tables, capsys, table, column, value, told):
+    """A column without a number, and numbers that no square can be taken of."""
+    def change(times, values):
+        values[:, column] = value
+        return times, values
+    changed(tables / table, change)
+    line = imported(bare_folder, tables, capsys, "--grasp-point", "0", "0", "0.2", code=2)
+    assert told in line["error"], line["error"]
+
+
+def test_a_recording_of_the_gripper_alone_is_no_estimate(branch_folder, capsys):
+    """Nothing was seen of the branch: one sentence says so."""
+    def change(source):
+        entry = (source / "pull.toml").read_text()
+        (source / "pull.toml").write_text("\n".join(
+            'observation = "none"' if row.startswith("observation") else row
+            for row in entry.splitlines()) + "\n")
+    pull_with(branch_folder, "alone", change)
+    line = estimated(branch_folder, capsys, "--pull", "alone", code=2)
+    assert "alone has nothing that was seen of the branch" in line["error"]

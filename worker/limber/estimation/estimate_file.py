@@ -145,5 +145,5 @@ def read_estimate(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read or is not an estimate. The message states the position.
     """
     content = read_json(path, "an estimate")
-    checked_as(path, _Estimate, content, "an estimate")
+    checked_as(path, _Estimate, content, "an estimate", strict=True)
     return content

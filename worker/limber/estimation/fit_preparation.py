@@ -38,7 +38,12 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
                 "positions are known.",
                 "Each observed point needs a rest position.",
                 "Give rest_points_m in pull.toml, or one value of --fractions for each marker.")
-        rest = rest if frames.positions.shape[1] else np.empty((0, 3))
+        if not frames.positions.shape[1]:
+            raise InputError(
+                f"{pull.name} has nothing that was seen of the branch, only what the gripper did.",
+                "An estimate compares how points of the branch moved.",
+                "Import it with the markers, depth images or clouds of the same time, or name "
+                "other pulls with --pull.")
         _check_rest(pull, frames, rest, progress)
         forwards.append(_forward(pull.name, entry, frames, rest, subject, settings))
     return forwards

@@ -108,11 +108,37 @@ class PlanBranchBound(_Told):
     gap_percent: float | None = None
 
 
+class PlanLevel(_Told):
+    """The bounds of one grid."""
+
+    spacing_m: float = Field(gt=0)
+    lower: float | None
+    upper: float | None
+
+
 class PlanCertificate(_Told):
     """The largest possible gap between the path and the best one."""
 
     gap_percent: float | None = None
+    levels: list[PlanLevel] = []
     full_model: PlanBranchBound | None = None
+
+
+class PlanTrade(_Told):
+    """The gentlest path found at one weight of its length."""
+
+    length_m: float
+    energy_integral_jm: float
+    lower_bound_jm: float | None
+    metre_jm: float
+
+
+class PlanDetour(_Told):
+    """How energy and length of the gentlest paths are traded."""
+
+    shortest_m: float
+    longest_m: float
+    curve: list[PlanTrade] = Field(min_length=1)
 
 
 class PlanInMotion(_Told):
@@ -139,6 +165,10 @@ class PlanSummary(_Told):
     plan: PathScores = PathScores()
     certificate: PlanCertificate | None = None
     in_motion: PlanInMotion | None = None
+    detour: PlanDetour | None = None
+    paths_on_field: dict[str, Any] | None = None
+    limits: dict[str, dict[str, float]] | None = None
+    targets: list[str] = []
     energy_saved_percent: float | None = None
     length_added_percent: float | None = None
     convergence: dict[str, list[PlanStep]] = {}
@@ -243,7 +273,7 @@ def read_plan(path: Path) -> PlanFile:
         motion = _way(content["motion"]) if version > 1 else None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _not_a_plan(path, f"{type(error).__name__}: {error}") from error
-    checked_as(path, PlanSummary, content, "a plan")
+    checked_as(path, PlanSummary, content, "a plan", strict=True)
     kept = {name: value for name, value in content.items() if name != "motion"}
     return PlanFile(version, kept, ways["baseline"], ways["plan"], motion)
 
@@ -255,7 +285,7 @@ def read_plan_summary(path: Path) -> dict[str, Any]:
         InputError: it is no plan, or damaged.
     """
     content = read_json(path, "a plan")
-    checked_as(path, PlanSummary, content, "a plan")
+    checked_as(path, PlanSummary, content, "a plan", strict=True)
     return content
 
 

@@ -160,6 +160,8 @@ def read_pull(folder: str | Path) -> Pull:
         robot = replace(robot, times=robot.times[~bad], warnings=(
             *robot.warnings,
             f"robot.csv: {bad.sum()} rows without a complete pose were discarded."))
+        if bad.all():
+            raise no_pose(folder / "robot.csv")
         poses, wrenches = poses[~bad], wrenches[~bad]
     warnings = list(robot.warnings)
     observations = None
@@ -168,6 +170,13 @@ def read_pull(folder: str | Path) -> Pull:
         observations = _marker_observations(folder / "markers.csv", markers)
         warnings += markers.warnings
     return Pull(folder.name, entry, robot.times, poses, wrenches, observations, tuple(warnings))
+
+
+def no_pose(path: Path) -> InputError:
+    """Return the refusal of a table in which no row has a complete pose of the gripper."""
+    return InputError(f"{path} has no row with a complete pose of the gripper.",
+                      "In each row one of x, y, z, rx, ry, rz is missing or no number.",
+                      "Export the recording again, with the gripper's position and rotation.")
 
 
 def write_pull(folder: str | Path, pull: Pull) -> None:

@@ -9,15 +9,22 @@ import numpy as np
 import scipy
 
 from limber.core.constants import FORCE_UNITS_N
+from limber.core.errors import InputError
 from limber.recordings.recording import Observations, Pull
 from limber.recordings.time_series import gaps, saturated, spikes
 
+_FARTHEST, _MOST_TURN, _MOST_FORCE = 1e4, 1e3, 1e6  # m of the branch, rad, N or N m
 PLAUSIBLE_YOUNG_PA = (2e4, 4e10)
 """From soft silicone to the stiffest dry wood: outside, the force is taken to be mis-scaled."""
 
 
 def clean(pull: Pull) -> Pull:
-    """Apply every check that needs no model."""
+    """Apply every check that needs no model.
+
+    Raises:
+        InputError: a position, force or torque is beyond anything that can be recorded.
+    """
+    _require_possible(pull)
     pull = _without_bad_readings(pull)
     pull = _tared(pull)
     pull = _with_right_sign(pull)
@@ -31,6 +38,23 @@ def clean(pull: Pull) -> Pull:
                                f"{frames}{' ...' if len(swaps) > 8 else ''}. The names were "
                                "corrected.")
     return pull
+
+
+def _require_possible(pull: Pull) -> None:
+    seen = None if pull.observations is None else pull.observations.positions
+    for what, values, most, unit in (
+            ("The gripper's position", pull.poses[:, :3], _FARTHEST, "m"),
+            ("The gripper's rotation", pull.poses[:, 3:], _MOST_TURN, "rad"),
+            ("The force", pull.wrenches[:, :3], _MOST_FORCE, "N"),
+            ("The torque", pull.wrenches[:, 3:], _MOST_FORCE, "N m"),
+            ("A marker's position", seen, _FARTHEST, "m")):
+        if values is None or not np.isfinite(values).any():
+            continue
+        if (largest := float(np.nanmax(np.abs(values)))) > most:
+            raise InputError(f"{pull.name}: {what[0].lower()}{what[1:]} reaches {largest:.3g} "
+                             f"{unit}.", f"No recording of a branch has more than {most:g} {unit}.",
+                             "Check the units of the recording, and whether its columns are what "
+                             "their titles say. Then import it again.")
 
 
 def work_done(pull: Pull) -> np.ndarray:

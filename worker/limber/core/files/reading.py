@@ -91,14 +91,22 @@ def read_json_as(path: str | os.PathLike, kind: type[Content], what: str) -> Con
     return checked_as(path, kind, read_json(path, what), what)
 
 
-def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what: str) -> Content:
+def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what: str, *,
+               strict: bool = False) -> Content:
     """Return what was read from ``path`` as ``kind``.
+
+    Args:
+        strict: Whether a number must be one in the file as well, no text and no true or false.
+            For content that is used as it was read.
 
     Raises:
         InputError: it is not of that kind; names the position.
     """
+    adapter = TypeAdapter(kind)
     try:
-        return TypeAdapter(kind).validate_python(content)
+        # Only JSON's own strictness takes a list for a tuple.
+        return (adapter.validate_json(json.dumps(content), strict=True) if strict
+                else adapter.validate_python(content))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"])

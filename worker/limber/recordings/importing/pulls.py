@@ -20,7 +20,14 @@ from limber.recordings.importing.recording_formats import (
     RecordingFormat,
     recording_format,
 )
-from limber.recordings.recording import Observations, Pull, PullEntry, write_entry, write_pull
+from limber.recordings.recording import (
+    Observations,
+    Pull,
+    PullEntry,
+    no_pose,
+    write_entry,
+    write_pull,
+)
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import estimate_offset
 from limber.recordings.time_series import Stream
@@ -124,6 +131,8 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
         messages = found
     robot: Stream = found if chosen.holds == "robot" else _gripper(request)
     poses, wrenches = (np.ascontiguousarray(part) for part in np.hsplit(robot.values, 2))
+    if not np.isfinite(poses).all(axis=1).any():
+        raise no_pose(request.source if chosen.holds == "robot" else Path(request.settings.robot))
     entry = request.entry(
         "none" if chosen.holds == "robot" else chosen.holds, rest, drive=settings.drive,
         mode=settings.grasp_mode, sigma=settings.position_sigma or 1e-3,

@@ -43,7 +43,7 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
     if moved := searched(plan.summary["convergence"]):
         shown.append((convergence(moved), "Cost of the best path so far over the planner's "
                                              "iterations, relative to the final cost."))
-    if plan.summary.get("certificate"):
+    if (plan.summary.get("certificate") or {}).get("levels"):
         if branch.has(f"plans/{name}-bound.npz"):
             bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
             shown.append((paths_over_bound(field, bound, plan), "Both paths over the lower bound "
@@ -51,7 +51,8 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
                           "gentlest path follows its steepest descent."))
         shown.append((certificate(plan), "Cost of the gentle path, and lower bound on the cost of "
                       "every path on the energy field, as the grid of the certificate is refined."))
-    if plan.summary.get("detour"):
+    if any(point["lower_bound_jm"] is not None
+           for point in (plan.summary.get("detour") or {}).get("curve", ())):
         shown.append((trade_off(plan), "Energy against length of the gentlest paths for several "
                       "weights of distance. No path is below the dashed line."))
     return shown
