@@ -1,5 +1,6 @@
 """Files of a branch folder with right checksums and wrong content: errors, never tracebacks."""
 
+import importlib
 import json
 import shutil
 from pathlib import Path
@@ -120,6 +121,25 @@ def test_options_are_finite_and_directions_have_a_length(name, value):
 
     with pytest.raises(InputError, match=f"--{name.replace('_', '-')}"):
         checked_settings(ReconstructSettings, {name: value})
+
+
+@pytest.mark.parametrize(("model", "values", "told"), [
+    ("geometry:ReconstructSettings", {"young": 9.0}, "for 9 GPa write 9e9"),
+    ("geometry:ReconstructSettings", {"density": 0.9}, "for 0.9 g/cm^3 write 900"),
+    ("geometry:MeshSurfaceSettings", {"young": 1e-300}, "between 1 kPa and 100 GPa"),
+    ("geometry:MeshSurfaceSettings", {"density": 1e5}, "between 50 and 3000"),
+    ("mechanics:SimulateSettings", {"young": 1e12}, "between 1 kPa and 100 GPa"),
+    ("estimation:EstimateSettings", {"young": 0.1}, "for 0.1 GPa write 0.1e9"),
+    ("estimation:EstimateSettings", {"density": 900e3}, "between 50 and 3000"),
+    ("estimation:SwingSettings", {"density": 1.1}, "for 1.1 g/cm^3 write 1100"),
+    ("estimation:VirtualPullSettings", {"young": (1e8, 9.0)}, "for 9 GPa write 9e9")])
+def test_moduli_and_densities_are_those_of_matter(model, values, told):
+    """GPa for Pa and g/cm^3 for kg/m^3: the likely slip is named."""
+    part, name = model.split(":")
+    settings = getattr(importlib.import_module(f"limber.{part}.settings"), name)
+    with pytest.raises(InputError) as refused:
+        checked_settings(settings, values)
+    assert told in str(refused.value)
 
 
 def test_lists_of_a_recording_stay_in_its_folder(tmp_path):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from limber.cli.main import call
-from limber.core.errors import InputError
+from limber.core.errors import Cancelled, InputError
+from limber.core.progress import Progress
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
-from limber.geometry.mesh_skeleton import body_format
+from limber.geometry.mesh_skeleton import body_format, mesh_model
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.stages.results.export import ExportSettings, export
 from limber.stages.shape.mesh import mesh_surface
@@ -34,6 +35,23 @@ def test_a_model_of_another_program_becomes_the_branch_again(tmp_path):
     np.testing.assert_allclose(other.nodes[-1] - other.nodes[0], one.nodes[-1] - one.nodes[0],
                                atol=1e-6)
     assert (load_branch(made).model.young == 2e8).all()
+
+
+def test_the_unit_of_a_model_is_asked_about(tmp_path):
+    """A skeleton in millimetres that was read as metres; and one of 1.7e18 m."""
+    told = []
+    for height in (719.0, 1.7e18):
+        path = tmp_path / "long.swc"
+        path.write_text(f"1 0 0 0 0 5 -1\n2 0 0 0 {0.5 * height} 5 1\n3 0 0 0 {height} 5 2\n")
+        with pytest.raises((InputError, Cancelled)) as stop:
+            mesh_model(path, MeshSurfaceSettings(), Progress(None, lambda text: _stop(told, text)))
+    assert "719 m long. Is its unit millimetres (--unit mm)" in told[0]
+    assert "1.7e+18 m long" in str(stop.value)
+
+
+def _stop(told, text):
+    told.append(text)
+    raise Cancelled
 
 
 def is_model(path):

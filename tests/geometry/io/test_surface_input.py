@@ -10,6 +10,7 @@ from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.geometry.io.surfaces import usable_surface
 from limber.geometry.mesh_surface import MeshSurfaceSettings
+from limber.geometry.plausible_size import size_doubts
 from limber.geometry.surface.surface import Surface
 from limber.stages.shape.mesh import mesh_surface
 
@@ -116,6 +117,14 @@ def test_a_wrong_unit_is_suspected(scale, text):
     whole = bar()
     _, warnings = usable_surface(Surface(whole.vertices * scale, whole.faces), FILE)
     assert text in warnings[0]
+
+
+def test_what_no_branch_can_be_is_refused():
+    """A mile of wood, or none: no mesh is begun."""
+    whole = bar()
+    for scale in (1e18, 1e-7):
+        with pytest.raises(InputError, match="No branch has this size"):
+            size_doubts(whole.vertices * scale, "surface")
 
 
 def test_refused_surfaces_leave_no_folder(tmp_path, capsys):

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from limber.core.files.reading import checked_as, read_json
 
 _Positive = Annotated[float, Field(gt=0)]
+_Modulus = Annotated[float, Field(ge=1.0, le=1e15)]
+"""[Pa], also of a fit that ended far from anything that a branch can have."""
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Maybe = float | None
 _Vector = tuple[float, float, float]
@@ -82,7 +84,7 @@ class _Truth(_Told):
 
 class _Estimate(_Told):
     method: str
-    young_pa: list[_Positive] = Field(min_length=1)
+    young_pa: list[_Modulus] = Field(min_length=1)
     young_mesh_pa: list[_Positive] | None = None
     young_interval_pa: list[tuple[_Maybe, _Maybe]]
     young_interval_sensor_pa: list[tuple[_Maybe, _Maybe]] | None = None

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import GraspMode, Groups, Settings
+from limber.core.settings import Density, GraspMode, Groups, Settings, Young
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,12 +40,12 @@ class EstimateSettings(Settings):
     fractions: tuple[float, ...] = Field(
         (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
             "main path.")
-    young: float | None = Field(
+    young: Young | None = Field(
         None, gt=0, description="Initial Young's modulus [Pa]. Default: from the measured force.")
     poisson: float | None = Field(
         None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --fit-poisson is "
             "given.")
-    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
+    density: Density | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     field: Literal["open", "inverse_distance"] = Field(
@@ -97,7 +97,7 @@ class SwingSettings(Settings):
     periods: float = Field(6.0, ge=2, le=30, description="Number of periods after the release "
         "that are used.")
     poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
-    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
+    density: Density | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     density_sigma: float = Field(
@@ -119,11 +119,11 @@ class VirtualPullSettings(Settings):
     }
     common = ("cell_errors", "seed")
 
-    young: tuple[float, ...] = Field(
+    young: tuple[Young, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
         "generated branch, or a gradient from 160 to 40 MPa.")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
+    density: Density = Field(900.0, gt=0, description="True density [kg/m^3].")
     motion: Literal["quasi_static", "dynamic"] = Field(
         "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
         "the branch; with --drive force it pulls and releases it.")

@@ -13,6 +13,7 @@ from limber.geometry.io.formats import Format, known_format
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
 from limber.geometry.io.surfaces import SURFACES
 from limber.geometry.mesh_surface import MeshedBody
+from limber.geometry.plausible_size import size_doubts
 from limber.geometry.reconstruction import gravity_after, mesh_skeleton
 from limber.geometry.sections import SECTIONS
 from limber.geometry.settings import MeshSurfaceSettings, ReconstructSettings
@@ -39,8 +40,8 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
         progress: Called as it goes; gets what the user should know.
 
     Raises:
-        InputError: it cannot be read, a radius is 0, or a root is given. MeshingError: it cannot
-            be meshed.
+        InputError: it cannot be read, a radius is 0, its size is no branch's, or a root is given.
+        MeshingError: it cannot be meshed.
     """
     if settings.root is not None:
         raise InputError("A root (--root) was given for a cylinder model.",
@@ -51,6 +52,8 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
         raise InputError(f"{int((given.radius <= 0).sum())} of {given.node_count} nodes of {path} "
                          "have radius 0.", "A branch has a thickness.",
                          "Give each node its radius.")
+    for text in size_doubts(given.nodes, "cylinder model"):
+        progress.warn(text)
     alignment, skeleton = _aligned(given, scale, settings)
     meshed = mesh_skeleton(skeleton, ReconstructSettings(
         young=settings.young, poisson=settings.poisson, density=settings.density,

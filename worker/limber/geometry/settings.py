@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Direction, Groups, Settings
+from limber.core.settings import Density, Direction, Groups, Settings, Young
 
 GRASP_FRACTION = 2.0 / 3.0
 """Where a branch is held, along its main path, if nothing is said."""
@@ -146,9 +146,9 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     twig_order: int = Field(
         9, ge=0, le=9, description="Leave twigs of a higher branching order out of the mesh, and "
             "keep their mass.")
-    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
+    young: Young = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
+    density: Density = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
     leaf_density: float = Field(
         0.2, ge=0, description="Mass of leaves per area of one side [kg/m^2].")
     grasp_fraction: float = Field(
@@ -178,9 +178,9 @@ class MeshSurfaceSettings(Settings):
     mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's limit of processor time "
                                    "[s].")
     mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
-    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
+    young: Young = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
+    density: Density = Field(900.0, gt=0, description="Density [kg/m^3].")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the axis.")
 

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import GraspMode, Groups, OneOf, Settings
+from limber.core.settings import GraspMode, Groups, OneOf, Settings, Young
 from limber.mechanics.materials.material_registry import material_names
 
 Point = tuple[float, float, float]
@@ -70,7 +70,7 @@ class SimulateSettings(Settings):
     lumped_mass: bool = Field(
         False, description="Lump the mass at the nodes instead of using the consistent mass "
             "matrix.")
-    young: float | None = Field(
+    young: Young | None = Field(
         None, gt=0, description="Young's modulus of the whole branch [Pa]. Default: the mesh's.")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")

@@ -8,13 +8,13 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Format, Registry
+from limber.geometry.plausible_size import size_doubts
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.surface_checks import crossings, pieces
 
 SURFACES = Registry("surface", "limber.surfaces", [
     Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])
 """Readers take ``scale``, the metres per unit."""
-_LONG, _SHORT = 60.0, 0.01  # [m]: no branch is longer or shorter
 _ROUNDED = 1e-5
 """Of the extent: numbers of five or six digits part vertices by as much."""
 
@@ -29,6 +29,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
     Raises:
         InputError: it has holes, edges of more than two faces, faces that point in and out,
             several bodies or cavities, no volume, or it intersects itself. Each states where.
+            Or it has a size that no branch has.
     """
     warnings = []
     corner = surface.faces
@@ -49,7 +50,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
                          "The surface of a solid must not intersect itself.",
                          "Unite its parts (in Blender: a Boolean modifier with Self), then mesh "
                          "the surface again.")
-    return surface, warnings + _unit_warnings(surface)
+    return surface, warnings + size_doubts(surface.vertices, "surface")
 
 
 def _welded(surface: Surface) -> tuple[Surface, list[str]]:
@@ -154,16 +155,6 @@ def _winding(surface: Surface, point: np.ndarray) -> float:
     under = (la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la
              + np.einsum("ij,ij->i", c, a) * lb)
     return float(np.arctan2(over, under).sum() / (2 * np.pi))
-
-
-def _unit_warnings(surface: Surface) -> list[str]:
-    size = float(np.ptp(surface.vertices, axis=0).max())
-    if size > _LONG:
-        return [f"The surface is {size:.0f} m long. Is its unit millimetres (--unit mm)?"]
-    if size < _SHORT:
-        return [f"The surface is {1000 * size:.2g} mm long. Is its unit correct (--unit m, cm, "
-                "mm, in)?"]
-    return []
 
 
 def _place(point: np.ndarray) -> str:

@@ -14,6 +14,9 @@ HEIGHTS = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9)
 """Shares of the main path's length at which diameters are given."""
 
 
+_THICKEST = 3.0  # m
+
+
 @dataclass(frozen=True)
 class Caliper:
     """One measured diameter.
@@ -117,6 +120,10 @@ def read_calipers(path: Path) -> list[Caliper]:
             raise InputError(f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} "
                              "m.", "A diameter must be positive, and both values must be finite.",
                              "Correct that line.")
+        if one.diameter > _THICKEST:
+            raise InputError(f"{path}, line {number}: a diameter of {one.diameter:g} m.",
+                             f"No branch is thicker than {_THICKEST:g} m; the column is in "
+                             "millimetres.", "Correct that line.")
     return values
 
 

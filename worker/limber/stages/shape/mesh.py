@@ -52,6 +52,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     from limber.core.constants import UNIT_METRES
     from limber.geometry.mesh_skeleton import body_format, mesh_model
     from limber.geometry.mesh_surface import mesh_body
+    from limber.geometry.plausible_size import size_doubts
     from limber.geometry.sections import SECTIONS, mesh_sections, read_sections
 
     settings = settings or MeshSurfaceSettings()
@@ -63,6 +64,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         progress = progress.keeping(warnings)
     elif chosen is SECTIONS:
         drawn = read_sections(path, settings.unit)
+        warnings += size_doubts(drawn.axis, "axis of the sections")
     else:
         surface, warnings = usable_surface(
             SURFACES.read_as(chosen, path, scale=UNIT_METRES[settings.unit]), path)
