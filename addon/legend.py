@@ -1,4 +1,10 @@
-"""The legend of a picture: text and colour keys that stand still before the camera."""
+"""The legend of a picture: text and colour keys that stand still before the camera.
+
+It has a margin of its own: lines are broken where it ends, and what is too long for the picture's
+height is made smaller as a whole.
+"""
+
+import textwrap
 
 import bpy
 from mathutils import Vector
@@ -7,6 +13,7 @@ from .branches import ShownBranch, add_object
 from .bridge import materials, meshes
 from .scene import COLORS
 from .scene_data import SceneData
+from .studio import LEGEND_SHARE, PAPER
 
 # In picture heights.
 _MARGIN = 0.04
@@ -15,6 +22,10 @@ _TEXT = 0.027
 _LINE = 0.044
 _BAR_WIDTH = 0.032
 _BAR_HEIGHT = 0.26
+_BROKEN = 1.3
+"""Distance of the lines of a broken text in heights of the text."""
+_LETTER = 0.41
+"""Mean width of a letter in heights of the text."""
 
 
 class _Sheet:
@@ -31,6 +42,7 @@ class _Sheet:
         left = min(corner.x for corner in corners)
         top = max(corner.y for corner in corners)
         self.unit = top - min(corner.y for corner in corners)
+        self.width = LEGEND_SHARE * (max(corner.x for corner in corners) - left) / self.unit
         self.corner = Vector((left, top, -depth))
         self.x, self.y = _MARGIN, _MARGIN
         self.ink = materials.flat_material("Legend ink", (0.012, 0.014, 0.018))
@@ -41,19 +53,42 @@ class _Sheet:
         thing = add_object(self.collection, name, data, material)
         thing.parent = self.camera
         thing.location = self.corner + Vector((x, -y, 0.0)) * self.unit
-        for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
-            setattr(thing, f"visible_{ray}", False)
+        _hide_from_light(thing)
         return thing
 
     def text(self, words: str, *, size: float = _TEXT, x: float = 0.0, y: float | None = None,
              ) -> None:
-        """Write ``words`` with their upper edge at ``y``."""
-        curve = bpy.data.curves.new(f"Legend {words[:20]}", "FONT")
-        curve.body = words
-        curve.size = size * self.unit
-        curve.align_y = "CENTER"
-        middle = (self.y if y is None else y) + size / 2
-        self.put(f"Legend: {words[:40]}", curve, self.ink, self.x + x, middle)
+        """Write ``words`` with their upper edge at ``y``, or at the current line; more lines than
+        one push the current line down."""
+        top = self.y if y is None else y
+        letters = max(8, int((self.width - self.x - x) / (_LETTER * size)))
+        for number, line in enumerate(textwrap.wrap(words, letters)):
+            curve = bpy.data.curves.new(f"Legend {line[:20]}", "FONT")
+            curve.body = line
+            curve.size = size * self.unit
+            curve.align_y = "CENTER"
+            middle = top + number * _BROKEN * size + size / 2
+            self.put(f"Legend: {line[:40]}", curve, self.ink, self.x + x, middle)
+            if number:
+                self.y += _BROKEN * size
+
+    def fit(self) -> None:
+        """Make everything smaller, where it would not end within the picture."""
+        share = min(1.0, (1.0 - 1.5 * _MARGIN) / self.y)
+        for thing in self.collection.objects:
+            thing.location = self.corner + (thing.location - self.corner) * share
+            thing.scale = (share, share, share)
+
+    def ground(self) -> None:
+        """Lay paper behind all of it: what reaches into the margin ends there."""
+        behind = 1.1
+        mesh = meshes.new_rectangle("Legend ground", behind * self.width * self.unit,
+                                    behind * self.unit)
+        thing = add_object(self.collection, "Legend ground", mesh,
+                           materials.flat_material("Legend ground", PAPER))
+        thing.parent = self.camera
+        thing.location = behind * (self.corner + Vector((0.0, -self.unit, 0.0)))
+        _hide_from_light(thing)
 
     def swatch(self, color: tuple[float, float, float], width: float, height: float) -> None:
         """Lay a bar of one colour on the current line."""
@@ -61,6 +96,12 @@ class _Sheet:
         material = materials.flat_material("Legend key", color)
         self.put("Legend key", mesh, material, self.x + (0.05 - width) / 2,
                  self.y + _TEXT / 2 + height / 2)
+
+
+def _hide_from_light(thing: bpy.types.Object) -> None:
+    """Let a thing be seen by the camera alone, without shadow or reflection."""
+    for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(thing, f"visible_{ray}", False)
 
 
 def add_legend(scene: bpy.types.Scene, camera: bpy.types.Object, data: SceneData,
@@ -77,6 +118,9 @@ def add_legend(scene: bpy.types.Scene, camera: bpy.types.Object, data: SceneData
         if shown.surface.data.materials[0].name.endswith(scale["title"]):
             _add_color_bar(sheet, name, scale)
     _add_keys(sheet, data, shown)
+    sheet.fit()
+    if "robot" in shown.objects:
+        sheet.ground()
     return sheet.collection
 
 
@@ -95,7 +139,7 @@ def _add_color_bar(sheet: _Sheet, name: str, scale: dict) -> None:
 
 def _goal_words(goal: dict) -> str:
     words = f"goal of the {goal.get('kind', 'grasp')}"
-    return f"{words}, within {100 * goal['radius_m']:.3g} cm" if goal.get("radius_m") else words
+    return f"{words}, within {1000 * goal['radius_m']:.3g} mm" if goal.get("radius_m") else words
 
 
 def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
@@ -106,7 +150,9 @@ def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
              ("grasp", "grasp", "", dot),
              ("targets", ", ".join(data.info.get("targets") or ()), "", dot),
              ("control_points", "control points", "", dot),
-             ("observed", "measured in the pull", "", dot), ("rest", "rest shape", "", dot),
+             ("observed", "measured in the pull", "", dot),
+             ("robot", f"robot {(data.info.get('robot') or {}).get('name', '')}", "", dot),
+             ("rest", "rest shape", "", dot),
              ("base", "fixed base", "", dot)]
     for name, words, note, (width, height) in keys:
         if name not in shown.objects:
@@ -115,5 +161,6 @@ def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
         sheet.text(words, x=0.066)
         sheet.y += _LINE
         if note:
-            sheet.text(note, x=0.066, y=sheet.y - 0.2 * _LINE)
-            sheet.y += 0.9 * _LINE
+            sheet.y -= 0.2 * _LINE
+            sheet.text(note, x=0.066)
+            sheet.y += 1.1 * _LINE

@@ -278,24 +278,23 @@ def _add_base(shown: ShownBranch, data: SceneData) -> None:
 
 
 def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
-    """Add the arm, a rod a link, moving along with the frames."""
-    if "robot_links" not in data.arrays:
+    """Add arm and gripper, a rod with round ends a link, moving along with the frames."""
+    if "robot_starts" not in data.arrays:
         return
-    links, radius = data.arrays["robot_links"], float(data.arrays["robot_radius"][0])
-    title = f"Robot {data.info.get('robot', '')}".strip()
+    starts, ends = data.arrays["robot_starts"], data.arrays["robot_ends"]
+    title = f"Robot {data.info['robot']['name']}"
     material = materials.plain_material(title, COLORS["robot"], roughness=0.5)
     shown.objects["robot"] = []
-    for number in range(links.shape[1] - 1):
-        ends = links[:, number], links[:, number + 1]
-        length = math.dist(ends[0][0], ends[1][0])
+    for number, radius in enumerate(data.arrays["robot_radii"].tolist()):
+        reach = starts[:, number], ends[:, number]
+        length = math.dist(reach[0][0], reach[1][0])
         if length < radius / 4:
-            # Two joints whose axes meet: there is no link to be seen.
+            # Two joints whose axes meet: the round ends beside it are all there is to see.
             continue
-        thin = radius if number < 3 else 0.7 * radius
-        rod = meshes.new_cylinder(f"{title} link {number + 1}", thin, length)
+        rod = meshes.new_capsule(f"{title} link {number + 1}", radius, length)
         meshes.set_one_color(rod, COLORS["robot"])
         thing = add_object(shown.collection, f"{title} link {number + 1}", rod, material)
-        animation.move_between(thing, *ends, speed=speed)
+        animation.move_between(thing, *reach, speed=speed)
         shown.objects["robot"].append(thing)
 
 

@@ -41,7 +41,7 @@ _SHAPES = {
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
     "observation_motion": "sm3 r", "observation_seen": "sm b",
     "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
-    "robot_links": "sl3 r", "robot_radius": "1 r",
+    "robot_starts": "sl3 r", "robot_ends": "sl3 r", "robot_radii": "l r",
     "view_points": "w3 r", "view_direction": "3 r"}
 _NEEDED = ("vertices", "faces", "view_points", "view_direction")
 _NEEDED_INFO = {"name": str, "folder": str, "scalars": dict, "paths": dict, "notes": list,

@@ -12,7 +12,11 @@ from .bridge import materials, meshes
 from .scene_data import SceneData
 
 # Share of the picture's width that is kept free on the left, for the legend.
-LEGEND_SHARE = 0.30
+LEGEND_SHARE = 0.36
+
+
+PAPER = (0.779, 0.8075, 0.836)
+"""Linear colour behind the branch, and of the legend's own ground."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,8 @@ def _set_world(scene: bpy.types.Scene) -> None:
     compat.use_nodes(world)
     world.cycles.sampling_method = "NONE"
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
-    background.inputs["Color"].default_value = (0.82, 0.85, 0.88, 1.0)
-    background.inputs["Strength"].default_value = 0.95
+    background.inputs["Color"].default_value = (*PAPER, 1.0)
+    background.inputs["Strength"].default_value = 1.0
 
 
 def _add_ground(collection: bpy.types.Collection, data: SceneData) -> np.ndarray:

@@ -146,6 +146,19 @@ def new_cylinder(name: str, radius: float, height: float) -> bpy.types.Mesh:
         mesh, cap_ends=True, segments=64, radius1=radius, radius2=radius, depth=height))
 
 
+def new_capsule(name: str, radius: float, length: float) -> bpy.types.Mesh:
+    """Make a rod with round ends along z, ``length`` [m] between the middles of its two ends.
+
+    The ends are half balls of ``radius`` [m], so that rods that meet at any angle join smoothly.
+    """
+    def make(builder: bmesh.types.BMesh) -> None:
+        bmesh.ops.create_uvsphere(builder, u_segments=48, v_segments=24, radius=radius)
+        for vertex in builder.verts:
+            # The ring about the middle goes to the upper end: the faces below it make the rod.
+            vertex.co.z += length / 2 if vertex.co.z > -1e-6 * radius else -length / 2
+    return _primitive(name, make)
+
+
 def new_rectangle(name: str, width: float, height: float) -> bpy.types.Mesh:
     """Make a rectangle in the xy plane, its lower left corner at the origin [m].
 

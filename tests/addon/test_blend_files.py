@@ -42,7 +42,7 @@ def test_example_plays(bpy, addon, path):
         np.testing.assert_allclose(found.reshape(-1, 3), frames[number], atol=1e-6)
     assert np.ptp(frames, axis=0).max() > 0.03, "it moves by centimetres"
     names = set(scene.objects.keys())
-    assert {"gentle path", "RRT* path", "Goal", "Grasp 1", "Fixed base", "Camera"} <= names
+    assert {"gentle path", "shortest path", "Goal", "Grasp 1", "Fixed base", "Camera"} <= names
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)

@@ -78,13 +78,13 @@ def test_content(bpy, addon, beam, tmp_path):
     red = colours.reshape(-1, 4)[:, 0]
     assert red[young.argmax()] > 0.8, "stiffest: yellow"
     assert red[young.argmin()] < 0.1, "softest: violet"
-    tube = meshes.positions(objects["D-RRT* path"].data)
+    tube = meshes.positions(objects["gentle path"].data)
     away = np.linalg.norm(tube[:, None] - beam.path, axis=2)
     radius = away.min()
     np.testing.assert_allclose(away.min(axis=0), radius, rtol=0.05)
     np.testing.assert_allclose(away.min(axis=1), radius, rtol=0.05)
     assert 0.001 < radius < 0.004
-    assert objects["RRT* path"].active_material != objects["D-RRT* path"].active_material
+    assert objects["shortest path"].active_material != objects["gentle path"].active_material
     tree = objects["D-RRT* tree"].data
     np.testing.assert_allclose(meshes.positions(tree), beam.path, atol=1e-6)
     assert [tuple(edge.vertices) for edge in tree.edges] == [
@@ -253,10 +253,11 @@ def test_command_makes_scene_and_picture(bpy, beam, tmp_path, capsys):
     assert result["frame_count"] == len(beam.frames)
     bpy.ops.wm.open_mainfile(filepath=str(scene))
     names = set(bpy.data.objects.keys())
-    assert {"beam", "D-RRT* path", "RRT* path", "Goal", "Camera", "Ground", "Fixed base"} <= names
+    assert {"beam", "gentle path", "shortest path", "Goal", "Camera", "Ground",
+            "Fixed base"} <= names
     texts = [thing.data.body for thing in bpy.data.objects if thing.type == "FONT"]
     assert any(text.endswith("MPa") for text in texts)
-    assert {"D-RRT* path", "RRT* path", "control points"} <= set(texts)
+    assert {"gentle path", "shortest path", "control points"} <= set(texts)
     assert bpy.context.scene.render.filepath.endswith("scene.png")
     pixels = np.asarray(Image.open(picture).convert("RGB"), float)
     assert pixels.shape == (420, 560, 3)
@@ -301,7 +302,8 @@ def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
 
 
 def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
-    """A rod for each link reaches from joint to joint in every frame; too short ones are left out.
+    """A rod for each link reaches from end to end in every frame; too short ones are left out.
+    Its ends are round, so that rods that meet have no gap.
     """
     from mathutils import Vector
 
@@ -318,8 +320,9 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
     norms = np.linalg.norm(steps, axis=2)
     steps *= np.divide(lengths, norms, out=np.zeros_like(norms), where=norms > 0)[..., None]
     links = np.concatenate([links[:, :1], links[:, :1] + np.cumsum(steps, axis=1)], axis=1)
-    shown_data.arrays |= {"robot_links": links, "robot_radius": np.array([0.03])}
-    shown_data.info["robot"] = "ur5e"
+    shown_data.arrays |= {"robot_starts": links[:, :-1], "robot_ends": links[:, 1:],
+                          "robot_radii": np.full(7, 0.03)}
+    shown_data.info["robot"] = {"name": "ur5e", "gripper_rods": 3}
     shown_data.write(tmp_path / "data.npz")
     scenes = importlib.import_module("limber_addon.scene")
     reader = importlib.import_module("limber_addon.scene_data")
@@ -332,6 +335,38 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
             half = np.linalg.norm(links[0, number + 1] - links[0, number]) / 2
             ends = [np.array(rod.matrix_world @ Vector((0, 0, side * half))) for side in (-1, 1)]
             np.testing.assert_allclose(ends, links[frame - 1, number:number + 2], atol=1e-5)
+            top = max(vertex.co.z for vertex in rod.data.vertices)
+            assert top == pytest.approx(half + 0.03, abs=1e-5)
+
+
+def test_a_long_legend_keeps_to_its_margin_and_height(bpy, addon, beam, tmp_path):
+    """Lines break where the margin ends; all is smaller where it would leave the picture below."""
+    from mathutils import Vector
+
+    from limber.results.scene.contents import scene_data as data_of
+    from limber.store import Branch
+
+    shown_data = data_of(Branch.open(beam.folder))
+    shown_data.info["notes"] = ["one of many words that go on and on beyond the margin"] * 12
+    shown_data.write(tmp_path / "data.npz")
+    modules = {name: importlib.import_module(f"limber_addon.{name}")
+               for name in ("scene", "scene_data", "studio", "legend")}
+    data = modules["scene_data"].read_scene_data(tmp_path / "data.npz")
+    scene = bpy.context.scene
+    shown = modules["scene"].show_branch(scene, data)
+    camera = modules["studio"].set_up_studio(scene, data)
+    legend = modules["legend"].add_legend(scene, camera, data, shown)
+    bpy.context.view_layer.update()
+    frame = camera.data.view_frame(scene=scene)
+    depth = 2.0 * camera.data.clip_start
+    left, right = (pick(corner.x for corner in frame) for pick in (min, max))
+    low = min(corner.y for corner in frame)
+    scale = depth / -frame[0].z
+    limit = left + modules["studio"].LEGEND_SHARE * (right - left)
+    for thing in legend.objects:
+        corner = thing.location + Vector(thing.dimensions) / 2
+        assert thing.location.x + thing.dimensions.x <= limit * scale * (1 - 1e-3) + 1e-9, thing
+        assert corner.y - thing.dimensions.y > low * scale, thing
 
 
 @pytest.mark.slow

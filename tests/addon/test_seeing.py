@@ -154,7 +154,7 @@ def test_what_can_be_shown_and_hidden(bpy, opened):
 def test_paths_by_energy_have_a_legend_and_a_graph(bpy, opened):
     """Rods in the colours of the energy; their scale joins the legend once they are in sight."""
     legend, graph = part("overlays.legend"), part("overlays.graph")
-    rods = bpy.data.objects["D-RRT* path by energy"]
+    rods = bpy.data.objects["gentle path by energy"]
     assert rods.hide_viewport and len(legend.shown_scales(opened)) == 1
     bpy.ops.limber.show(group="energy")
     assert [scale["unit"] for scale in legend.shown_scales(opened)] == ["Pa", "J"]

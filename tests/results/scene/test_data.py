@@ -117,18 +117,23 @@ def test_goal_path_and_motion(tmp_path, mesh):
     assert np.linalg.norm(data.arrays["view_direction"]) == pytest.approx(1.0)
 
 
-def test_a_baseline_that_no_tree_found_is_not_called_its(tmp_path, mesh):
-    """Where RRT* found no path the gentle one drawn tight stands in its place, by its own name."""
+def test_paths_are_called_as_in_the_report(tmp_path, mesh):
+    """Gentle and shortest, whichever planner found them; where both are one, that is said."""
     plan = _plan({}, [[0.0, 0.0, 0.3], [0.1, 0.0, 0.3]])
-    summary = json.loads(plan["plans/p.json"]) | {
-        "energy_saved_percent": 3.0, "length_added_percent": 0.0}
+    summary = json.loads(plan["plans/p.json"]) | {"length_added_percent": 0.0}
     plan |= {"plans/p-baseline.csv": plan["plans/p.csv"]}
-    for found, title in (({"RRT*": {}}, "RRT*"), ({"eikonal": {}}, "shortest path")):
-        told = json.dumps(summary | {"paths_on_field": found})
-        info = scene_data(_branch(tmp_path / title[:4], mesh,
+    wood = {"name": None, "breaking_strain": 0.006, "is_assumed": True, "paths_over": ["baseline"]}
+    for saved, note in ((3.0, "energy -3 %, length +0 % against the shortest path"),
+                        (0.0, "no shorter path was found")):
+        told = json.dumps(summary | {"energy_saved_percent": saved, "wood": wood} | {
+            key: {"length_m": 0.1, "peak_strain": 0.007} for key in ("plan", "baseline")})
+        info = scene_data(_branch(tmp_path / str(saved), mesh,
                                   plan__p=plan | {"plans/p.json": told})).info
-        assert info["paths"]["baseline"]["title"] == title
-        assert f"energy -3 %, length +0 % against {title}" in info["notes"]
+        assert {key: about["title"] for key, about in info["paths"].items()} == {
+            "plan": "gentle", "baseline": "shortest"}
+        assert note in info["notes"]
+        assert "strain, shortest: over the 0.6 % at which green wood breaks (assumed)" in (
+            info["notes"])
 
 
 def test_search_trees(tmp_path, mesh):
@@ -440,8 +445,8 @@ def _preview(joints, base, arm):
 
 @pytest.mark.parametrize("away, model", [(0.0, "ur5e"), (0.1, "ur5e"), (0.0, "gone.urdf")])
 def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, model):
-    """In each frame: base, six origins with the arm's own distances, grasp at the branch's; an
-    arm that is elsewhere than the grasp, or not known here, is not shown."""
+    """In each frame: foot and links as rods of the arm's own lengths, and a gripper about the
+    grasp, which is in the picture; an arm that is elsewhere, or not known here, is not shown."""
     from limber.robot.known_arms import arm_named
 
     arm = arm_named("ur5e")
@@ -459,15 +464,20 @@ def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, mo
         stage.result.update(model=model, base_pose=base)
     data = scene_data(Branch.open(tmp_path / "a.branch"))
     if away or model != "ur5e":
-        assert "robot_links" not in data.arrays
+        assert "robot_starts" not in data.arrays
         return
-    links = data.arrays["robot_links"]
-    assert links.shape == (5, 8, 3) and data.info["robot"] == "ur5e"
-    np.testing.assert_allclose(links[:, 0], np.repeat([base[:3]], 5, axis=0))
-    np.testing.assert_allclose(links[:, -1], points, atol=1e-7)
-    np.testing.assert_allclose(links[:, 6], points, atol=1e-7)
-    lengths = np.linalg.norm(np.diff(links[:, :7], axis=1), axis=2)
-    np.testing.assert_allclose(lengths, np.repeat([np.hypot(arm.a, arm.d)], 5, axis=0), atol=1e-7)
+    starts, ends = data.arrays["robot_starts"], data.arrays["robot_ends"]
+    own = arm.rods(joints[::10])
+    assert starts.shape == ends.shape == (5, len(own.radii) + 4, 3)
+    assert data.info["robot"] == {"name": "ur5e", "gripper_rods": 3}
+    np.testing.assert_allclose(starts[:, 0], np.repeat([base[:3]], 5, axis=0))
+    lengths = np.linalg.norm(ends - starts, axis=2)[:, 1:-3]
+    np.testing.assert_allclose(lengths, np.linalg.norm(own.ends - own.starts, axis=2), atol=1e-7)
+    np.testing.assert_allclose(data.arrays["robot_radii"][1:-3], own.radii)
+    fingers = 0.5 * (ends[:, -2] + ends[:, -1])
+    assert np.linalg.norm(fingers - points, axis=1).max() < 0.03
+    shown = data.arrays["view_points"]
+    assert all((shown == end).all(axis=1).any() for end in ends[0, -3:])
 
 
 def test_paths_have_the_same_colours_everywhere():

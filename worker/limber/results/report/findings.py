@@ -15,7 +15,7 @@ ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is 
            "the real branch.")
 _MOST_NAMED = 6
 """Control points whose moduli stand one by one in a sentence."""
-_SAME = 0.05
+SAME = 0.05
 """Percent of energy and length by which two paths that count as one differ at most."""
 PATH_NAMES = {"baseline": "shortest", "plan": "gentle"}
 """Of the two paths of a plan, in text, tables and figures."""
@@ -75,7 +75,7 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
     saved, added = plan.get("energy_saved_percent"), plan.get("length_added_percent")
     if saved is None or added is None:
         return f"{told}."
-    if max(abs(saved), abs(added)) < _SAME:
+    if max(abs(saved), abs(added)) < SAME:
         return f"{told}; no shorter one was found."
     return (f"{told}; it saves {saved:.3g} % of the shortest path's energy for {added:+.2g} % of "
             "length.")

@@ -41,8 +41,9 @@ visible`` [t, m], ``observation_times`` [t],    ``info["observation"]`` names, a
 grasp_times`` [g]
 ``observation_motion`` [frames, m, 3],          the same points in each frame, where the frames
 ``observation_seen`` [frames, m]                are of that pull
-``robot_links`` [frames, n, 3],                 the arm of the plan's dry run: base, the origins of
-``robot_radius`` [1]                            its links, grasp; how thick to draw it
+``robot_starts``, ``robot_ends`` [frames, n,    rods with round ends: the arm of the plan's dry
+3], ``robot_radii`` [n]                         run from foot to wrist, then the gripper, of which
+                                                ``info["robot"]`` says the name and the last rods
 ``frame_bounds`` [2, 3], ``view_points``,       what the camera must see, and its direction
 ``view_direction`` [3]
 ==============================================  ====================================================

@@ -7,6 +7,7 @@ import numpy as np
 from limber.core.files.reading import read_arrays, read_columns, require_shapes
 from limber.planning.plan_file import read_plan_summary
 from limber.planning.search_files import read_trees
+from limber.results.report.findings import PATH_NAMES, SAME, remarks_on
 from limber.results.scene.arrays import SceneData
 from limber.results.scene.colours import colour_scale, colours_of
 from limber.results.scene.graphs import energy_graph
@@ -32,16 +33,13 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
         plan = max(plans, key=lambda name: branch.manifest.stages[f"plan:{name}"].finished)
     summary = read_plan_summary(
         branch.require(f"plans/{plan}.json", f"plan --name {plan}"))
-    planned = "gentle" if summary.get("planner") == "eikonal" else "D-RRT*"
-    # Where its tree found none, the baseline is the gentle path drawn tight.
-    compared = summary.get("paths_on_field")
-    shortest = "RRT*" if compared is None or "RRT*" in compared else "shortest path"
-    for key, name, title in (("plan", plan, planned), ("baseline", f"{plan}-baseline", shortest)):
+    for key, name in (("plan", plan), ("baseline", f"{plan}-baseline")):
         if not branch.has(f"plans/{name}.csv"):
             continue
         table = read_columns(branch.path(f"plans/{name}.csv"), _POSITION, "the table of a path")
         _add_path(data, key, table)
-        data.info["paths"][key] = {"title": title, "note": _path_note(summary.get(key) or {})}
+        data.info["paths"][key] = {"title": PATH_NAMES[key],
+                                   "note": _path_note(summary.get(key) or {})}
     gap = (summary.get("certificate") or {}).get("gap_percent")
     if gap is not None and "plan" in data.info["paths"]:
         data.info["paths"]["plan"]["note"] += f", at most {gap:.1f} % above the least cost"
@@ -51,8 +49,11 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     data.info["goal"] = _goal(summary.get("goal") or {}, data.arrays.get("path:plan"))
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
-        data.info["notes"].append(f"energy {round(-saved):+d} %, length {round(added):+d} % "
-                                  f"against {shortest}")
+        data.info["notes"].append(
+            "no shorter path was found" if max(abs(saved), abs(added)) < SAME else
+            f"energy {round(-saved):+d} %, length {round(added):+d} % against the shortest path")
+    if beyond := remarks_on(summary).get("peak_strain"):
+        data.info["notes"].append(f"strain, {beyond}")
     return plan
 
 

@@ -8,11 +8,15 @@ from limber.core.errors import InputError
 from limber.core.files.reading import read_columns
 from limber.core.numerics.rigid import matrices
 from limber.results.scene.arrays import SceneData
+from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
 from limber.store import Branch
 
 _FARTHEST_M = 0.02
 """A frame whose grasp is farther from every pose of the dry run is of another motion."""
+_GRIPPER = 0.9  # radius of its body in those of the thinnest link
+_PALM = 0.65  # how far from the flange to the grasp its body reaches
+_FINGER = 0.3  # radius of a finger in those of the body
 _POSE = ("x_m", "y_m", "z_m")
 
 
@@ -43,11 +47,49 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     if rows is None:
         return
     base = matrices(np.asarray(entry.result["base_pose"], float))
-    links = (base @ arm.link_frames(joints[rows]))[..., :3, 3]
-    start = np.broadcast_to(base[:3, 3], (len(rows), 1, 3))
-    data.arrays["robot_links"] = np.concatenate([start, links, places[rows][:, None]], axis=1)
-    data.arrays["robot_radius"] = np.array([arm.link_radius])
-    data.info["robot"] = Path(arm.name).stem
+    starts, ends, radii = _arm_rods(arm, base, joints[rows])
+    flange = (base @ arm.link_frames(joints[rows]))[:, -1]
+    held = _gripper_rods(flange, places[rows], _GRIPPER * float(radii.min()))
+    data.arrays["robot_starts"], data.arrays["robot_ends"], data.arrays["robot_radii"] = (
+        np.concatenate(parts, axis=axis) for parts, axis in zip(
+            zip((starts, ends, radii), held, strict=True), (1, 1, 0), strict=True))
+    data.info["robot"] = {"name": Path(arm.name).stem, "gripper_rods": len(held[2])}
+
+
+def _arm_rods(arm: Arm, base: np.ndarray, joints: np.ndarray,
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where the rods of foot and links begin and end [m], [n, rods, 3], and their radii.
+
+    Args:
+        base: Frame of the arm's base, shape [4, 4].
+        joints: Angles [rad], shape [n, 6].
+    """
+    rods = arm.rods(joints)
+    starts, ends = (points @ base[:3, :3].T + base[:3, 3] for points in (rods.starts, rods.ends))
+    foot = np.broadcast_to(base[:3, 3], (len(joints), 1, 3))
+    return (np.concatenate([foot, starts], axis=1), np.concatenate([starts[:, :1], ends], axis=1),
+            np.r_[rods.radii[0], rods.radii])
+
+
+def _gripper_rods(flange: np.ndarray, grasps: np.ndarray, radius: float,
+                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a body and two fingers between flange and grasp, as :func:`_arm_rods` does.
+
+    Args:
+        flange: Its frames, shape [n, 4, 4].
+        grasps: Middle between the fingers [m], shape [n, 3].
+        radius: Of the body [m].
+    """
+    place = flange[:, :3, 3]
+    way = grasps - place
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    axis = way / np.maximum(length, 1e-9)
+    side = flange[:, :3, 0] - (flange[:, :3, 0] * axis).sum(axis=1, keepdims=True) * axis
+    side *= 0.8 * radius / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    palm, tip = place + _PALM * way, grasps + 0.5 * radius * axis
+    return (np.stack([place, palm - side, palm + side], axis=1),
+            np.stack([palm, tip - side, tip + side], axis=1),
+            radius * np.array([1.0, _FINGER, _FINGER]))
 
 
 def _rows(places: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:

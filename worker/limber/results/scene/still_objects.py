@@ -21,6 +21,8 @@ from limber.store.loading import load_found_skeleton, load_skeleton
 ROOT, FORK, TIP, RADIUS_LIMITED, RADIUS_INTERPOLATED = 1, 2, 4, 8, 16
 RADIUS_UNRESOLVED, BRIDGE, EDITED = 32, 64, 128
 """Bits of ``skeleton_flags``."""
+_WRIST_RODS = 2
+"""Rods before the gripper's that belong in the picture with it."""
 CLOUD_LIMIT = 2_000_000
 """Most points of a scan that are handed on; of more, evenly chosen ones."""
 
@@ -160,17 +162,35 @@ def add_view(data: SceneData) -> None:
         radius = goal["radius_m"] or 0.0
         centre = np.array(goal["centre_m"])
         seen.append(_corners(np.array([centre - radius, centre + radius])))
-    arrays["view_points"] = np.vstack(seen)
-    data.info["size_m"] = np.ptp(arrays["view_points"], axis=0).max()
-    data.info["ground_m"] = arrays["view_points"][:, 2].min()
-    arrays["view_direction"] = _view_direction(np.vstack(paths or [vertices])[:, :2])
+    branch = np.vstack(seen)
+    data.info["size_m"] = np.ptp(branch, axis=0).max()
+    data.info["ground_m"] = branch[:, 2].min()
+    gripper = _gripper_points(data)
+    arrays["view_points"] = np.vstack([branch, gripper])
+    # Seen from where the arm stands behind the branch.
+    behind = (gripper.mean(axis=0) - arrays["grasp"][0])[:2] if len(gripper) else np.zeros(2)
+    arrays["view_direction"] = _view_direction(np.vstack(paths or [vertices])[:, :2], behind)
 
 
-def _view_direction(points: np.ndarray) -> np.ndarray:
-    """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards."""
+def _gripper_points(data: SceneData) -> np.ndarray:
+    """Return the ends of gripper and wrist in the first and the last frame [m], shape [n, 3]."""
+    if "robot_ends" not in data.arrays:
+        return np.empty((0, 3))
+    count = data.info["robot"]["gripper_rods"] + _WRIST_RODS
+    return np.concatenate([data.arrays[name][::max(1, len(data.arrays[name]) - 1), -count:]
+                           for name in ("robot_starts", "robot_ends")]).reshape(-1, 3)
+
+
+def _view_direction(points: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards.
+
+    Args:
+        behind: Direction of what shall stand behind them [2]; zeros where nothing does.
+    """
     across = principal_axes(points)[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     # Of the two sides, always the same one, so that a picture made twice is the same picture.
-    across = across if across[1] >= 0 else -across
+    side = behind @ across if np.any(behind) else across[1]
+    across = across if side >= 0 else -across
     turned = np.array([across[0] - 0.3 * across[1], across[1] + 0.3 * across[0], -0.22])
     return turned / np.linalg.norm(turned)
 
