@@ -301,6 +301,21 @@ def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     assert "another mesh" in json.loads(done.stdout.splitlines()[-1])["error"]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="a shell script stands for Blender")
+@pytest.mark.parametrize(("told", "writes"), [
+    ("Blender 4.3.2", True), ("Blender 99.0.0", False), ("Blender 3.6.1", False), ("?", False)])
+def test_an_older_blender_writes_what_it_shall_open(tmp_path, monkeypatch, told, writes):
+    """One that is too old for our scenes, or as new as bpy, does not."""
+    from limber.results.scene.blender_process import blender_command
+
+    program = tmp_path / "blender"
+    program.write_text(f"#!/bin/sh\necho '{told}'\n")
+    program.chmod(0o755)
+    monkeypatch.delenv("LIMBER_SCENE_BLENDER", raising=False)
+    monkeypatch.setenv("LIMBER_BLENDER", str(program))
+    assert (blender_command()[0] == str(program)) == writes
+
+
 def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
     """A rod for each link reaches from end to end in every frame; too short ones are left out.
     Its ends are round, so that rods that meet have no gap.

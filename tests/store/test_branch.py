@@ -34,6 +34,25 @@ def test_stage_enters_folder_and_manifest(branch: Branch):
     assert not list(branch.folder.glob(".first*"))
 
 
+@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
+def test_a_branch_that_failed_to_begin_leaves_no_folder(tmp_path: Path, failure, branch: Branch):
+    """One with a result, or with a file of somebody's own, stays as it is."""
+    new = Branch.create(tmp_path / "new.branch")
+    for begun in (new, branch, Branch.create(tmp_path / "own.branch")):
+        if begun.name == "own":
+            (begun.folder / "notes.txt").write_text("mine")
+        before = {path.name for path in begun.folder.iterdir()}
+        with pytest.raises(failure), begun.dropped_if_empty(), begun.stage("made") as stage:
+            stage.path("half.txt").write_text("half")
+            raise failure
+        if begun is new:
+            assert not begun.folder.exists()
+        else:
+            kept = {path.name for path in begun.folder.iterdir()}
+            assert before <= kept and "half.txt" not in kept
+            assert Branch.open(begun.folder).name == begun.name
+
+
 @pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt, SystemExit])
 def test_failed_stage_leaves_everything_as_it_was(branch: Branch, failure: type[BaseException]):
     """An error or Ctrl-C in the middle of a stage changes no file and leaves no litter."""

@@ -52,6 +52,19 @@ def test_a_second_writer_is_told_who_writes_and_readers_go_on(branch: Branch, ho
     assert Branch.open(branch.folder, verify=True).path("data.txt").read_text() == "one"
 
 
+def test_an_empty_branch_that_another_begins_is_not_removed(tmp_path: Path):
+    """Its own beginning failed because another program is writing there."""
+    new = Branch.create(tmp_path / "new.branch")
+    with subprocess.Popen([sys.executable, "-c", _HOLDER, str(new.folder)],
+                          stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(BranchFolderError, match="Another Limber"), new.dropped_if_empty(), \
+                new.stage("made"):
+            pytest.fail("the stage began")
+        process.kill()
+    assert Branch.open(new.folder).name == "new"
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_a_killed_writers_lock_is_taken_over(branch: Branch, holder):
     """After kill -9 the next writer goes on at once; what it said of itself is gone."""

@@ -33,6 +33,7 @@ from limber.store import journal
 from limber.store.disk import gone, in_words, require_room, require_there
 from limber.store.folder_state import (
     begin,
+    drop_empty,
     finish_pending,
     inside,
     is_litter,
@@ -270,6 +271,17 @@ class Branch:
                 sweep(self.folder)
                 require_room(self.folder, purpose)
             yield
+
+    @contextmanager
+    def dropped_if_empty(self) -> Iterator[None]:
+        """Remove the folder if what follows fails before any result has come into it: a stage that
+        begins a branch leaves no half one."""
+        try:
+            yield
+        except BaseException:
+            if not self.manifest.stages:
+                drop_empty(self.folder)
+            raise
 
     def stream(self, name: str) -> Stream:
         """Open the stream ``name``, new or left by a program that ended; see :class:`Stream`.

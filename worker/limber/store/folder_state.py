@@ -1,5 +1,6 @@
 """Checks of a branch folder before it is read: it exists, is complete and has no links."""
 
+import contextlib
 import os
 import shutil
 from collections.abc import Iterator
@@ -12,7 +13,14 @@ from limber.core.files.atomic import flush_folder, write_atomically
 from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
 from limber.store import journal
 from limber.store.disk import in_words
-from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, wait_for_commit
+from limber.store.lock import (
+    COMMIT_LOCK,
+    HOLDER,
+    RUN_LOCK,
+    commit_lock,
+    run_lock,
+    wait_for_commit,
+)
 from limber.store.manifest import MANIFEST, Manifest, read_manifest
 
 
@@ -94,6 +102,25 @@ def settle(folder: Path, *, unfinished: bool = False) -> None:
         wait_for_commit(folder)
         if journal.is_pending(folder) and not unfinished:
             raise journal.unfinished_error(folder)
+
+
+def drop_empty(folder: Path) -> None:
+    """Remove a branch folder that has a manifest and nothing in it; any other stays as it is.
+
+    It also stays where another program writes to it.
+    """
+    own = (COMMIT_LOCK, RUN_LOCK, HOLDER)
+    # What cannot be removed stays: the failure that leads here is what the user must read.
+    with (contextlib.suppress(OSError, BranchFolderError),
+          run_lock(folder, "removing an empty branch"), commit_lock(folder)):
+        manifest = read_manifest(folder)
+        if manifest.stages or manifest.files or {path.name for path in folder.iterdir()} - {
+                MANIFEST, *own}:
+            return
+        # The locks are held until the end, so that nobody begins to write meanwhile.
+        for name in (MANIFEST, *own):
+            (folder / name).unlink(missing_ok=True)
+        folder.rmdir()
 
 
 def finish_pending(folder: Path) -> None:

@@ -22,7 +22,7 @@ from limber.core.files.atomic import write_atomically
 
 COMMIT_LOCK = ".lock"
 RUN_LOCK = ".run.lock"
-_HOLDER = ".run.json"
+HOLDER = ".run.json"
 _COMMIT_WAIT_SECONDS = 60.0
 
 
@@ -54,7 +54,7 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
     is_first = lock.lock_counter == 1
     try:
         if is_first:
-            write_atomically(folder / _HOLDER, json.dumps({
+            write_atomically(folder / HOLDER, json.dumps({
                 "purpose": purpose, "user": _user(), "host": socket.gethostname(),
                 "process": os.getpid(), "since": datetime.now(UTC).isoformat(timespec="seconds"),
             }) + "\n")
@@ -62,7 +62,7 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
     finally:
         try:
             if lock.lock_counter == 1:
-                (folder / _HOLDER).unlink(missing_ok=True)
+                (folder / HOLDER).unlink(missing_ok=True)
         finally:
             lock.release()
 
@@ -139,7 +139,7 @@ def _holder(folder: Path) -> str:
     """Who has the run lock, in words."""
     for _ in range(5):
         try:
-            found = json.loads((folder / _HOLDER).read_text(encoding="utf-8"))
+            found = json.loads((folder / HOLDER).read_text(encoding="utf-8"))
             since = datetime.fromisoformat(found["since"])
             minutes = (datetime.now(UTC) - since).total_seconds() / 60
             return (f"{found['purpose']}, process {found['process']} of {found['user']} on "

@@ -3,15 +3,22 @@
 The core never imports bpy: the ``bpy`` package in this Python, or a Blender program, runs it.
 """
 
+import importlib.metadata
 import importlib.util
 import os
+import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 from limber.core.errors import MissingDependencyError
 from limber.core.progress import Progress
+
+_OLDEST = (4, 2)
+"""Blender that the add-on's script runs in."""
+_ANSWER_SECONDS = 20.0
 
 
 def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
@@ -32,9 +39,10 @@ def blender_command() -> list[str]:
     """
     script = str(scene_script())
     named = os.environ.get("LIMBER_SCENE_BLENDER")
-    if named is None and importlib.util.find_spec("bpy") is not None:
-        return [sys.executable, script]
     blender = named or os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
+    has_bpy = named is None and importlib.util.find_spec("bpy") is not None
+    if has_bpy and not _is_older_than_bpy(blender):
+        return [sys.executable, script]
     if not blender:
         raise MissingDependencyError(
             "There is no bpy package in this Python and no Blender was found.",
@@ -42,6 +50,23 @@ def blender_command() -> list[str]:
             "Install bpy (pip install 'limber[blender]'), or set LIMBER_BLENDER to a Blender.")
     return [blender, "--background", "--factory-startup", "--python-exit-code", "3",
             "--python", script]
+
+
+def _is_older_than_bpy(blender: str | None) -> bool:
+    """Whether a Blender shows our scenes but may not open what the bpy package writes: then it is
+    the one that writes them."""
+    if not blender:
+        return False
+    try:
+        told = subprocess.run([blender, "--version"], capture_output=True, text=True, check=False,
+                              timeout=_ANSWER_SECONDS).stdout
+        versions = [re.match(r"(?:Blender )?(\d+)\.(\d+)", text)
+                    for text in (told, importlib.metadata.version("bpy"))]
+    except (OSError, subprocess.TimeoutExpired, importlib.metadata.PackageNotFoundError):
+        # A Blender that does not answer writes nothing.
+        return False
+    own, bpy = ((0, 0) if found is None else (int(found[1]), int(found[2])) for found in versions)
+    return _OLDEST <= own < bpy
 
 
 def scene_script() -> Path:

@@ -74,7 +74,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         return branch.manifest.stages["mesh"].result
     for text in list(warnings):
         progress.warn(text)
-    with branch.stage("mesh", settings, digests=digests) as stage:
+    with branch.dropped_if_empty(), branch.stage("mesh", settings, digests=digests) as stage:
         if has_cylinders:
             made, masses = mesh_model(path, settings, progress)
         elif drawn is not None:

@@ -106,13 +106,14 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         cloud_path, camera_path, mask_path)
     unit, unit_notes = unit_of(raw, settings.unit)
     settings = settings.model_copy(update={"unit": unit})
-    branch = Branch.create(folder)
     digests = {"cloud": file_digest(cloud_path)}
     for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
         if path is not None:
             digests[name] = file_digest(require_file(path, f"A {name} file"))
-    if edits_path is not None:
-        edits = read_edits(edits_path)
+    given = None if edits_path is None else read_edits(edits_path)
+    branch = Branch.create(folder)
+    if given is not None:
+        edits = given
     else:
         edits = [] if skeleton_path is not None else load_edits(branch)
     digests |= edits_digest(edits)
@@ -134,7 +135,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
             _keep_skeleton(early, alignment, skeleton, settings.unit)
             found.write(early.path(SEARCH))
         is_kept = True
-    with branch.stage("reconstruct", settings, digests=digests) as stage:
+    with branch.dropped_if_empty(), branch.stage(
+            "reconstruct", settings, digests=digests) as stage:
         own = None if skeleton_path is None else read_skeleton(
             skeleton_path, scale=UNIT_METRES[settings.unit])
         try:
