@@ -13,6 +13,7 @@ from limber.store import Branch
 ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is assumed. The "
            "estimate shows only that the assumed modulus is recovered. It states nothing about "
            "the real branch.")
+ASSUMED_PULL = "from a simulated pull with an assumed modulus"
 _MOST_NAMED = 6
 """Control points whose moduli stand one by one in a sentence."""
 SAME = 0.05

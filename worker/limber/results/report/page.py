@@ -18,6 +18,7 @@ from limber.results.motion_files import read_frames_file
 from limber.results.report import figures, loads_section, swing_section
 from limber.results.report.findings import (
     ASSUMED,
+    ASSUMED_PULL,
     beyond_sentence,
     certificate_sentence,
     modulus_sentence,
@@ -103,7 +104,7 @@ def _found(branch: Branch, picture: Path | None) -> Section:
     if branch.has("estimate.json"):
         told.append(modulus_sentence(
             read_estimate(branch.path("estimate.json")),
-            "from a simulated pull with an assumed modulus" if is_assumed(pull) else ""))
+            ASSUMED_PULL if is_assumed(pull) else ""))
     else:
         told.append("Young's modulus has not been estimated from a pull: what follows holds for "
                     "the modulus that the mesh has.")
@@ -164,6 +165,7 @@ def _pull(branch: Branch, name: str) -> Section:
     section = Section(f"Pull {name}")
     pull = read_pull(branch.path(f"pulls/{name}"))
     if _is_virtual(branch, name):
+        section.title += " (simulated)"
         section.text.append(
             "This pull was simulated on a separate, finer mesh, with "
             f"{'a known' if _has_truth(branch) else 'an assumed'} Young's modulus and sensor "

@@ -267,10 +267,11 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     return tables
 
 
-def _moduli_line(result: Mapping[str, Any]) -> str:
-    from limber.results.report.findings import modulus_sentence
+def _moduli_line(values: Mapping[str, Any]) -> str:
+    from limber.results.report.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
 
-    return modulus_sentence(result)
+    pull = simulated_pull(Branch.read(values["branch_folder"]))
+    return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")
 
 
 STAGE = StageDescription(

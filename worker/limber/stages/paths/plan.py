@@ -341,11 +341,18 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     return [("Both paths, on the full model", comparison_rows(result))]
 
 
-def _found_lines(result: Mapping[str, Any]) -> str:
-    from limber.results.report.findings import beyond_sentence, certificate_sentence, path_sentence
+def _found_lines(values: Mapping[str, Any]) -> str:
+    from limber.results.report.findings import (
+        beyond_sentence,
+        certificate_sentence,
+        modulus_origin,
+        path_sentence,
+    )
 
+    origin = modulus_origin(Branch.read(values["branch_folder"]))
     return "\n".join(filter(None, (
-        path_sentence(result), certificate_sentence(result), beyond_sentence(result))))
+        path_sentence(values), certificate_sentence(values), beyond_sentence(values),
+        "" if origin == "estimated" else f"All this holds for Young's modulus as {origin}.")))
 
 
 STAGE = StageDescription(
