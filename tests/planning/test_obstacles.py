@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.surface.surface import Surface
-from limber.planning.constraints.obstacles import Box, Solid, closest
+from limber.planning.constraints.obstacles import Box, Obstacles, Solid, closest
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
@@ -39,3 +39,17 @@ def test_the_deepest_is_told(both):
     near = (box.centre + (box.half[1] + 0.01) * box.axes[1])[None]
     assert closest((box,), near) is None
     assert closest((box,), near, radius=0.02)[1] == pytest.approx(0.01)
+
+
+def test_a_clearance_is_kept_from_bodies(both):
+    """Broken where the branch comes nearer, with how near; inside a body with how deep; kept beyond
+    it. The value that planners limit crosses its limit there."""
+    box, _ = both
+    constraint, touching = Obstacles.keeping((box,), 0.03), Obstacles((box,))
+    places = [box.centre + (box.half[1] + off) * box.axes[1] for off in (0.05, 0.02, -0.01)]
+    nodes = np.array(places)[:, None]
+    assert constraint.clearance == pytest.approx(0.03) and touching.clearance == 0.0
+    assert ((constraint.values(nodes[:, 0], nodes) > constraint.limit) == [False, True, True]).all()
+    far, near, inside = (constraint.broken(one[:1, 0], one) for one in nodes[:, None])
+    assert far is None and "20.0 mm away from box" in near and "clearance of 30.0 mm" in near
+    assert "10.0 mm inside box" in inside and touching.broken(nodes[1], nodes[1:2]) is None

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError, NoPathError
+from limber.planning.constraints.obstacles import Box
 from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import places_in
+from limber.stages.paths.plan_cell import blocked_by, clearance_in, places_in
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
@@ -128,6 +129,27 @@ def test_a_second_arm_reaches_as_far_as_it_can():
         place.require("the tip", np.array([1.0, 0.9, 0.3]), None)
     with pytest.raises(NoPathError, match="directions"):
         place.require("the tip", np.array([1.0, 0.0, 0.15]), None)
+
+
+def test_the_clearance_is_what_the_base_leaves_uncertain():
+    """Twice the deviation at the grasp, no more than the branch has at rest, or what is asked; the
+    arm and the gripper keep it too."""
+    cell = Cell(robot={"model": "ur5e", "pose_sigma_m": 0.0}, base={
+        "pose": (1.0, 0, 0, 0, 0, 0), "position_sigma_m": 0.003, "rotation_sigma_rad": 0.004})
+    grasp, nodes = np.zeros(3), np.zeros((1, 3))
+    far, near = (Box("a post", np.full(3, 0.01), np.array([away, 0, 0]), np.eye(3))
+                 for away in (0.21, 0.014))
+    assert clearance_in(cell, None, (far,), grasp, nodes) == pytest.approx(0.01)
+    assert clearance_in(cell, None, (far, near), grasp, nodes) == pytest.approx(0.0036)
+    assert clearance_in(cell, 0.05, (near,), grasp, nodes) == 0.05
+    assert clearance_in(cell, None, (), grasp, nodes) == 0.0
+    joints = np.array(cell.arm.home, float)[None]
+    elbow = cell.arm.rods(joints).ends[0, 0] + [1.0, 0.0, 0.0]
+    post = Box("a post", np.full(3, 0.01), elbow + [0.3, 0.0, 0.0], np.eye(3))
+    flange = cell.arm.forward(joints)
+    assert blocked_by(cell, (post,))(flange, joints) is None
+    refused = blocked_by(cell, (post,), 0.25)(flange, joints)
+    assert "from a post, nearer than the clearance of 250.0 mm" in refused.seen
 
 
 def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):

@@ -42,7 +42,7 @@ class PlanSettings(Settings):
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_damage", "max_stress", "workspace_low",
-                               "workspace_high", "confidence"),
+                               "workspace_high", "clearance", "confidence"),
         "timing": ("speed", "acceleration", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
@@ -102,6 +102,10 @@ class PlanSettings(Settings):
         "Lower corner of the box that the grasp must stay in, in the branch's frame [m]."))
     workspace_high: tuple[float, float, float] | None = Field(None, description=(
         "Upper corner of that box [m]."))
+    clearance: float | None = Field(None, ge=0, le=0.5, description=(
+        "Least distance of branch, gripper and arm from the cell's obstacles [m]. Default: twice "
+        "the uncertainty of the robot's base in the cell file, but no more than the branch has at "
+        "rest."))
     confidence: float | None = Field(None, ge=0.5, lt=1, description=(
         "Probability that the limits hold, given the uncertainty of the estimated Young's "
         "modulus. Default: the limits are checked for the estimate only."))

@@ -55,13 +55,14 @@ class Limits:
     constraints: tuple[Constraint, ...] = ()
 
     def with_cell(self, low: np.ndarray | None, high: np.ndarray | None, force: float,
-                  obstacles: tuple[Obstacle, ...]) -> "Limits":
-        """Return the limits with those of a robot's cell besides.
+                  obstacles: tuple[Obstacle, ...], clearance: float = 0.0) -> "Limits":
+        """Return the limits with those of a robot's cell besides; ``clearance`` [m] is kept from
+        its obstacles.
 
         Raises:
             InputError: the workspaces have nothing in common.
         """
-        more = (Obstacles(obstacles),) if obstacles else ()
+        more = (Obstacles.keeping(obstacles, clearance),) if obstacles else ()
         both = replace(self, force=min(self.force, force),
                        constraints=(*more, *self.constraints),
                        low=self.low if low is None else np.maximum(self.low, low),

@@ -62,6 +62,16 @@ class Obstacles(Constraint):
     touches one, more inside; smooth for a planner's field.
     """
 
+    @classmethod
+    def keeping(cls, bodies: tuple[Obstacle, ...], clearance: float) -> "Obstacles":
+        """Return the constraint to stay ``clearance`` [m] away from bodies."""
+        return cls(bodies, float(np.exp(-clearance / _SCALE)))
+
+    @property
+    def clearance(self) -> float:
+        """What is kept from the bodies [m]."""
+        return -_SCALE * float(np.log(self.limit))
+
     bodies: tuple[Obstacle, ...]
     limit: float = 1.0
     name = "closeness"
@@ -74,11 +84,15 @@ class Obstacles(Constraint):
         return replace(self, limit=self.limit / factor)
 
     def broken(self, grasps: np.ndarray, nodes: np.ndarray) -> str | None:
-        if (hit := closest(self.bodies, nodes.reshape(-1, 3))) is None:
+        kept = self.clearance
+        if (hit := closest(self.bodies, nodes.reshape(-1, 3), kept)) is None:
             return None
         name, depth, where = hit
         place = ", ".join(f"{x:.3f}" for x in where)
-        return f"the branch is {1e3 * depth:.1f} mm inside {name} at ({place}) m"
+        if depth < kept:
+            return (f"the branch is {1e3 * (kept - depth):.1f} mm away from {name} at ({place}) m, "
+                    f"less than the clearance of {1e3 * kept:.1f} mm")
+        return f"the branch is {1e3 * (depth - kept):.1f} mm inside {name} at ({place}) m"
 
 
 def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,

@@ -122,7 +122,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     )
     in_cell = None
     if cell_file is not None:
-        in_cell = _InCell.of(branch, cell_file, asked, progress)
+        in_cell = _InCell.of(branch, cell_file, asked, progress, settings, grasp_model)
         digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
     reads = ["energy.npz"]
@@ -161,7 +161,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
             found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
-                                                in_cell.obstacles, pace.speed)
+                                                in_cell.obstacles, pace.speed,
+                                                in_cell.clearance)
+            found.summary["clearance_m"] = in_cell.clearance
         progress(0.95, "writing")
         rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
         found.summary["setpoint_rate_hz"] = rate
@@ -190,14 +192,26 @@ class _InCell:
     obstacles: tuple[Obstacle, ...]
     limits: Limits
     places: dict[str, CellPlace]
+    clearance: float
 
     @classmethod
-    def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress) -> _InCell:
-        from limber.stages.paths.plan_cell import cell_for, cell_obstacles, limits_in, places_in
+    def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress,
+           settings: PlanSettings, grasp_model: GraspModel) -> _InCell:
+        from limber.stages.paths.plan_cell import (
+            cell_for,
+            cell_obstacles,
+            clearance_in,
+            limits_in,
+            places_in,
+        )
 
         cell = cell_for(branch, path, progress)
         obstacles = cell_obstacles(cell, path.parent)
-        return cls(cell, obstacles, limits_in(cell, limits, obstacles), places_in(cell, obstacles))
+        clearance = clearance_in(
+            cell, settings.clearance, obstacles, grasp_model.rest_position,
+            grasp_model.mesh.nodes + grasp_model.rest.displacement)
+        return cls(cell, obstacles, limits_in(cell, limits, obstacles, clearance),
+                   places_in(cell, obstacles), clearance)
 
     def slowed(self, pace: Pace) -> Pace:
         """Return the pace, no faster than the cell allows."""
@@ -212,10 +226,13 @@ class _InCell:
 
         places = [getattr(settings, kind.name) for kind in asked_kinds(settings) if kind.is_place]
         for place in places:
-            hit = closest(self.obstacles, np.array([place], float))
+            hit = closest(self.obstacles, np.array([place], float), self.clearance)
             if hit:
+                inside = hit[1] - self.clearance
                 raise NoPathError(
-                    f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
+                    f"The goal lies {1e3 * inside:.1f} mm inside {hit[0]}." if inside >= 0.0 else
+                    f"The goal lies {-1e3 * inside:.1f} mm from {hit[0]}, nearer than the "
+                    f"clearance of {1e3 * self.clearance:.1f} mm.",
                     "The branch cannot be moved there.",
                     "Choose another goal, or correct the obstacle in the cell file.")
 

@@ -32,6 +32,8 @@ _ROD_SPACING = 0.02  # [m] of points along a part of gripper or arm
 _POSE_SPACING = 0.01  # [m] that a part goes at most between poses that are looked at
 _BETWEEN = 0.006  # [m] by which parts are thicker for what lies between both
 _SIGHT_SPACING = 0.005  # [m] of points on a line of sight
+_DEVIATIONS = 2.0  # of where the robot holds the branch, that a clearance covers
+_AT_REST = 0.9  # of the branch's clearance at rest, that is kept at most where none was asked for
 _LARGE = 20.0  # [m] an obstacle that is larger is in another unit
 
 
@@ -140,7 +142,25 @@ def _view_of(cell: Cell) -> View | None:
                 camera.range_m)
 
 
-def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...]) -> Limits:
+def clearance_in(cell: Cell, asked: float | None, obstacles: tuple[Obstacle, ...],
+                 grasp: np.ndarray, nodes: np.ndarray) -> float:
+    """Return the distance to keep from obstacles [m]: as ``asked``, else what covers how uncertain
+    it is where the robot holds the branch, but no more than nearly what it has at rest.
+
+    Args:
+        grasp, nodes: Of the branch at rest, branch frame [m], shapes [3] and [n, 3].
+    """
+    if asked is not None or not obstacles:
+        return asked or 0.0
+    base, arm = cell.base, np.linalg.norm(grasp - np.array(cell.base.pose[:3]))
+    sigma = float(np.linalg.norm([base.position_sigma_m, base.rotation_sigma_rad * arm,
+                                  cell.robot.pose_sigma_m]))
+    own = min(float(body.clearance(nodes).min()) for body in obstacles)
+    return max(min(_DEVIATIONS * sigma, _AT_REST * own), 0.0)
+
+
+def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clearance: float = 0.0,
+              ) -> Limits:
     """Return limits with the cell's workspace, force and obstacles besides.
 
     Raises:
@@ -149,11 +169,11 @@ def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...]) -> Li
     box = cell.workspace
     return limits.with_cell(None if box is None else np.array(box.low_m),
                             None if box is None else np.array(box.high_m),
-                            cell.limits.soft_force_n, obstacles)
+                            cell.limits.soft_force_n, obstacles, clearance)
 
 
 def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obstacle, ...],
-               speed: float) -> dict[str, Any]:
+               speed: float, clearance: float = 0.0) -> dict[str, Any]:
     """Return how the cell's robot takes the gripper along approach and path, at a speed [m/s].
 
     Raises:
@@ -163,7 +183,8 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
     there = np.array(motion.phases) != "return"
     forces = present(motion.forces, "force of the motion")
     predicted = Predicted.of_forces(motion.poses[there], forces[there])
-    found = robot_motion(cell, predicted, axis, speed=speed, blocked=blocked_by(cell, obstacles))
+    found = robot_motion(cell, predicted, axis, speed=speed, blocked=blocked_by(
+        cell, obstacles, clearance))
     return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
             "gripper_rotation": found.rotation,
             "duration_s": found.approach.duration + found.path.duration,
@@ -171,16 +192,18 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
             "joint_limit_margin_rad": found.joints.limit_margin}
 
 
-def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...]) -> Blocked:
-    """Return what tells where gripper or arm would be inside an obstacle."""
+def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...], clearance: float = 0.0) -> Blocked:
+    """Return what tells where gripper or arm would be nearer to an obstacle than ``clearance`` [m].
+    """
     def blocked(flange: np.ndarray, joints: np.ndarray) -> NoPathError | None:
-        return None if not obstacles else _in_the_way(cell, obstacles, flange, joints)
+        return None if not obstacles else _in_the_way(cell, obstacles, flange, joints, clearance)
     return blocked
 
 
 def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
-                joints: np.ndarray) -> NoPathError | None:
-    """Return the error that names what is deepest in an obstacle, None where nothing is.
+                joints: np.ndarray, clearance: float) -> NoPathError | None:
+    """Return the error that names what is deepest in an obstacle, or in ``clearance`` [m] about it;
+    None where nothing is.
 
     Args:
         flange: Frames in the robot's base, shape [n, 4, 4].
@@ -200,14 +223,17 @@ def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
         share = np.linspace(0.0, 1.0, int(np.ceil(length / _ROD_SPACING)) + 1)[:, None]
         places = starts[looked, None] + share * (ends - starts)[looked, None]
         places = places.reshape(-1, 3) @ base[:3, :3].T + base[:3, 3]
-        hit = closest(obstacles, places, radius + _BETWEEN)
+        hit = closest(obstacles, places, radius + _BETWEEN + clearance)
         if hit and (worst is None or hit[1] > worst[0]):
             worst = hit[1], what, hit[0], hit[2]
     if worst is None:
         return None
     depth, what, name, where = worst
     return NoPathError(
-        f"{what} would be inside {name}, by up to {1e3 * depth:.1f} mm, at "
+        f"{what} would be "
+        + (f"inside {name}, by up to {1e3 * (depth - clearance):.1f} mm, at " if depth >= clearance
+           else f"{1e3 * (clearance - depth):.1f} mm from {name}, nearer than the clearance of "
+                f"{1e3 * clearance:.1f} mm, at ") +
         f"({', '.join(f'{x:.3f}' for x in where)}) m.",
         "This is the gripper direction farthest from singularities. Every other direction that "
         "was tried is blocked as well.",
