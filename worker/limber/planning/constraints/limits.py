@@ -157,7 +157,7 @@ class Limits:
         """
         found = dict.fromkeys(UNITS, 0.0)
         inner, values = ~known.region.is_face(), sampled_sizes(known.samples)
-        above = _above(known)
+        above = self.above(known)
         for name, limit in self.asked().items():
             size = values.get(name)
             if size is None:
@@ -176,10 +176,22 @@ class Limits:
                 for name, limit in self.asked().items()]
         return (" at most " + " and ".join(kept)) if kept else ""
 
+    @staticmethod
+    def above(known: EnergyField) -> dict[str, np.ndarray]:
+        """Return by how much the field, fitted without it, says too much of each sample, by the
+        names of ``UNITS`` and of constraints, shape [m] each; nan where that is not known."""
+        samples, missed = known.samples, known.missed
+        size = np.linalg.norm(samples.forces, axis=1)
+        above = {"energy": missed[:, 0],
+                 "force": np.linalg.norm(samples.forces + missed[:, 1:4], axis=1) - size}
+        table = samples.load_table
+        more = np.abs(table + missed[:, 4:]) - np.abs(table)
+        return above | dict(zip(known.load_names, more.T, strict=True))
+
     def errors(self, known: EnergyField) -> dict[str, LocalError]:
         """Return by how much the field may say too much, as a function of the place in the plain
         chart, by limit: at no sample left out it was more; nowhere more than :meth:`doubts`."""
-        inner, above = ~known.region.is_face(), _above(known)
+        inner, above = ~known.region.is_face(), self.above(known)
         places, doubts = known.region.chart.plain.map(known.samples.positions), self.doubts(known)
         return {name: LocalError.of(places[inner], above[name][inner], 1.0, doubts[name])
                 for name in self.asked() if np.isfinite(doubts[name])}
@@ -218,18 +230,6 @@ def sampled_sizes(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
     """Return what limits are on at samples, by the names of ``UNITS``, shape [m] each."""
     return {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
             **samples.loads}
-
-
-def _above(known: EnergyField) -> dict[str, np.ndarray]:
-    """Return by how much the field, fitted without it, says too much of each sample, by the names
-    of ``UNITS``, shape [m] each; nan where that is not known."""
-    samples, missed = known.samples, known.missed
-    size = np.linalg.norm(samples.forces, axis=1)
-    above = {"energy": missed[:, 0],
-             "force": np.linalg.norm(samples.forces + missed[:, 1:4], axis=1) - size}
-    table = samples.load_table
-    more = np.abs(table + missed[:, 4:]) - np.abs(table)
-    return above | dict(zip(known.load_names, more.T, strict=True))
 
 
 def with_unit(name: str) -> str:
