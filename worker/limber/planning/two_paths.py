@@ -36,6 +36,7 @@ _SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
 _AT_START = 1e-4  # [m] the approach ends that near
 NOTHING_ASKED = "none"
 """The engine of paths that stay where they are."""
+_FEW_CELLS = 30_000  # a limit that is far too low is proven with them, in a second or two
 _ANY = 1e6  # gap: any path will do
 
 
@@ -120,7 +121,7 @@ def _check_any_way(field: EnergyField, start: np.ndarray, goal: Goal, limits: Li
         return
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
                             beyond=asked.beyond(field), errors=asked.errors(field))
-    verdict = judge(problem)
+    verdict = judge(problem, _FEW_CELLS)
     if not verdict.proven:
         return
     none = separated(problem, verdict)

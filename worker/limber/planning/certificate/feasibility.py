@@ -141,16 +141,18 @@ class Verdict:
     wall: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
 
-def judge(problem: GentleProblem) -> Verdict:
-    """Return a path on the field, or whether it is proven that none exists."""
+def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
+    """Return a path on the field, or whether it is proven that none exists; undecided where that
+    would take more than ``most_cells`` at once."""
+    most = most_cells or _MOST_CELLS
     exact = replace(problem, beyond=problem.limits, errors={})
-    on_field = _judged(exact, 0.0)
+    on_field = _judged(exact, 0.0, most)
     if not on_field.proven:
         return on_field
-    return _judged(problem, problem.goal.uncertainty(problem.energy_field))
+    return _judged(problem, problem.goal.uncertainty(problem.energy_field), most)
 
 
-def _judged(problem: GentleProblem, goal_uncertainty: float) -> Verdict:
+def _judged(problem: GentleProblem, goal_uncertainty: float, most_cells: int) -> Verdict:
     """Cut cells until they prove that no path keeps the sure limits and comes as near as
     ``goal_uncertainty`` [m] to the goal, or a way leads by them, or there are too many."""
     cells, wall = _first(problem), _Wall(problem)
@@ -185,7 +187,7 @@ def _judged(problem: GentleProblem, goal_uncertainty: float) -> Verdict:
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
                            (bends / tolerance)[open_cells][ends].sum(axis=0))
         parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
-        if prestress.sum() * parts.prod() > _MOST_CELLS:
+        if prestress.sum() * parts.prod() > most_cells:
             return Verdict(cells.edges)
         cells = cells.take(prestress).cut(parts)
 
