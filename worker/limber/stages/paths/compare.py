@@ -1,0 +1,146 @@
+"""Compare RRT*, D-RRT* and the gentle path over random starts, as the paper does."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from limber.core.errors import InputError, NoPathError
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups, Settings
+from limber.planning.settings import PlanSettings
+from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from limber.planning.experiments.compared_planners import ComparedTrial
+
+_COLUMNS = ("trial", "planner", "length_m", "energy_sum_nmm", "energy_integral_jm",
+            "peak_energy_j")
+
+
+class CompareInputs(BranchInputs):
+    """A branch folder, and the comparison's name."""
+
+    groups: ClassVar[Groups] = {"output": ("name",)}
+
+    name: str = Field("planners", description="Name of the comparison's files.")
+
+
+class CompareSettings(Settings):
+    """Trials, the goal that they share, and how is planned."""
+
+    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "goal_tolerance", "seed"),
+                                "solver": ("max_detour", "iterations", "engine")}
+
+    trials: int = Field(10, ge=1, le=1000, description=(
+        "Number of random deformed start configurations."))
+    goal: tuple[float, float, float] | None = Field(None, description=(
+        "Goal position of the grasp, in the branch's frame [m]. Default: a distant pose."))
+    goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
+    seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
+    max_detour: float | None = Field(None, ge=0, le=1000, description=(
+        "Largest extra length of the gentle path over the shortest path [%]."))
+    iterations: int = Field(3000, ge=100, le=200_000, description=(
+        "Number of samples of RRT* and D-RRT*."))
+    engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
+        "Implementation of RRT* and D-RRT*: auto, ompl or own."))
+
+
+def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
+            force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Stage ``compare``: plan from random starts with each planner, on the branch's energy field.
+
+    Writes ``comparisons/NAME.csv``, a row a path, and ``comparisons/NAME.png``.
+
+    Raises:
+        BranchFolderError: no energy field. InputError: a name that is none.
+        NoPathError: no trial has a path; says why.
+    """
+    from limber.planning.experiments.compared_planners import run_trials, summarised
+    from limber.planning.field.energy_field import EnergyField
+    from limber.planning.goals.chosen_pose import default_goal
+    from limber.planning.goals.grasp_goal import near
+    from limber.results.report.planner_figure import planner_figure
+
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise InputError(f"--name {name!r} cannot name a comparison.",
+                         "It becomes part of file names.",
+                         "Use letters, digits, dash, dot and underscore.")
+    branch = Branch.open(folder)
+    field = EnergyField.read(branch.require("energy.npz", "energy"))
+    key, reads = f"compare:{name}", ["energy.npz"]
+    if not force and branch.is_current(key, settings, reads=reads):
+        return branch.manifest.stages[key].result
+    goal = (default_goal(field, settings.goal_tolerance) if settings.goal is None
+            else near(np.array(settings.goal), settings.goal_tolerance))
+    asked = PlanSettings(**{each: getattr(settings, each) for each in (
+        "goal_tolerance", "seed", "max_detour", "iterations", "engine")})
+    with branch.stage(key, settings, reads=reads) as stage:
+        trials = run_trials(field, goal, asked, settings.trials, progress=progress)
+        good = [trial for trial in trials if trial.scores]
+        if not good:
+            raise NoPathError(f"None of {len(trials)} trials has a path.", trials[0].trouble,
+                              "Choose another --goal, or sample more poses with `limber energy "
+                              "--samples`.")
+        for trial in trials:
+            if trial.trouble:
+                progress.warn(f"Trial {trial.number + 1} has no path: {trial.trouble}")
+        gaps = [trial.gap_percent for trial in good if trial.gap_percent is not None]
+        stage.path(f"comparisons/{name}.csv").write_text(_rows(good), encoding="utf-8")
+        planner_figure(field, good).savefig(stage.path(f"comparisons/{name}.png"), dpi=150)
+        stage.result.update({
+            "goal": goal.describe(), "trial_count": len(trials), "planned_count": len(good),
+            "planners": summarised(trials), "gap_percent_median": float(np.median(gaps)),
+            "field_energy_error": field.errors["energy_error"], "branch": folder.stem})
+    progress(1.0, "compared")
+    return branch.manifest.stages[key].result
+
+
+def _rows(trials: Sequence[ComparedTrial]) -> str:
+    from limber.planning.experiments.compared_planners import COMPARED
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for trial in trials:
+        for path, score in trial.scores.items():
+            writer.writerow([trial.number + 1, COMPARED[path],
+                             *(f"{getattr(score, column):.9g}" for column in _COLUMNS[2:])])
+    return text.getvalue()
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """In the paper's form: each planner against RRT*, mean and deviation over the trials."""
+    from limber.planning.experiments.compared_planners import BASELINE, COMPARED
+
+    rows = [["branch", "planner", "path length [m]", "longer [%]", "deformation energy [N mm]",
+             "saved [%]"]]
+    for path, row in result["planners"].items():
+        is_base = path == BASELINE
+        rows.append([result["branch"], COMPARED[path], _spread(row, "length_m", ".3f"),
+                     "" if is_base else f"{row['longer_percent']:.2f}",
+                     _spread(row, "energy_sum_nmm", ".2f"),
+                     "" if is_base else f"{row['saved_percent']:.2f}"])
+    return [(f"Planners over {result['planned_count']} random starts, on the energy field", rows)]
+
+
+def _spread(row: dict[str, Any], key: str, form: str) -> str:
+    mean, deviation = row[f"{key}_mean"], row[f"{key}_deviation"]
+    return f"{mean:{form}}" if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
+
+
+STAGE = StageDescription(
+    "compare", 105, by_name(compare, folder="branch_folder"), CompareInputs, CompareSettings,
+    ParallelOptions, key="compare:{name}", reads=("energy.npz",),
+    writes=("comparisons/{name}.csv", "comparisons/{name}.png"), tables=_tables, step="plan",
+    label="Compare Planners")
