@@ -215,8 +215,9 @@ _LOAD = {"tip_displacement_m": [0.01, 0, -0.02], "sag_m": 0.02, "sag_interval_m"
              "mean_speed_m_s": 5.0, "mean_tip_displacement_m": [0.01, 0, 0]}}
 _RINGING = {"young_pa": 1e9, "young_interval_pa": [8e8, 1.2e9], "frequencies_hz": [2.0, 4.0],
             "frequency_deviations_hz": [0.01, 0.02], "damping_ratios": [0.02, 0.03],
-            "damping_ratio_deviations": [0.001, 0.002], "model_frequencies_hz": [2.0, 4.1],
-            "left_over": 0.05}
+            "damping_ratio_deviations": [0.001, 0.002],
+            "damping_ratio_intervals": [[0.01, 0.02], [0.02, 0.03]],
+            "model_frequencies_hz": [2.0, 4.1], "left_over": 0.05}
 _TRACK = (0.02 * np.cos(np.linspace(0, 6, 12))[:, None, None] * [[[0, 0, 0.1], [0, 0.5, 1.0]]])
 _SWING = {"pull": "let-go", "young_pa": 2.5e6, "young_interval_pa": [2.4e6, 2.7e6],
           "damping_ratio": 0.05, "damping_ratio_interval": [0.04, 0.06], "release_s": 0.4,

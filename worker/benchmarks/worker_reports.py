@@ -138,7 +138,8 @@ def _clouds(rng: np.random.Generator, folder: Path) -> Iterator[Case]:
     for name, coding in (("05 latin.ply", "latin-1"), ("05 utf.ply", "utf-8")):
         path = folder / name.replace(" ", "-")
         path.write_bytes(("ply\nformat ascii 1.0\ncomment f\u00fcr die Pr\u00fcfung\n"
-                          "element vertex 40\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+                          "element vertex 40\nproperty float x\nproperty float y\n"
+                          "property float z\nend_header\n"
                           + body + "\n").encode(coding))
         yield name, partial(_is_cloud, path, points)
     for name, colour in (("06 fractions.ply", "0.25 0.5 0.75"), ("06 words.ply", "64 128 191")):

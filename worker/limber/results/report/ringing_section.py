@@ -15,7 +15,7 @@ class VibrationFile(FileContent):
     frequencies_hz: list[float] = Field(min_length=1)
     frequency_deviations_hz: list[float]
     damping_ratios: list[float]
-    damping_ratio_intervals: list[tuple[float, float]]
+    damping_ratio_intervals: list[tuple[float, float]] = Field(default_factory=list)
     model_frequencies_hz: list[float]
     left_over: float
 
@@ -28,14 +28,15 @@ def vibration_rows(path: Path) -> tuple[list[list[str]], list[list[str]]]:
     """
     told = read_json_as(path, VibrationFile, "the result of a vibration")
     low, high = told.young_interval_pa
+    intervals: list[tuple[float, float] | None] = [*told.damping_ratio_intervals]
     modulus = [["quantity", "value", "95 % interval"],
                ["Young's modulus, mean of the branch [MPa]", f"{told.young_pa / 1e6:.4g}",
                 f"{low / 1e6:.4g} to {high / 1e6:.4g}"],
                ["unexplained part of the recording", f"{100 * told.left_over:.0f} %", ""]]
     vibrations = [["frequency [Hz]", "+-", "damping", "95 % interval"]]
     vibrations += [[f"{frequency:.4g}", f"{spread:.2g}", f"{100 * ratio:.2f} %",
-                    f"{100 * least:.2f} to {100 * most:.2f} %"]
-                   for frequency, spread, ratio, (least, most) in zip(
+                    f"{100 * interval[0]:.2f} to {100 * interval[1]:.2f} %" if interval else ""]
+                   for frequency, spread, ratio, interval in zip(
                        told.frequencies_hz, told.frequency_deviations_hz, told.damping_ratios,
-                       told.damping_ratio_intervals, strict=False)]
+                       intervals or [None] * len(told.damping_ratios), strict=False)]
     return modulus, vibrations
