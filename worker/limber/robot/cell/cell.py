@@ -153,6 +153,10 @@ class LimitsEntry(_Entry):
                                "motion [N].")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
+    contact_n_per_m: float | None = Field(
+        None, gt=0, le=1e7, description="Stiffness of what the arm may run into, such as 20000 for "
+        "a wall [N/m]. Motions are so slow that such a contact stays below hard_force_n plus a "
+        "tenth.")
 
     @model_validator(mode="after")
     def _order(self) -> "LimitsEntry":

@@ -245,13 +245,15 @@ class Driver:
                     "the joints' motion is faster than the cell's limits"))
                 return
         else:
-            following.rate = 0.0
-        if not self._sent(following):
+            # Braked where it was; from there it goes on.
+            self._command = following.trajectory.pose(following.time)
+        moves = self.guard.state == State.MOVING
+        if not (self._sent(following) if moves else self._control.keep_alive()):
             self._under_way.judge(self.guard.event(
                 "the control program accepted no target: it ends when it receives nothing for "
                 f"{self._control.silence:.2g} s, for example because this computer is too busy"))
             return
-        over = following.time >= end + 0.5 * self._control.lookahead
+        over = moves and following.time >= end + 0.5 * self._control.lookahead
         still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
         if over and still:
             self._finish(following)

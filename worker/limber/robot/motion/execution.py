@@ -8,6 +8,7 @@ import numpy as np
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotated, rotation_vector
 from limber.robot.cell.cell import Cell
+from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, at_places
 from limber.robot.motion.joint_path import JointPath, follow, no_branch
 from limber.robot.motion.trajectory import Trajectory, along, densely
@@ -85,6 +86,7 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
                          "The guard would slow the motion down, and the predicted forces would "
                          "not match.",
                          "Reduce --speed, or raise limits.speed_m_s in the cell file.")
+    speed = speed_within(cell, speed)
     wanted = across(axis) if rotation is None else [np.asarray(rotation, float)]
     ways: list[_Way] = []
     refusal: NoPathError | None = None

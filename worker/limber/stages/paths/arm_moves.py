@@ -8,6 +8,7 @@ from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.cell.cell import Cell
+from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.joint_planner import joint_way
@@ -33,13 +34,13 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
         raise NoPathError("The arm is there already.", "", "")
     joints = joint_way(start, goal, cell.joint_limits, around.free)
     poses = pose_vectors(cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose)))
-    limits = cell.limits
-    ways = np.array([max(length(second[:3] - first[:3]), limits.speed_m_s * max(
+    limits, fastest = cell.limits, speed_within(cell, cell.limits.speed_m_s)
+    ways = np.array([max(length(second[:3] - first[:3]), fastest * max(
         length(turn_between(first, second)) / (0.8 * limits.turn_speed_rad_s),
         float(np.abs(turned).max()) / _JOINT_SPEED))
         for (first, second), turned in zip(pairwise(poses), np.diff(joints, axis=0), strict=True)])
     share = np.clip(around.from_branch(joints) / _NEAR_M, _SLOWEST, 1.0)
-    times = along_bounded(ways, share * limits.speed_m_s, limits.acceleration_m_s2)
+    times = along_bounded(ways, share * fastest, limits.acceleration_m_s2)
     return Trajectory(times, poses, ExpectedWrench.nothing(poses), joints, by_joints=True)
 
 
@@ -61,7 +62,8 @@ def away_from_branch(cell: Cell, joints: np.ndarray, pose: np.ndarray) -> Trajec
     taken = joint_path(cell.arm, flange, start=joints, joint_limits=cell.joint_limits,
                        singularity_margin=cell.limits.singularity,
                        joint_margin=cell.limits.joint_margin_rad)
-    times = along(poses, _SLOWEST * cell.limits.speed_m_s, cell.limits.acceleration_m_s2)
+    speed = speed_within(cell, _SLOWEST * cell.limits.speed_m_s)
+    times = along(poses, speed, cell.limits.acceleration_m_s2)
     return Trajectory(times, poses, ExpectedWrench.nothing(poses), taken.joints)
 
 

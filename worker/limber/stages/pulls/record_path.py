@@ -11,6 +11,7 @@ from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.cell.cell import Cell
+from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.execution import Blocked
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.start_check import different_joints, in_degrees
@@ -153,7 +154,7 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
     met = None if blocked is None else blocked(flange, taken.joints)
     if met is not None:
         raise met
-    passed = along(out, speed, cell.limits.acceleration_m_s2,
+    passed = along(out, speed_within(cell, speed), cell.limits.acceleration_m_s2,
                    turn_speed=0.8 * cell.limits.turn_speed_rad_s)
     # The way back is the way out in time as well, so that speeds fit where it turns.
     legs = ((passed, out, taken.joints),

@@ -1,0 +1,88 @@
+"""Contact with something stiff: the force stays below the hard limit plus a tenth."""
+
+import numpy as np
+import pytest
+from tests.robot.stepped import Run, Wall
+
+from limber.core.errors import InputError
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.contact_speed import contact_speed, speed_within
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.virtual.controller import Controller
+
+TOOL = np.array([0.0, 0.0, 0.15])
+CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
+            tool={"grasp_pose": (*TOOL, 0, 0, 0), "mass_kg": 0.0})
+
+
+def order_of(trajectory: Trajectory) -> dict:
+    expected = trajectory.expected
+    return {"order": "follow", "times": trajectory.times, "poses": trajectory.poses,
+            "expected": None if expected is None else vars(expected)}
+
+
+def facing_a_wall(patch, speed: float, stiffness: float, *, predicted: bool,
+                  cell: Cell = CELL) -> tuple[Run, Wall, dict]:
+    """A way of 60 mm at ``speed`` and a wall 30 mm away: the run, the wall, the order."""
+    controller = Controller("ur5e", seed=1)
+    controller.set_tool(np.r_[TOOL, 0, 0, 0])
+    start = controller.pose.copy()
+    wall = Wall(TOOL, np.array([0, -1.0, 0]), start[:3] + [0, 0.03, 0], stiffness)
+    controller.load = wall
+    poses = densely(np.array([start, start + [0, 0.06, 0, 0, 0, 0]]))
+    path = Trajectory(along(poses, speed, 0.3), poses,
+                      ExpectedWrench.nothing(poses) if predicted else None)
+    return Run(cell, controller, patch), wall, order_of(path)
+
+
+def against_a_wall(*arguments, **named) -> tuple[Run, Wall, dict]:
+    """Go it: the run, the wall, and how it ended."""
+    run, wall, order = facing_a_wall(*arguments, **named)
+    return run, wall, run.follow(order)
+
+
+@pytest.mark.parametrize("predicted", [True, False])
+def test_a_wall_at_full_speed_stays_below_the_hard_limit(monkeypatch, predicted):
+    """20 N/mm at 50 mm/s: without a prediction the soft limit pauses, and brakes for it."""
+    run, wall, event = against_a_wall(monkeypatch, 0.05, 2e4, predicted=predicted)
+    assert event["event"] in ("paused", "stopped")
+    assert wall.peak > 5.0
+    assert wall.peak <= 1.1 * CELL.limits.hard_force_n
+    assert np.abs(run.control.controller.speeds).max() < 1e-3
+
+
+@pytest.mark.parametrize("stiffness", [5e3, 1e5])
+def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(monkeypatch, stiffness):
+    """A soft one needs no less than the cell's speed; a stiff one is met slowly."""
+    cell = CELL.model_copy(update={"limits": CELL.limits.model_copy(update={
+        "contact_n_per_m": stiffness})})
+    speed = speed_within(cell, 0.05)
+    assert (speed == 0.05) == (stiffness == 5e3)
+    assert speed == min(0.05, contact_speed(cell, stiffness)) > 0.005
+    assert speed_within(CELL, 0.05) == 0.05
+    _, wall, event = against_a_wall(monkeypatch, speed, stiffness, predicted=False, cell=cell)
+    assert event["event"] in ("paused", "stopped")
+    assert 5.0 < wall.peak <= 1.1 * CELL.limits.hard_force_n
+
+
+def test_a_contact_that_no_speed_is_slow_enough_for_is_refused():
+    with pytest.raises(InputError, match="even at 1 mm/s"):
+        contact_speed(CELL, 1e7)
+    slow = CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"model": "ur5"}),
+                                   "sensor": CELL.sensor.model_copy(update={"kind": "ft300"})})
+    assert contact_speed(slow, 2e4) < contact_speed(CELL, 2e4)
+
+
+def test_after_a_pause_it_goes_on_from_where_it_braked(monkeypatch):
+    """The wall is taken away; nothing jumps, and the end of the path is reached."""
+    run, wall, order = facing_a_wall(monkeypatch, 0.05, 2e4, predicted=False)
+    stood = []
+
+    def take_away() -> None:
+        wall.stiffness = 0.0
+        stood.append(run.control.controller.pose[:3].copy())
+    assert run.follow(order, at_pause=take_away)["event"] == "reached"
+    places = run.rows[:, 1:4]
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.05 * 0.002 * 1.5
+    assert np.linalg.norm(places[-1] - stood[0]) > 0.02

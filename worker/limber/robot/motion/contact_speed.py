@@ -1,0 +1,59 @@
+"""How fast a gripper may go so that a contact stays below the hard limit until the arm stands."""
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.robot.cell.cell import Cell
+
+OVER_HARD = 1.1
+"""Of the hard limit: what a contact may come to."""
+
+# From a force to the brake: half a smoothing of the sensor's own, what the loop takes, and two
+# steps of the controller. Measured with the virtual one: 4 ms at 500 Hz, 14 ms at 125 Hz.
+_LOOP_SECONDS = 0.002
+_STEPS = 2.0
+_FT300_SECONDS = 0.010  # between two of its readings
+# The joints brake at 8 rad/s^2; the joint that moves a gripper is seldom nearer than this.
+_BRAKING_M_S2 = 8.0 * 0.3
+_SLOWEST_M_S = 1e-3
+
+
+def reaction_seconds(cell: Cell) -> float:
+    """Return the longest time from a force to the brake [s]."""
+    sensor = _FT300_SECONDS if cell.sensor.kind == "ft300" else 0.0
+    return _LOOP_SECONDS + _STEPS / cell.arm.rate + sensor
+
+
+def contact_speed(cell: Cell, stiffness: float) -> float:
+    """Return the greatest speed [m/s] at which a contact stays below the hard limit plus a tenth.
+
+    The arm brakes from the soft limit on: v t + v^2 / 2a of way, times the stiffness, may add no
+    more than is between the two.
+
+    Args:
+        stiffness: Of the contact [N/m].
+
+    Raises:
+        InputError: not even a millimetre a second is slow enough.
+    """
+    limits = cell.limits
+    way = (OVER_HARD * limits.hard_force_n - limits.soft_force_n) / stiffness
+    lost = _BRAKING_M_S2 * reaction_seconds(cell)
+    speed = float(np.sqrt(lost**2 + 2 * _BRAKING_M_S2 * way) - lost)
+    if speed < _SLOWEST_M_S:
+        raise InputError(
+            f"A contact of {stiffness:g} N/m adds more than the force between limits.soft_force_n "
+            f"and limits.hard_force_n even at {1e3 * _SLOWEST_M_S:g} mm/s.",
+            f"The arm needs {1e3 * reaction_seconds(cell):.0f} ms to brake.",
+            "Lower limits.soft_force_n, or state a softer limits.contact_n_per_m.")
+    return speed
+
+
+def speed_within(cell: Cell, speed: float) -> float:
+    """Return ``speed`` [m/s], or less where the cell states a contact that needs less.
+
+    Raises:
+        InputError: as :func:`contact_speed`.
+    """
+    stiffness = cell.limits.contact_n_per_m
+    return speed if stiffness is None else min(speed, contact_speed(cell, stiffness))
