@@ -111,6 +111,8 @@ def test_home_and_retreat_move_only_when_armed(e_series, tmp_path, capfd):
         begin = np.array(e_series.state["pose"])
         set_off(e_series, link, straight(e_series, (0.0, 0.1, 0.0), expected=False))
         link.process.kill()
+    while np.linalg.norm(e_series.state["tool_speed"]) > 1e-3:
+        time.sleep(0.02)
     before = e_series.state["joints"]
     code, told = run(["retreat", path], capfd)
     assert code == 0 and not told["armed"] and told["way_m"] > 0.002 and told["tare_known"]
