@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from limber.robot.driver.link import RobotLink
     from limber.robot.motion.execution import Blocked
     from limber.robot.motion.trajectory import Trajectory
+    from limber.robot.pull_plausibility import PullPlausibility
     from limber.robot.recorder import MarkerStream, PullRecorder
     from limber.store import Stream
 
@@ -144,7 +145,9 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
               options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
     from limber.robot.driver.link import RobotLink
     from limber.robot.driver.live_force import LiveForce
+    from limber.robot.pull_plausibility import PullPlausibility
     from limber.robot.recorder import MarkerStream, PullRecorder
+    from limber.stages.pulls.record_prediction import predicted_pull
 
     tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
                if options.markers else None)
@@ -156,10 +159,14 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
         progress(0.02, "connecting")
         live = LiveForce(branch.folder, f"Recording {name}", cell.limits.soft_force_n)
 
+        doubts: list[PullPlausibility] = []
+
         def take(rows: np.ndarray) -> None:
             if recorders:
                 recorders[0].take(rows)
             live.take(rows)
+            if doubts and doubts[0].reason is None and doubts[0].take(rows):
+                link.stop()
         with live, RobotLink(cell, take) as link:
             sample = link.wait_for_samples()
             point = _grasp_point(branch, sample[1:4])
@@ -168,6 +175,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             # Before the tare: what takes long would be drift.
             trajectory = _pull(branch, cell, point, sample, settings, blocked,
                                progress.part(0.02, 0.1))
+            predicted = predicted_pull(branch, cell, point, trajectory, progress.part(0.08, 0.1))
             progress(0.1, "taring: keep the gripper free")
             live.at("taring")
             tared = link.tare(_TARE_SECONDS)
@@ -177,13 +185,15 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                          marker_lines)
             recorder.close_gripper()
             live.at("pulling")
+            doubts += [] if predicted is None else [PullPlausibility(cell, predicted)]
             link.start(trajectory)
             event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
-            ended = {"ended": "reached" if event["event"] == "reached" else event["reason"]}
+            ended = {"ended": _how_it_ended(event, doubts)}
             if event["event"] == "reached":
                 # What was seen last comes a little later.
                 time.sleep(0.5)
                 _write_markers(tracker, marker_lines, recorder)
+                _warn_of_what_is_left(doubts, recorder, progress)
                 grip(cell, link, close=False, progress=progress)
             else:
                 ended["after_stop"] = retreat_if_chosen(cell, link, options.after_stop, progress)
@@ -198,6 +208,22 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                     lines.path.unlink(missing_ok=True)
         if tracker is not None:
             tracker.close()
+
+
+def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
+    """``reached``, or why the pull was stopped: by the guard, or because the sensor is wrong."""
+    if event["event"] == "reached":
+        return "reached"
+    reason = doubts[0].reason if doubts else None
+    return event["reason"] if reason is None else f"the force sensor cannot be right: {reason}"
+
+
+def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder,
+                          progress: Progress) -> None:
+    """Warn of a force that is left where the gripper is back at its start."""
+    if doubts and recorder.last is not None and (
+            told := doubts[0].left_at_end(recorder.last[None])):
+        progress.warn(f"{told}.")
 
 
 def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None,

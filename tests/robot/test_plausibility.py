@@ -1,0 +1,80 @@
+"""A pull whose force cannot be the branch's: noticed in its first ten millimetres."""
+
+import numpy as np
+import pytest
+
+from limber.robot.cell.cell import Cell
+from limber.robot.pull_plausibility import LOOKED_M, PredictedPull, PullPlausibility
+
+CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6})
+WAY = np.array([1.0, 0.0, 0.0])
+STIFF = np.array([200.0, 40.0, 0.0])  # N/m: it pulls a little askew
+
+
+def rows(response: np.ndarray, *, bias=(0.0, 0.0, 0.0), seed: int = 0) -> np.ndarray:
+    """15 mm out at 10 mm/s and 500 Hz; ``response`` [3, 3] is the sensor's."""
+    rng = np.random.default_rng(seed)
+    ways = np.arange(0, 0.015, 0.01 / 500)
+    samples = np.full((len(ways), 37), np.nan)
+    samples[:, 0] = 5.0 + np.arange(len(ways)) / 500
+    samples[:, 1:4] = [0.1, 0.2, 0.3] + ways[:, None] * WAY
+    samples[:, 13:16] = (ways[:, None] * STIFF @ response.T + bias
+                         + 0.07 * rng.standard_normal((len(ways), 3)))
+    return samples
+
+
+def judged(samples: np.ndarray, factor: float | None) -> tuple[str | None, float]:
+    """The doubt, and after which way [m] it came."""
+    ways = np.array([0.0, 0.0035, 0.007, 0.01])
+    doubt = PullPlausibility(CELL, PredictedPull(ways, ways[:, None] * STIFF, factor))
+    for batch in np.array_split(samples, len(samples) // 10):
+        if doubt.take(batch):
+            return doubt.reason, float(np.linalg.norm(batch[-1, 1:4] - samples[0, 1:4]))
+    return None, np.nan
+
+
+SWAPPED = np.eye(3)[[1, 2, 0]]
+
+
+@pytest.mark.parametrize("response, factor, told", [
+    (-np.eye(3), None, "against the predicted one"),
+    (SWAPPED, None, "across the predicted one"),
+    (0.1 * np.eye(3), 3.0, "smaller than the known moduli allow"),
+    (10.0 * np.eye(3), 3.0, "larger than the known moduli allow"),
+    (np.zeros((3, 3)), 2.0, "is not held"),
+])
+def test_a_wrong_sensor_is_noticed_in_the_first_ten_millimetres(response, factor, told):
+    for seed in range(5):
+        reason, way = judged(rows(response, seed=seed), factor)
+        assert reason is not None and told in reason
+        assert way <= LOOKED_M + 3e-4
+
+
+@pytest.mark.parametrize("factor", [None, 2.0])
+def test_a_right_sensor_is_not_doubted(factor):
+    """Noise, 15 degrees of a wrong base and half a newton of drift are no faults."""
+    turn = np.radians(15)
+    askew = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0],
+                      [0, 0, 1.0]])
+    for seed in range(20):
+        assert judged(rows(np.eye(3), seed=seed), factor) == (None, pytest.approx(
+            np.nan, nan_ok=True))
+        assert judged(rows(askew, bias=(0.0, 0.0, 0.3), seed=seed), factor)[0] is None
+
+
+def test_moduli_that_are_not_known_make_no_size_wrong():
+    assert judged(rows(0.1 * np.eye(3)), None)[0] is None
+    assert judged(rows(10.0 * np.eye(3)), None)[0] is None
+
+
+def test_a_force_that_is_left_at_the_end_is_told():
+    """Three newtons of drift; what noise and the branch leave is not told."""
+    ways = np.array([0.0, 0.01])
+    doubt = PullPlausibility(CELL, PredictedPull(ways, ways[:, None] * STIFF, None))
+    out = rows(np.eye(3))
+    doubt.take(out)
+    back = out[:20].copy()
+    back[:, 0] = out[-1, 0] + 2.0
+    assert doubt.left_at_end(back) is None
+    back[:, 15] += 3.0
+    assert "A force of 3 N is left" in doubt.left_at_end(back)
