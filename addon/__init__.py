@@ -12,6 +12,7 @@ MODULES = (
     "properties",
     "operators.import_cloud",
     "operators.run_stage",
+    "operators.take_choice",
     "operators.arming",
     "operators.replay",
     "operators.from_cursor",

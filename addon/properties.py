@@ -274,11 +274,11 @@ def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dic
 
     Where the branch folder keeps no result (of loads, of an export, of a dry run), that too.
     """
-    common = ("status", "error", "warnings", "seconds", "arguments")
+    common = ("status", "error", "warnings", "seconds", "arguments", "choices", "code", "place")
     kept = {name: outcome[name] for name in common if name in outcome}
     if not stage.keeps_entry(values_of(group_of(scene, stage), stage, {"name"})):
         kept["result"] = {name: value for name, value in outcome.items()
-                          if name not in (*common, "command")}
+                          if name not in (*common, "command", "fix")}
     group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, branches, properties
+from .. import branch_folder, branches, properties, trouble_mark
 from ..stages import SettingError, Stage, stages
 from ..steps import FIRST
 from .needs_result import branch_property, check_identity, needed_folder
@@ -129,6 +129,10 @@ class StageOperator(WorkerOperator):
     def ended(self, context, outcome):
         properties.keep_outcome(context.scene, self.stage, str(self._folder),
                                 {**outcome, "arguments": self._given})
+        if outcome.get("place"):
+            trouble_mark.show(context.scene, self.stage, outcome["place"])
+        else:
+            trouble_mark.remove(context.scene, self.stage)
 
     def _take_keywords(self, context) -> None:
         group = properties.group_of(context.scene, self.stage)

@@ -3,6 +3,7 @@
 import bpy
 
 from .. import jobs, preferences
+from ..plain_words import plain
 from ..worker import WorkerNotFound
 
 _INTERVAL_SECONDS = 0.1
@@ -97,12 +98,12 @@ class WorkerOperator:
             job.state, job.error = jobs.JobState.FAILED, _no_result(job)
         self.ended(context, {**job.result, "status": job.state.value, "error": job.error})
         for warning in job.result.get("warnings", []):
-            self.report({"WARNING"}, warning)
+            self.report({"WARNING"}, plain(warning))
         if job.state is jobs.JobState.CANCELLED:
             self.report({"INFO"}, f"{self.title}: {job.message or 'cancelled'}")
             return {"CANCELLED"}
         if job.state is jobs.JobState.FAILED:
-            self.report({"ERROR"}, job.error)
+            self.report({"ERROR"}, plain(job.error))
             return {"CANCELLED"}
         try:
             self.finish(context, job.result)

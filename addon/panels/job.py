@@ -5,6 +5,7 @@ import textwrap
 import bpy
 
 from .. import jobs
+from ..plain_words import plain
 from .sidebar import SidebarPanel
 
 _LETTERS = 40
@@ -31,7 +32,7 @@ class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
         elif job is not None and job.error:
             column = self.layout.column(align=True)
             column.label(text=f"{job.title} failed", icon="ERROR")
-            for line in textwrap.wrap(job.error, _LETTERS)[:12]:
+            for line in textwrap.wrap(plain(job.error), _LETTERS)[:12]:
                 column.label(text=line)
         if job is not None:
             _draw_log(self.layout, job)

@@ -1,11 +1,14 @@
 """One panel a step of the work, drawn from the stages' schema."""
 
+import json
 import textwrap
+from typing import Any
 
 import bpy
 
-from .. import branch_folder, branches, jobs, properties
+from .. import branch_folder, branches, jobs, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
+from ..plain_words import choice_title, first_sentence, plain
 from ..stages import Field, Stage, stages
 from ..steps import PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
 from ..steps import next_step as step_after
@@ -132,9 +135,9 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     folder = branches.current_folder(context.scene)
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("error"):
-        _draw_text(layout, outcome["error"], "ERROR")
+        draw_error(layout, context, stage, outcome)
     for warning in outcome.get("warnings", []):
-        _draw_text(layout, warning, "INFO")
+        _draw_text(layout, plain(warning, stage), "INFO")
     result = outcome.get("result", {}) if entry is None else entry.result
     if view.stage == "plan":
         draw_paths(layout, result, branch_folder.read_record(folder) if folder else None)
@@ -211,9 +214,31 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
         row.operator("limber.from_object", text="", icon="OBJECT_DATA").region = field.name
 
 
+def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
+               outcome: dict[str, Any]) -> None:
+    """Draw what was seen, a button for each choice, and the whole text on demand."""
+    text = plain(outcome["error"], stage)
+    short = first_sentence(text)
+    _draw_text(layout, short, "ERROR")
+    if trouble_mark.of(context.scene, stage) is not None:
+        layout.label(text="The place is marked in the view", icon="EMPTY_AXIS")
+    for choice in outcome.get("choices") or []:
+        title = choice_title(stage, choice["option"], choice["value"])
+        if title:
+            button = layout.operator("limber.take_choice", text=title, icon="FILE_REFRESH")
+            button.stage, button.option = stage.name, choice["option"]
+            button.value = json.dumps(choice["value"])
+            button.branch_uuid = branches.current_uuid(context.scene)
+    if text != short:
+        header, body = layout.panel(f"limber_error_{stage.name}", default_closed=True)
+        header.label(text="Why, and what to do")
+        if body is not None:
+            _draw_text(body, text, "NONE")
+
+
 def _draw_text(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(text, 44)[:12]):
+    for number, line in enumerate(textwrap.wrap(text, 44)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1")
 
 

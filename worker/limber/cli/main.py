@@ -276,7 +276,9 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
         code = error.exit_code
         if isinstance(error, SafetyStop):
             result = error.result
-        outcome |= {"status": error.status, "error": str(error), "fix": error.fix}
+        outcome |= {"status": error.status, "error": str(error), "fix": error.fix,
+                    "code": type(error).__name__, "choices": _choices(name, error),
+                    "place": list(error.place) if error.place else None}
     except KeyboardInterrupt:
         code = 130
         outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}
@@ -291,6 +293,15 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
     outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
     _print_outcome(outcome, result or {}, style, state.closing)
     return code
+
+
+def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
+    """Return what the error offers to do instead, as options of the stage; see ``offers``."""
+    if name not in stage_summaries():
+        return []
+    from limber.stages.offers import offers
+
+    return offers(stage_schema(name), f"{error.why} {error.fix}")
 
 
 def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,

@@ -3,7 +3,8 @@
 Every message has three parts: what was seen, why it is wrong, what to do.
 """
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Self
 
 
 class LimberError(Exception):
@@ -11,11 +12,18 @@ class LimberError(Exception):
 
     exit_code = 3
     status = "failed"
+    place: tuple[float, ...] | None = None
+    """Where it is, in the coordinates and the unit of the file that the stage reads."""
 
     def __init__(self, seen: str, why: str = "", fix: str = ""):
         """State what was ``seen``, ``why`` that is wrong and how to ``fix`` it."""
         self.seen, self.why, self.fix = seen, why, fix
         super().__init__(" ".join(part for part in (seen, why, fix) if part))
+
+    def at(self, place: Iterable[float]) -> Self:
+        """Say where it is; returns the error itself."""
+        self.place = tuple(float(value) for value in place)
+        return self
 
 
 class InputError(LimberError):

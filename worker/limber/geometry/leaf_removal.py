@@ -103,7 +103,7 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
                      "Flat wood may look like a leaf, so Limber removes more than "
                      f"{100 * UNASKED:.0f} % of a scan only on request.",
                      "If these are leaves, remove them and keep their mass (--leaves cut). If they "
-                     "are wood, keep all points (--leaves keep).")
+                     "are wood, keep all points (--leaves keep).").at(place)
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:

@@ -55,7 +55,8 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
             f"{_place(where(plant['at']))} in the scan's coordinates. "
             f"{100 * plant['points'] / count:.0f} % of the points have a base of their own.",
             "A branch belongs to one plant, and the scan does not show which one is meant.",
-            f"{_FIX} Or use the larger plant (--plants largest), or join them (--plants joined).")
+            f"{_FIX} Or use the larger plant (--plants largest), or join them (--plants joined)."
+        ).at(where(plant["at"]))
     for piece in graph.split_off:
         share = piece["points"] / count
         if share > 0.2 and piece["distance"] > 0.25 * diagonal:
@@ -63,7 +64,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
                 f"The scan contains two distant clusters. {100 * share:.0f} % of the points lie "
                 f"{piece['distance']:.3g} m from the rest, at {_place(where(piece['at']))} in the "
                 "scan's coordinates.", "A branch must be connected.",
-                f"{_FIX} Or use the larger cluster (--plants largest).")
+                f"{_FIX} Or use the larger cluster (--plants largest).").at(where(piece["at"]))
 
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,

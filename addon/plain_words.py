@@ -1,0 +1,63 @@
+"""What the worker says, in the words of the panels: it speaks of options and commands. No bpy."""
+
+import re
+
+from .stages import Field, Stage, stages
+
+_OPTION = re.compile(r"--(?P<name>[a-z][a-z0-9-]*)(?:[ =](?P<value>[^\s,;:()]+))?")
+_COMMAND = re.compile(r"`limber (?P<name>[a-z-]+)[^`]*`")
+_SENTENCE = re.compile(r"(?<=[.?!])\s+(?=[A-Z])")
+
+
+def plain(text: str, stage: Stage | None = None) -> str:
+    """Return a text with the titles of settings for options, and of buttons for commands.
+
+    ``--plants largest`` becomes ``Plants: largest``, `` `limber energy` `` becomes ``Sample the
+    Energy``. What no panel has stays. Of an option that several stages have, it is that of
+    ``stage``.
+    """
+    text = _COMMAND.sub(lambda match: _label(match["name"]) or match[0], text)
+    return _OPTION.sub(lambda match: _setting(match, stage), text)
+
+
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a text: what was seen."""
+    return _SENTENCE.split(text.strip(), maxsplit=1)[0]
+
+
+def choice_title(stage: Stage, option: str, value: object) -> str:
+    """Return what the button of a choice says; nothing if the stage has no such setting."""
+    field = stage.fields.get(option)
+    if field is None:
+        return ""
+    if field.kind == "boolean":
+        return f"{field.title}: {'on' if value else 'off'}"
+    shown = f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
+    return f"{field.title}: {shown}{f' {field.unit}' if field.unit else ''}"
+
+
+def _label(name: str) -> str:
+    stage = stages().get(name)
+    return stage.label if stage is not None and stage.label else ""
+
+
+def _setting(match: re.Match, stage: Stage | None) -> str:
+    name, value = match["name"].replace("-", "_"), match["value"]
+    field = _field(name, stage)
+    if field is None:
+        # A word may follow, as in "use --no-gravity and".
+        off = _field(name.removeprefix("no_"), stage)
+        return match[0] if off is None or off.kind != "boolean" else (
+            f"{off.title}: off{f' {value}' if value else ''}")
+    if not value:
+        return field.title
+    is_value = field.kind in ("choice", "number", "integer") and (
+        value.rstrip(".") in field.choices or value[0].isdigit())
+    return f"{field.title}: {value}" if is_value else f"{field.title} {value}"
+
+
+def _field(name: str, stage: Stage | None) -> Field | None:
+    for each in (*([stage] if stage is not None else []), *stages().values()):
+        if name in each.fields:
+            return each.fields[name]
+    return None

@@ -1,0 +1,79 @@
+"""An error of the worker in the panel: a short sentence, a button for each choice, a mark."""
+
+import importlib
+import json
+import sys
+
+import pytest
+from tests.addon.test_panels import _draw_step
+
+
+def part(name):
+    return importlib.import_module(f"limber_addon.{name}")
+
+
+TOLD = {"status": "failed", "code": "InputError", "place": [1200.0, 2000.0, 300.0],
+        "choices": [{"option": "plants", "value": "largest"}, {"option": "unknown", "value": 1}],
+        "error": "The scan contains two plants. A branch belongs to one plant. Crop the scan "
+                 "(--crop-low, --crop-high). Or use the larger plant (--plants largest)."}
+
+
+@pytest.fixture()
+def failing(bpy, registered, tmp_path, monkeypatch):
+    """A scan in millimetres, far from the origin, that a worker refuses until it is told to take
+    the larger plant; what it was called with is written down."""
+    scan = tmp_path / "twig.xyz"
+    scan.write_text("1000 2000 0\n1000 2000 100\n1000 2000 500\n")
+    calls = tmp_path / "calls"
+    script = tmp_path / "worker.py"
+    script.write_text(
+        "import json, sys\n"
+        f"open({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + '\\n')\n"
+        "good = '--plants' in sys.argv\n"
+        f"print(json.dumps({{'status': 'done', 'seconds': 0.1}} if good else {TOLD!r}))\n"
+        "sys.exit(0 if good else 2)\n")
+    monkeypatch.setattr(part("preferences"), "worker_command",
+                        lambda: [sys.executable, str(script)])
+    bpy.context.scene.limber.reconstruct.unit = "mm"
+    bpy.ops.limber.import_cloud(filepath=str(scan))
+    return calls
+
+
+@pytest.mark.slow
+def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
+    """Refused; its sentence, its mark and its button are there; pressed, the step is done."""
+    with pytest.raises(RuntimeError, match=r"two plants.*Plants: largest"):
+        bpy.ops.limber.reconstruct()
+    scene, stage = bpy.context.scene, part("stages").stages()["reconstruct"]
+    mark = part("trouble_mark").of(scene, stage)
+    bpy.context.view_layer.update()
+    cloud = next(thing for thing in scene.objects if "limber_scan_sha256" in thing)
+    local = [1200.0, 2000.0, 300.0]
+    offset = cloud.get("limber_map_offset", (0.0, 0.0, 0.0))
+    assert list(mark.matrix_world.translation) == pytest.approx(
+        [0.001 * (a - b) for a, b in zip(local, offset, strict=True)], abs=1e-5)
+    drawn = _draw_step(bpy, "skeleton")
+    labels = drawn.names("label")
+    assert "The scan contains two plants." in labels
+    assert "The place is marked in the view" in labels and "Why, and what to do" in labels
+    assert not [text for text in labels if "--" in text]
+    assert ("operator", "limber.take_choice", "Plants: largest") in drawn.calls
+    assert drawn.names("operator").count("limber.take_choice") == 1, "what is unknown has no button"
+    result = bpy.ops.limber.take_choice(stage="reconstruct", option="plants", value='"largest"')
+    assert result == {"FINISHED"}
+    assert "--plants" in json.loads(failing.read_text().splitlines()[-1])
+    assert part("trouble_mark").of(scene, stage) is None
+    assert "Why, and what to do" not in _draw_step(bpy, "skeleton").names("label")
+
+
+@pytest.mark.parametrize(("stage", "text", "wanted"), [
+    ("reconstruct", "Crop it (--crop-low, --crop-high).", "Crop it (Crop low, Crop high)."),
+    ("reconstruct", "Join them (--plants joined).", "Join them (Plants: joined)."),
+    ("plan", "Run `limber energy b.branch` first.", "Run Sample the Energy first."),
+    ("plan", "Or use --goal with a tip.", "Or use Goal with a tip."),
+    ("energy", "Switch it off (--no-gravity).", "Switch it off (Gravity: off)."),
+    ("energy", "`limber cache --clear` and --such-a-thing 3", None)])
+def test_options_are_told_by_their_titles(addon, stage, text, wanted):
+    """As the panels call them; what no panel has stays as it is."""
+    words = part("plain_words").plain(text, part("stages").stages()[stage])
+    assert words == (text if wanted is None else wanted)

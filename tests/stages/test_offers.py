@@ -1,0 +1,30 @@
+"""What an error's text offers becomes options of the stage with values."""
+
+import pytest
+
+from limber.core.errors import InputError
+from limber.stages.offers import offers
+from limber.stages.registry import stage_schema
+
+
+@pytest.mark.parametrize(("stage", "text", "wanted"), [
+    ("reconstruct", "Crop it (--crop-low, --crop-high). Or use the larger plant (--plants "
+     "largest), or join them (--plants joined). Again: --plants largest.",
+     [{"option": "plants", "value": "largest"}, {"option": "plants", "value": "joined"}]),
+    ("reconstruct", "accept the axes as they are (--unexplained 1).",
+     [{"option": "unexplained", "value": 1.0}]),
+    ("reconstruct", "--plants everything, --no-such thing, `limber cache --clear`", []),
+    ("energy", "Switch weight off (--no-gravity) or sample more: --samples 200.",
+     [{"option": "gravity", "value": False}, {"option": "samples", "value": 200}]),
+    ("plan", "Choose a goal (--goal).", [])])
+def test_options_with_a_value_are_offered(stage, text, wanted):
+    """In the text's order, each once; not what the stage does not know, nor what has no value."""
+    found = offers(stage_schema(stage), text)
+    assert found == wanted
+    assert [type(one["value"]) for one in found] == [type(one["value"]) for one in wanted]
+
+
+def test_an_error_says_where_it_is():
+    """As three plain numbers, of any array; without one, it has no place."""
+    assert InputError("Two plants.").place is None
+    assert InputError("Two plants.").at(iter((1, 2.5, 3))).place == (1.0, 2.5, 3.0)

@@ -1,0 +1,51 @@
+"""What an error's text offers to do instead: options of the stage, with the value to give them."""
+
+import re
+from typing import Any
+
+_OPTION = re.compile(r"--(?P<name>[a-z][a-z0-9-]*)(?:[ =](?P<value>[^\s,;:()]+))?")
+
+
+def offers(schema: dict[str, Any], text: str) -> list[dict[str, Any]]:
+    """Return the options that a text offers with a value, in its order, each once.
+
+    Args:
+        schema: Of the stage, from :func:`limber.stages.registry.stage_schema`.
+        text: What the user reads, for example "join them (--plants joined)".
+
+    Returns:
+        For each the ``option`` (the name of its field) and its ``value``. An option without a value
+        is not among them: what to give it only the user knows.
+    """
+    fields = {name: about for part in ("inputs", "settings", "options")
+              for name, about in schema[part].get("properties", {}).items()}
+    found: list[dict[str, Any]] = []
+    for match in _OPTION.finditer(text):
+        name, value = match["name"].replace("-", "_"), (match["value"] or "").rstrip(".")
+        one = _switch(fields, name)
+        if one is None and value and name in fields:
+            one = _valued(name, fields[name], value)
+        if one is not None and one not in found:
+            found.append(one)
+    return found
+
+
+def _switch(fields: dict[str, Any], name: str) -> dict[str, Any] | None:
+    for field, value in ((name, True), (name.removeprefix("no_"), False)):
+        if (value or field != name) and fields.get(field, {}).get("type") == "boolean":
+            return {"option": field, "value": value}
+    return None
+
+
+def _valued(name: str, about: dict[str, Any], value: str) -> dict[str, Any] | None:
+    for kind in about.get("anyOf", [about]):
+        if value in kind.get("enum", ()):
+            return {"option": name, "value": value}
+        if kind.get("type") in ("number", "integer"):
+            try:
+                number = float(value)
+            except ValueError:
+                continue
+            return {"option": name,
+                    "value": int(number) if kind["type"] == "integer" else number}
+    return None
