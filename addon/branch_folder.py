@@ -46,6 +46,21 @@ class BranchRecord:
         # Two stages may make the same thing (a pull): the settings tell which one did.
         return record if record and set(record.settings) <= set(stage.fields) else None
 
+    def names(self, pattern: str) -> list[str]:
+        """Return the names of what the folder has, sorted.
+
+        Args:
+            pattern: A file with ``{name}`` in it, such as ``plans/{name}.csv``; or, ending with a
+                colon, the start of a stage's key, such as ``target:``.
+        """
+        if pattern.endswith(":"):
+            return sorted(key.removeprefix(pattern) for key in self.stages
+                          if key.startswith(pattern))
+        before, after = pattern.split("{name}")
+        found = {file.removeprefix(before).removesuffix(after) for file in self.files
+                 if file.startswith(before) and file.endswith(after)}
+        return sorted(name for name in found if name and "/" not in name)
+
     def is_stale(self, stage: Stage, record: StageRecord) -> bool:
         """Whether another stage has since rewritten an input of this stage."""
         for name, (digest, maker) in self.files.items():

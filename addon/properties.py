@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from . import branches, compat
+from . import branch_folder, branches, compat
 from .overlays import graph as viewport_graph
 from .stages import Field, SettingError, Stage, rows_of, stages
 
@@ -191,7 +191,7 @@ def stage_properties(stage: Stage, options: set[str] = frozenset()) -> dict[str,
     """Return the properties of a stage's fields, by name, with these options of properties."""
     found: dict[str, Any] = {}
     for name, field in stage.fields.items():
-        found[name] = _property(field, set(options))
+        found[name] = _property(field, set(options), _pattern(stage, field))
         if field.is_optional and has_switch(field):
             found[OPEN + name] = bpy.props.BoolProperty(
                 name=field.title, description=f"{field.description} Off: the worker decides",
@@ -199,7 +199,32 @@ def stage_properties(stage: Stage, options: set[str] = frozenset()) -> dict[str,
     return found
 
 
-def _property(field: Field, options: set[str]) -> Any:
+_PATTERNS = {"plan": "plans/{name}.csv", "motion": "frames/{name}.pc2",
+             "pull": "pulls/{name}/pull.toml", "target": "target:"}
+"""What a field of this name chooses from, as :meth:`BranchRecord.names` takes it."""
+
+
+def _pattern(stage: Stage, field: Field) -> str:
+    """Return what the folder offers for a field, or nothing: its name, where it reads such a file.
+    """
+    if field.name == "name":
+        read = next((each for each in stage.reads if "{name}" in each), "")
+        return f"{read}pull.toml" if read.endswith("/") else read
+    return _PATTERNS.get(field.name, "")
+
+
+def _search(pattern: str) -> Any:
+    """Return the function that lists what the current branch has for a text field."""
+    def found(settings: bpy.types.PropertyGroup, _context, typed: str) -> list[str]:
+        folder = branches.current_folder(settings.id_data)
+        record = None if folder is None else branch_folder.read_record(folder)
+        names = [] if record is None else record.names(pattern)
+        # What is chosen already would hide all others.
+        return names if typed in names else [name for name in names if typed in name]
+    return found
+
+
+def _property(field: Field, options: set[str], pattern: str = "") -> Any:
     if field.kind == "path":
         options |= compat.PATH_OPTIONS
     about: dict[str, Any] = {"name": field.label, "description": field.description,
@@ -207,8 +232,8 @@ def _property(field: Field, options: set[str]) -> Any:
     if field.kind == "boolean":
         return bpy.props.BoolProperty(default=bool(field.default), **about)
     if field.kind == "choice":
-        items = [(choice, choice.replace("_", " ").capitalize() if len(choice) > 2 else choice, "")
-                 for choice in field.choices]
+        items = [(choice, choice.replace("_", " ").capitalize() if len(choice) > 2 else choice,
+                  field.description) for choice in field.choices]
         return bpy.props.EnumProperty(items=items, default=field.default or items[0][0], **about)
     if field.kind == "integer":
         least = -_LARGEST_INTEGER if field.least is None else int(field.least) + field.is_open
@@ -226,6 +251,8 @@ def _property(field: Field, options: set[str]) -> Any:
             **about)
     subtype = "FILE_PATH" if field.kind == "path" else "NONE"
     default = "" if field.default is None else field.shown(field.default)
+    if pattern and field.kind in ("string", "list"):
+        about["search"] = _search(pattern)
     return bpy.props.StringProperty(default=default, subtype=subtype, **about)
 
 

@@ -42,8 +42,7 @@ class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
 
 def pulls_of(record: branch_folder.BranchRecord | None) -> list[str]:
     """Return the names of a branch's recordings, sorted."""
-    return sorted(name.split("/")[1] for name in (record.files if record else ())
-                  if name.startswith("pulls/") and name.endswith("/pull.toml"))
+    return record.names("pulls/{name}/pull.toml") if record else []
 
 
 def register() -> None:

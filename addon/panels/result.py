@@ -72,28 +72,44 @@ def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, setting
         return
     for note in info["notes"]:
         body.label(text=note)
-    moving = info.get("frame_scalars") or {}
-    if moving:
+    if info.get("frame_scalars"):
         body.prop(settings, "each_frame")
+    spans = ""
     shown = surface.get(branches.FRAME_SCALAR_KEY)
     active = surface.data.color_attributes.active_color
-    for name, scale in info["scalars"].items():
-        is_shown = name == shown if shown else active is not None and (
-            active.name == f"{name}_color")
-        told = (moving[name] if settings.each_frame and name in moving else scale)["title"]
-        title, _, rest = told.partition(" (")
-        button = body.operator("limber.color_by", text=title[0].upper() + title[1:], icon="COLOR",
-                               depress=is_shown)
-        button.scalar, button.each_frame = name, settings.each_frame
-        ticks = scale["ticks"]
-        span = f"{ticks[1]} everywhere" if scale.get("is_one") else f"{ticks[0]} to {ticks[-1]}"
-        body.label(text=f"{span} ({rest}" if rest else span, icon="BLANK1")
+    names = list(info["scalars"])
+    for pair in zip(names[::2], [*names[1::2], ""], strict=False):
+        row = body.row(align=True)
+        for name in filter(None, pair):
+            is_shown = name == shown if shown else active is not None and (
+                active.name == f"{name}_color")
+            title, _, rest = _scale(info, settings, name)["title"].partition(" (")
+            button = row.operator("limber.color_by", text=title[0].upper() + title[1:],
+                                  depress=is_shown)
+            button.scalar, button.each_frame = name, settings.each_frame
+            if is_shown:
+                spans = _span(info["scalars"][name], rest)
+    if spans:
+        body.label(text=spans, icon="COLOR")
     if "stress_over_strength" in info["scalars"]:
         row = body.row(heading="Strength [Pa]")
         row.prop(settings.scene, "use_strength", text="")
         value = row.row()
         value.active = settings.scene.use_strength
         value.prop(settings.scene, "strength", text="")
+
+
+def _scale(info: dict, settings, name: str) -> dict:
+    """Return the scale of a quantity as it would be shown: in each frame, or the worst of all."""
+    moving = info.get("frame_scalars") or {}
+    return moving[name] if settings.each_frame and name in moving else info["scalars"][name]
+
+
+def _span(scale: dict, rest: str) -> str:
+    """Return the values that the colours span, with what stands in brackets in the title."""
+    ticks = scale["ticks"]
+    span = f"{ticks[1]} everywhere" if scale.get("is_one") else f"{ticks[0]} to {ticks[-1]}"
+    return f"{span} ({rest}" if rest else span
 
 
 def _draw_in_sight(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:

@@ -295,3 +295,37 @@ def test_no_worker_is_said_in_the_panel(bpy, panels, monkeypatch):
     drawn = _draw(panels("result"), bpy.context)
     assert "No worker was found." in drawn.names("label")
     assert "preferences.addon_show" in drawn.names("operator")
+
+
+def test_names_are_chosen_from_what_the_branch_has(bpy, panels, tmp_path):
+    """Plans, motions and pulls are listed; all of them while one is chosen, else what fits."""
+    properties = importlib.import_module("limber_addon.properties")
+    stages = importlib.import_module("limber_addon.stages").stages()
+    scene = bpy.context.scene
+    scene.limber.branch_folder = str(EXAMPLE)
+
+    def listed(stage, field, typed=""):
+        stage = stages[stage]
+        search = properties._search(properties._pattern(stage, stage.fields[field]))
+        return search(properties.group_of(scene, stage), bpy.context, typed)
+    for stage, field in (("scene", "plan"), ("scene", "motion"), ("execute", "name"),
+                         ("suggest-pull", "plan")):
+        assert "to-goal" in listed(stage, field), (stage, field)
+    for stage, field in (("estimate", "pull"), ("export-pull", "name")):
+        assert listed(stage, field) == ["pull-1"]
+    assert listed("scene", "motion", "to-goal") == listed("scene", "motion")
+    assert listed("scene", "plan", "nothing") == []
+    assert properties._pattern(stages["plan"], stages["plan"].fields["name"]) == ""
+    scene.limber.branch_folder = str(tmp_path)
+    assert listed("scene", "plan") == []
+
+
+def test_every_choice_has_a_tooltip(bpy, panels):
+    """Of every setting of every stage."""
+    stages = importlib.import_module("limber_addon.stages").stages()
+    for stage in stages.values():
+        group = getattr(bpy.context.scene.limber, stage.name.replace("-", "_"))
+        for field in stage.fields.values():
+            assert field.description, (stage.name, field.name)
+            for item in getattr(group.bl_rna.properties[field.name], "enum_items", ()):
+                assert item.description, (stage.name, field.name, item.identifier)
