@@ -20,6 +20,7 @@ MODULES = (
     "operators.open_report",
     "operators.open_result",
     "operators.play",
+    "operators.picture",
     "operators.seeing",
     "operators.several",
     "operators.material",

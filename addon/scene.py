@@ -21,6 +21,7 @@ from .branches import (
     SCAN_KEY,
     SHOWS_KEY,
     UUID_KEY,
+    VIEW_KEY,
     ShownBranch,
     add_object,
 )
@@ -125,6 +126,7 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     surface = add_object(collection, name, mesh)
     # Not the folder: it may move, and the file with it.
     surface[INFO_KEY] = json.dumps({**data.info, "folder": None})
+    surface[VIEW_KEY] = data.arrays["view_direction"].tolist()
     if "map_offset" in data.info:
         surface[OFFSET_KEY] = [float(value) for value in data.info["map_offset"]]
     if "grasp" in data.arrays:

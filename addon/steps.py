@@ -30,6 +30,7 @@ class StepState(enum.Enum):
     STALE = ("out of date: its input has changed", "FILE_REFRESH")
     CHANGED = ("out of date: its settings have changed", "FILE_REFRESH")
     FAILED = ("failed", "ERROR")
+    OVER_STRENGTH = ("the stress exceeds the strength of the wood", "ERROR")
 
     @property
     def words(self) -> str:

@@ -9,15 +9,18 @@ from .. import branch_folder, branches
 from ..branch_folder import BranchRecord
 from ..operators import several
 
-_PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy", "energy_sum_nmm", 1.0, "N mm"),
+_PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy, summed", "energy_sum_nmm", 1.0, "N mm"),
               ("Peak energy", "peak_energy_j", 1e3, "mJ"), ("Peak force", "peak_force_n", 1.0, "N"),
               ("Peak strain", "peak_strain", 1e2, "%"))
 _PLAN = "plan:"
 
 
 def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
-               record: BranchRecord | None) -> None:
-    """Draw the planned path beside the one without energy, what is proven, and other plans."""
+               record: BranchRecord | None, stress_share: float) -> None:
+    """Draw the planned path beside the one without energy, what is proven, and other plans.
+
+    ``stress_share`` is the largest stress over the strength: beyond 1 the plan is not ticked.
+    """
     paths = [result.get(key) or {} for key in ("plan", "baseline")]
     if not paths[0]:
         return
@@ -29,24 +32,21 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     if saved is not None and longer is not None:
         layout.label(text=f"{saved:.0f} % of the energy saved, {abs(longer):.1f} % "
                      f"{'longer' if longer >= 0 else 'shorter'}")
-    wood = result.get("wood") or {}
-    is_over = "plan" in wood.get("paths_over", ())
-    if is_over:
-        most = f"{100 * wood['breaking_strain']:.2g} %"
-        layout.label(text=f"Over the strain that breaks wood: {most}", icon="ERROR")
+    strength = result.get("strength") or {}
+    is_over = bool(strength.get("over")) or stress_share > 1.0
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
                  f"Proven: at most {gap:.1f} % above the minimum",
-                 icon="QUESTION" if gap is None else
-                 "DOT" if (result.get("strength") or {}).get("over") else "CHECKMARK")
-    strength = result.get("strength") or {}
+                 icon="QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
     if strength.get("over"):
         layout.label(text=f"Strain {strength['peak_strain'] / strength['median_strain']:.1f} x "
                      f"the strength ({strength['source']})", icon="ERROR")
+    elif is_over:
+        layout.label(text=f"May break: stress {stress_share:.2g} times the strength", icon="ERROR")
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (
         record.stages.items() if record else ()) if key.startswith(_PLAN)}
     if len(others) > 1:
-        draw_table(layout, [["Plan", "Energy [N mm]", "Length [mm]"], *(
+        draw_table(layout, [["Plan", "Sum [N mm]", "Length [mm]"], *(
             [name, _number((each.get("plan") or {}).get("energy_sum_nmm"), 1.0),
              _number((each.get("plan") or {}).get("length_m"), 1e3)]
             for name, each in others.items())])

@@ -34,6 +34,7 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
         row = self.layout.row(align=True)
         row.operator("limber.export_motion", icon="EXPORT")
         row.operator("limber.turntable", icon="CAMERA_DATA")
+        self.layout.operator("limber.set_up_picture", icon="IMAGE_DATA")
         if context.scene.camera is not None:
             row = self.layout.row(align=True)
             row.operator("render.render", text="Render", icon="RENDER_STILL")

@@ -105,7 +105,18 @@ def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
     for other in step.others:
         if state is StepState.NOT_RUN and made & set(stages()[other.stage].writes):
             state, _ = state_of(scene, other.stage)
-    return state
+    is_done = state is StepState.DONE and step.view.stage == "plan"
+    return StepState.OVER_STRENGTH if is_done and stress_share(scene) > 1.0 else state
+
+
+def stress_share(scene: bpy.types.Scene) -> float:
+    """Return the largest stress over the strength of the plan that is set, where it is the one in
+    sight; 0 where that is not known."""
+    surface = branches.find_surface(scene)
+    info = {} if surface is None else branches.info_of(surface)
+    scale = info.get("scalars", {}).get("stress_over_strength")
+    is_shown = info.get("plan") == scene.limber.plan.name and bool(scale)
+    return float(scale["high"]) if is_shown else 0.0
 
 
 def _age(stage: Stage, group: bpy.types.PropertyGroup, record: BranchRecord,
@@ -130,6 +141,8 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     button = row.operator(f"limber.{properties.attribute_name(view.stage)}", text=stage.label,
                           icon="PLAY" if is_primary else "NONE")
     button.branch_uuid = branches.current_uuid(context.scene)
+    if view.stage == "plan" and state is StepState.DONE and stress_share(context.scene) > 1.0:
+        state = StepState.OVER_STRENGTH
     if state is not StepState.NOT_RUN:
         layout.label(text=state.words[0].upper() + state.words[1:], icon=state.icon)
     folder = branches.current_folder(context.scene)
@@ -140,7 +153,8 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
         _draw_text(layout, plain(warning, stage), "INFO")
     result = outcome.get("result", {}) if entry is None else entry.result
     if view.stage == "plan":
-        draw_paths(layout, result, branch_folder.read_record(folder) if folder else None)
+        draw_paths(layout, result, branch_folder.read_record(folder) if folder else None,
+                   stress_share(context.scene))
     elif view.stage == "estimate":
         draw_moduli(layout, result)
     if is_primary and view.stage in _GRAPHS and result:

@@ -211,7 +211,7 @@ def test_an_opened_result(bpy, panels, beam):
     bpy.context.scene.frame_set(6)
     drawn = _draw(panels("play"), bpy.context)
     assert drawn.names("operator") == ["limber.play", "limber.retime", "limber.export_motion",
-                                       "limber.turntable"]
+                                       "limber.turntable", "limber.set_up_picture"]
     assert drawn.names("label") == ["Energy 10 mJ"]
 
 

@@ -1,0 +1,71 @@
+"""Set Up Picture: what is framed, in which colours; and a plan over the strength is not ticked."""
+
+import importlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.addon.test_panels import _draw_step
+
+pytestmark = pytest.mark.usefixtures("worker_here")
+
+EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+
+
+def part(name):
+    return importlib.import_module(f"limber_addon.{name}")
+
+
+@pytest.fixture()
+def example(bpy, registered, tmp_path):
+    """The shipped example, opened beside Blender's startup camera and light."""
+    bpy.ops.wm.read_factory_settings()
+    shutil.copytree(EXAMPLE, tmp_path / "example")
+    bpy.ops.limber.open_result(directory=str(tmp_path / "example"))
+    return part("branches").find_surface(bpy.context.scene)
+
+
+@pytest.mark.slow
+def test_the_picture_has_the_whole_motion_and_the_legends_colours(bpy, example):
+    """At rest and bent, right of the legend; 1080 high; twice pressed is once made."""
+    from bpy_extras.object_utils import world_to_camera_view
+    from mathutils import Vector
+
+    scene = bpy.context.scene
+    for _ in range(2):
+        assert bpy.ops.limber.set_up_picture() == {"FINISHED"}
+    assert scene.view_settings.view_transform == "Standard"
+    assert (scene.render.resolution_y, scene.camera.name.split(".")[0]) == (1080, "Camera")
+    assert len([each for each in bpy.data.collections if "limber_picture" in each]) == 2
+    assert bpy.data.objects["Light"].hide_render, "the startup light would outshine the colours"
+    heights = []
+    for frame in (scene.frame_start, scene.frame_end):
+        scene.frame_set(frame)
+        shape = example.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        seen = np.array([world_to_camera_view(scene, scene.camera, shape.matrix_world @ Vector(
+            vertex.co)) for vertex in shape.data.vertices])
+        assert (seen[:, :2] > 0.0).all() and (seen[:, :2] < 1.0).all()
+        assert seen[:, 0].min() > 0.25, "the legend stands on the left"
+        heights.append(np.ptp(seen[:, 1]))
+    assert min(heights) > 0.4, "the branch fills the picture"
+    words = [thing.data.body for thing in scene.objects if thing.type == "FONT"]
+    assert any("Young" in text or "modulus" in text for text in words), words
+
+
+@pytest.mark.slow
+def test_a_plan_over_the_strength_is_not_ticked(bpy, example):
+    """1.8 times the assumed strength: said so, in the panel and its header; with stronger wood it
+    is done."""
+    steps, scene = part("panels.steps"), bpy.context.scene
+    step = bpy.types.LIMBER_PT_plan.step
+    assert steps.stress_share(scene) == pytest.approx(1.8, abs=0.05)
+    assert steps.step_state(scene, step) is part("steps").StepState.OVER_STRENGTH
+    drawn = _draw_step(bpy, "plan")
+    assert any(text.startswith("May break: stress 1.8") for text in drawn.names("label"))
+    assert "The stress exceeds the strength of the wood" in drawn.names("label")
+    scene.limber.scene.use_strength, scene.limber.scene.strength = True, 500e6
+    bpy.ops.limber.open_result()
+    assert steps.step_state(scene, step) is part("steps").StepState.DONE
+    assert "The stress exceeds the strength of the wood" not in _draw_step(
+        bpy, "plan").names("label")
