@@ -19,6 +19,7 @@ from benchmarks.worker_batches import (
     on_dask,
     speed_up,
 )
+from benchmarks.worker_demo import DEMO_ROWS, run_demo
 from benchmarks.worker_exports import EXPORT_ROWS, exported
 from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_hostile import HOSTILE_ROWS, hostile
@@ -96,6 +97,7 @@ PARTS = {
     "exports": Part(exported, 60, EXPORT_ROWS, grows=True),
     "ringing": Part(rung, 30, (RINGING_ROW,), grows=True),
     "silicone-beam": Part(truth_beam.swing_row, 60, (truth_beam.SWING_ROW,)),
+    "demo": Part(run_demo, 90, DEMO_ROWS),
     "readme": Part(run_readme, 60, (README_ROW,), grows=True),
     "memory": Part(_memory, 30, (MEMORY_ROW,), grows=True),
     "kills": Part(killed, 90, (KILLS_ROW,), grows=True),

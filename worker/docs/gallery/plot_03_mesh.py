@@ -15,7 +15,8 @@ import limber
 branch = limber.open("../../../blend_files/bending_branch")
 mesh, camera = branch.mesh, Camera(azimuth=-5)
 faces = outer_faces(mesh)
-fork = branch.skeleton.nodes[branch.skeleton.forks()[0]]
+axes_found = branch.skeleton
+fork = axes_found.nodes[axes_found.parent[np.argmax(axes_found.order == 1)]]
 
 figure, (whole, near) = plt.subplots(1, 2, figsize=(8, 5.5), layout="constrained")
 for axes in (whole, near):

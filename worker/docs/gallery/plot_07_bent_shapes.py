@@ -42,8 +42,9 @@ for angle in np.radians([0, 8, 16, 24]):
                  scale.to_rgba(per_face(mesh, faces, strain))[:, :3])
     place = camera(state.pose[None, :3])[0][0]
     axes.plot(*place, "o", ms=10, mfc="none", mec="#e08214", mew=2)
-    axes.annotate(f"{np.linalg.norm(state.reaction_force):.2f} N", place, xytext=(12, -4),
+    tip = camera(shapes[-1])[0][np.argmax(np.linalg.norm(shapes[-1] - base, axis=1))]
+    axes.annotate(f"{np.linalg.norm(state.reaction_force):.2f} N", tip, xytext=(6, 4),
                   textcoords="offset points")
 frame(axes, camera, *shapes)
-figure.colorbar(scale, label="largest principal strain [%]", shrink=0.8)
+figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.8)
 plt.show()

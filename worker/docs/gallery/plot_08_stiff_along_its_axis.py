@@ -3,7 +3,7 @@ Why a straight pull is not gentle
 =================================
 
 A branch is stiff along its axis. A grasp that goes aside in a straight line stretches the branch;
-one that follows the arc of least energy does not. The scales are logarithmic.
+one that follows the arc of least energy does not. The scale of forces is logarithmic.
 """
 
 import matplotlib.pyplot as plt
@@ -35,7 +35,7 @@ for label, colour in (("straight line", "#1965ce"), ("arc of least energy", "#e5
             pose[:3] = tried[np.argmin(field.energy(tried))]
         state = loaded.equilibrium(grasp, pose, start=state).require()
         forces.append(np.linalg.norm(state.reaction_force))
-    axes.loglog(1e3 * ways, forces, "o-", color=colour, label=label)
+    axes.semilogy(1e3 * ways, forces, "o-", color=colour, label=label)
 axes.set(xlabel="way aside [mm]", ylabel="force of the gripper [N]")
 axes.legend()
 plt.show()

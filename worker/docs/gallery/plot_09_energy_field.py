@@ -19,7 +19,7 @@ up = np.linspace(-spread[2], 0.4 * spread[2], 121)
 points = np.stack([*np.meshgrid(rest[0] + across, [rest[1]], rest[2] + up, indexing="ij")], -1)
 energy = 1e3 * field.energy(points.reshape(-1, 3)).reshape(161, 121)
 
-figure, axes = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
+figure, axes = plt.subplots(figsize=(7.5, 3.4), layout="constrained")
 levels = [0, 2, 5, 10, 20, 50, 100, 200, 500]
 filled = axes.contourf(1e3 * (rest[0] + across), 1e3 * (rest[2] + up), energy.T, levels,
                        cmap="viridis", extend="max", norm="symlog")
@@ -29,5 +29,5 @@ axes.plot(*(1e3 * field.positions[near][:, [0, 2]]).T, ".", color="white", ms=6,
 axes.plot(1e3 * rest[0], 1e3 * rest[2], "x", color="#e08214", ms=11, mew=3, label="at rest")
 axes.set(xlabel="x [mm]", ylabel="z [mm]", aspect="equal")
 axes.legend(loc="lower left", facecolor="#555555", labelcolor="white")
-figure.colorbar(filled, label="energy [mJ]", ticks=levels)
+figure.colorbar(filled, label="energy [mJ]", ticks=levels, shrink=0.9)
 plt.show()

@@ -3,7 +3,7 @@ A branch in the wind
 ====================
 
 How far the tip of the branch moves, and how its largest strain grows, with the speed of a steady
-wind from the side. The drag is that of bare wood, without leaves.
+wind from the side. At rest the strain is that of its own weight. The drag is that of bare wood.
 """
 
 import shutil
