@@ -111,7 +111,7 @@ def test_top_level_is_as_designed():
     top = {name.split("/")[0] for name in tracked}
     allowed = {"addon", "worker", "tests", "blend_files", "scripts", ".ci", "README.md",
                "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in",
-               "pyproject.toml", "requirements.lock", "setup.py", ".gitignore",
+               "pyproject.toml", "requirements.lock", "setup.py", ".github", ".gitignore",
                ".gitattributes", ".pre-commit-config.yaml"}
     assert top <= allowed
 

@@ -36,6 +36,6 @@ for key, path, title in (("baseline", plan.shortest_path, "shortest path"),
     axes.plot(*camera(path[:, :3])[0].T, lw=3, color=PATH_COLOURS[key],
               label=f"{title}: {peak:.1f} N at most")
 frame(axes, camera, mesh.nodes, bent)
-axes.legend(loc="lower left")
+figure.legend(loc="outside lower center", ncols=2)
 figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.8)
 plt.show()
