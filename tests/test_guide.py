@@ -63,8 +63,10 @@ def test_every_option_of_help_is_explained(written_pages):
                        for name, child in command.commands.items())
         told = command.get_help(click.Context(command, info_name=words))
         seen = set(re.findall(r"^ +(?:-\w, )?(--[a-z][a-z-]*)", told, re.MULTILINE))
-        rows = {word: line.split(" | ")[1] for line in sections[words].splitlines()
-                if line.startswith("| `") for word in re.findall(r"--[a-z-]+", line.split(" | ")[0])}
+        cells = [line.split(" | ") for line in sections[words].splitlines()
+                 if line.startswith("| `")]
+        rows = {word: meaning for names, meaning, *_ in cells
+                for word in re.findall(r"--[a-z-]+", names)}
         lacking = [word for word in seen - {"--help", "--help-all"}
                    if len(rows.get(word, "").split()) < 3]
         assert not lacking, f"limber {words}: {lacking}"
