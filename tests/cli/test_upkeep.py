@@ -5,6 +5,7 @@ import os
 import shutil
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -71,3 +72,17 @@ def test_a_bug_report_of_a_scan(tmp_path, capsys):
             assert json.loads(archive.read("report.json"))["files"]["scan.ply"]["bytes"] == 17
     assert call(["bug-report", str(tmp_path / "none"), "-o", str(out)]) == 2
     capsys.readouterr()
+
+
+def test_doctor_names_what_is_wrong_with_a_cache(tmp_path, monkeypatch, capsys):
+    """Empty files, and a disk without room."""
+    (tmp_path / "numba").mkdir()
+    (tmp_path / "numba" / "a.nbi").write_bytes(b"")
+    (tmp_path / "numba" / "b.nbi").write_bytes(bytes(2_000_000))
+    monkeypatch.setattr(caches, "cache_folder", lambda: tmp_path)
+    assert call(["doctor", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["caches"]["numba"]
+    assert told.startswith("2 files, 2 MB; 1 of them empty")
+    monkeypatch.setattr("shutil.disk_usage", lambda _place: SimpleNamespace(free=5e6))
+    assert call(["doctor", "--json"]) == 0
+    assert "its disk has 5 MB left" in json.loads(capsys.readouterr().out)["caches"]["numba"]

@@ -1,5 +1,6 @@
 """Learnt models are kept, shared, bounded, and mended where they are damaged."""
 
+import errno
 import os
 import threading
 import time
@@ -84,6 +85,31 @@ def test_a_damaged_entry_is_dropped_and_said(learnt, tmp_path, damage):
     assert len(said) == 1 and "key.npz" in said[0]
     assert not path.exists()
     assert cache.load("key") is None and len(said) == 1
+
+
+def test_a_folder_that_cannot_be_written_costs_time_only(branch, learnt, tmp_path, monkeypatch):
+    """A file in its place, as for one that is read-only or full: trained, not kept, said once."""
+    (tmp_path / "cache").write_text("")
+    monkeypatch.setattr(cache_module, "build_reduced",
+                        lambda *_args: (learnt.reduced, learnt.snapshots))
+    told = []
+    for folder in (tmp_path / "cache", tmp_path / "cache" / "below"):
+        told.clear()
+        cache = ReducedCache(folder, progress=Progress(None, told.append))
+        for _ in range(2):
+            found = learnt_model(*branch, SETTINGS, cache=cache)
+            assert found.reduced is learnt.reduced and not found.was_known
+        assert len(told) == 1 and "cannot be stored" in told[0]
+    full = ReducedCache(tmp_path / "full", progress=Progress(None, told.append))
+    monkeypatch.setattr(cache_module, "write_model", _disk_full)
+    told.clear()
+    assert not learnt_model(*branch, SETTINGS, cache=full).was_known
+    assert len(told) == 1 and "No space left" in told[0]
+    assert not list((tmp_path / "full").glob("*.part"))
+
+
+def _disk_full(*_args):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_the_least_used_go_where_room_is_short(learnt, tmp_path):

@@ -16,6 +16,7 @@ import contextlib
 import hashlib
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,13 +71,25 @@ class ReducedCache:
     Args:
         folder: Where; made if it is not there.
         limit_bytes: What all models may take; the one stored last always stays.
-        progress: Told of files that were damaged and are removed.
+        progress: Told of files that were damaged and are removed, and of a folder that cannot be
+            written: models are then trained, and not kept.
     """
 
     def __init__(self, folder: Path, *, limit_bytes: int = LIMIT_BYTES,
                  progress: Progress = SILENT):
         self.folder, self.limit_bytes, self._progress = Path(folder), limit_bytes, progress
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self._is_told = False
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            self.tell(error)
+
+    def tell(self, error: OSError) -> None:
+        """Warn, once, that models cannot be kept."""
+        if not self._is_told:
+            self._is_told = True
+            self._progress.warn(f"Reduced models cannot be stored in {self.folder} "
+                                f"({error.strerror or error}). They are trained again each time.")
 
     def path(self, key: str) -> Path:
         """Return the file of a model; :func:`read_model` reads it."""
@@ -118,9 +131,26 @@ class ReducedCache:
         self._make_room(path)
         return path
 
-    def learning(self, key: str) -> FileLock:
-        """Return the lock held while this model is trained, so that no other process trains it."""
-        return FileLock(self.folder / f"{key}.lock")
+    @contextlib.contextmanager
+    def learning(self, key: str) -> Iterator[None]:
+        """Hold the lock of a model's training, so that no other process trains it meanwhile.
+
+        Where no lock can be made, each process trains its own.
+
+        Raises:
+            Timeout: another process holds it.
+        """
+        lock = FileLock(self.folder / f"{key}.lock")
+        try:
+            lock.acquire(timeout=_WAIT_SECONDS)
+        except Timeout:
+            raise
+        except OSError as error:
+            self.tell(error)
+        try:
+            yield
+        finally:
+            lock.release()
 
     def _make_room(self, newest: Path) -> None:
         now, models = time.time(), []
@@ -168,18 +198,20 @@ def learnt_model(model: BranchModel, grasp: Grasp, weights: np.ndarray,
         return LearntModel(*build_reduced(model, grasp, weights, control_young, settings,
                                           progress), was_known=False)
     key = model_key(model, grasp, weights, control_young, settings)
-    lock = cache.learning(key)
     while True:
         known = cache.load(key)
         if known is not None:
             return LearntModel(*known, was_known=True)
         try:
-            with lock.acquire(timeout=_WAIT_SECONDS):
+            with cache.learning(key):
                 known = cache.load(key)  # the one that was waited for
                 if known is not None:
                     return LearntModel(*known, was_known=True)
                 made = build_reduced(model, grasp, weights, control_young, settings, progress)
-                cache.store(key, *made)
+                try:
+                    cache.store(key, *made)
+                except OSError as error:
+                    cache.tell(error)
                 return LearntModel(*made, was_known=False)
         except Timeout:
             progress(0.0, "another process is training this model; waiting for it")

@@ -6,11 +6,16 @@ import os
 import platform
 import shutil
 from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from limber.cli.main import Run, stage_command
+
+if TYPE_CHECKING:
+    from limber.core.files.caches import Cache
+
+_LEAST_FREE_BYTES = 200e6
 
 # Module, distribution, what does not work without it. None: nothing works without it.
 PARTS = [
@@ -73,10 +78,26 @@ def report() -> dict[str, Any]:
             f"missing: {cost or 'nothing works without it'}")
         if not present:
             missing.append(module)
+    from limber.core.files.caches import known_caches
+
     return {
+        "caches": {one.name: _told_cache(one) for one in known_caches()},
         "python": platform.python_version(), "system": platform.platform(),
         "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
     }
+
+
+def _told_cache(cache: "Cache") -> str:
+    """Size of a cache and what is wrong with it; `--warm` reads what it holds, too."""
+    told = [f"{cache.file_count} files, {cache.byte_count / 1e6:.0f} MB"]
+    if not os.access(cache.folder, os.W_OK):
+        told.append(f"{cache.folder} cannot be written: nothing is kept, every run computes it")
+    elif (free := shutil.disk_usage(cache.folder).free) < _LEAST_FREE_BYTES:
+        told.append(f"its disk has {free / 1e6:.0f} MB left (`limber cache --clear` frees some)")
+    if cache.empty_count:
+        told.append(f"{cache.empty_count} of them empty, as after a power cut: each is made again "
+                    "when needed (`limber cache --clear` removes all)")
+    return "; ".join(told)
 
 
 def _version(distribution: str) -> str:

@@ -13,12 +13,13 @@ TETRAHEDRA_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class Cache:
-    """One folder of the cache: what it holds, how many files, how many bytes."""
+    """One folder of the cache: what it holds, how many files, of those empty, how many bytes."""
 
     name: str
     folder: Path
     file_count: int
     byte_count: int
+    empty_count: int = 0
 
 
 def cache_folder() -> Path:
@@ -34,7 +35,7 @@ def known_caches() -> list[Cache]:
     found = []
     for place in sorted(path for path in folder.iterdir() if path.is_dir()):
         sizes = [size for _, size, _ in _files(place)]
-        found.append(Cache(place.name, place, len(sizes), sum(sizes)))
+        found.append(Cache(place.name, place, len(sizes), sum(sizes), sizes.count(0)))
     return found
 
 

@@ -1,5 +1,6 @@
 """Tetrahedra for a branch: our own sweep along its axes, or fTetWild on its surface."""
 
+import contextlib
 import hashlib
 import os
 from dataclasses import dataclass, field
@@ -194,11 +195,13 @@ def _from_cache(place: Path) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _to_cache(place: Path, nodes: np.ndarray, tets: np.ndarray) -> None:
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        part = place.with_name(f".{os.getpid()}-{place.name}")
-        np.savez(part, nodes=nodes, tets=tets)
-        os.replace(part, place)
-        trim(place.parent, TETRAHEDRA_BYTES)
-    except OSError:
-        return  # a cache that cannot be written costs time, not results
+    part = place.with_name(f".{os.getpid()}-{place.name}")
+    # A cache that cannot be written costs time, not results.
+    with contextlib.suppress(OSError):
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(part, nodes=nodes, tets=tets)
+            os.replace(part, place)
+            trim(place.parent, TETRAHEDRA_BYTES)
+        finally:
+            part.unlink(missing_ok=True)
