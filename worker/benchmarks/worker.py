@@ -23,6 +23,7 @@ from benchmarks.worker_demo import DEMO_ROWS, run_demo
 from benchmarks.worker_exports import EXPORT_ROWS, exported
 from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_hostile import HOSTILE_ROWS, hostile
+from benchmarks.worker_kernel_cache import KERNELS_ROW, kernels
 from benchmarks.worker_kills import KILLS_ROW, killed
 from benchmarks.worker_readers import READERS
 from benchmarks.worker_readme import README_ROW, run_readme
@@ -72,6 +73,10 @@ def _hostile(setting: Setting) -> list[Row]:
     return hostile(setting, TEMPLATE)
 
 
+def _kernels(setting: Setting) -> list[Row]:
+    return kernels(setting, TEMPLATE)
+
+
 def _fuzzed(setting: Setting, names: tuple[str, ...] = tuple(READERS)) -> list[Row]:
     """One row for all readers, and one for each."""
     found = fuzz(list(names), setting, TEMPLATE, _harmful(setting))
@@ -93,6 +98,7 @@ PARTS = {
     "hostile": Part(_hostile, 60, HOSTILE_ROWS, grows=True),
     "fuzz": Part(_fuzzed, 60, (_FUZZED, *map(_fuzz_asked, READERS)), grows=True),
     "readers": Part(reported, 120, REPORT_ROWS),
+    "kernel-cache": Part(_kernels, 60, (KERNELS_ROW,), grows=True),
     "start-up": Part(_start_up, 15, tuple(_START_UP.values())),
     "exports": Part(exported, 60, EXPORT_ROWS, grows=True),
     "ringing": Part(rung, 30, (RINGING_ROW,), grows=True),
