@@ -1,8 +1,9 @@
 """Puts the add-on's modules into the wheel: `limber scene` has a process with bpy run them.
 
-Everything else stands in pyproject.toml.
+The list of packages that it was tested with (SBOM) goes beside them. Everything else stands in pyproject.toml.
 """
 
+import runpy
 from pathlib import Path
 
 from setuptools import setup
@@ -27,6 +28,13 @@ class BuildWithAddon(build_py):
                           source.relative_to(ROOT / "addon"))
             self.mkpath(str(target.parent))
             self.copy_file(str(source), str(target))
+        self._write_sbom()
+
+    def _write_sbom(self):
+        known = runpy.run_path(str(ROOT / "scripts" / "check_dependencies"))
+        lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+        Path(self.build_lib, "limber", "sbom.cdx.json").write_text(
+            known["sbom"](known["pins"](lock), self.distribution.get_version()), encoding="utf-8")
 
 
 setup(cmdclass={"build_py": BuildWithAddon})

@@ -54,6 +54,7 @@ def main(arguments: list[str]) -> int:
     parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
     if not others or asked.fast:
         parts.append(command("types", [BIN / "mypy"]))
+        parts.append(command("packages", [sys.executable, ROOT / "scripts/check_dependencies"]))
     parts.extend(tests(asked.fast, others))
     if asked.ci:
         parts += [command(name, [ROOT / "scripts" / f"test_{name}"]) for name in ("zip", "wheel")]

@@ -165,6 +165,12 @@ def _build(root, out):
     return Path(done.stdout.splitlines()[-1]), done.stderr
 
 
+def _copy_scripts(root):
+    (root / "scripts").mkdir()
+    for name in ("scripts/build_extension", "scripts/check_dependencies", "requirements.lock"):
+        shutil.copy(ROOT / name, root / name)
+
+
 def _check(path):
     with zipfile.ZipFile(path) as archive:
         names = set(archive.namelist())
@@ -172,7 +178,7 @@ def _check(path):
     assert path.name == f"limber-{manifest['version']}.zip"
     sources = {file.relative_to(ROOT / "addon").as_posix()
                for file in (ROOT / "addon").rglob("*.py")}
-    assert sources <= names
+    assert sources | {"sbom.cdx.json"} <= names
     assert not [name for name in names if "__pycache__" in name or name.endswith(".pyc")]
 
 
@@ -192,8 +198,7 @@ def test_by_the_bpy_package(tmp_path, bpy):
 def test_without_any_blender(tmp_path):
     """With neither, the zip is made all the same, and what was not checked is said."""
     shutil.copytree(ROOT / "addon", tmp_path / "addon")
-    (tmp_path / "scripts").mkdir()
-    shutil.copy(ROOT / "scripts" / "build_extension", tmp_path / "scripts")
+    _copy_scripts(tmp_path)
     path, said = _build(tmp_path, tmp_path / "out")
     assert "NOT checked" in said
     _check(path)
@@ -204,8 +209,7 @@ def test_an_invalid_manifest_is_refused(tmp_path, bpy):
     if not list((ROOT / ".venv").glob("lib/python3*/site-packages/bpy")):
         pytest.skip("NO BPY in .venv: scripts/setup brings it")
     shutil.copytree(ROOT / "addon", tmp_path / "addon")
-    (tmp_path / "scripts").mkdir()
-    shutil.copy(ROOT / "scripts" / "build_extension", tmp_path / "scripts")
+    _copy_scripts(tmp_path)
     (tmp_path / ".venv").symlink_to(ROOT / ".venv")
     manifest = tmp_path / "addon" / "blender_manifest.toml"
     manifest.write_text(manifest.read_text().replace("scanned ones do", "scanned ones do."))

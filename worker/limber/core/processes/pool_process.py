@@ -165,7 +165,7 @@ def _sendable(error: BaseException) -> BaseException:
     if not isinstance(error, LimberError):
         error.add_note("In a process of the pool:\n" + "".join(traceback.format_exception(error)))
     try:
-        pickle.loads(pickle.dumps(error))
+        pickle.loads(pickle.dumps(error))  # noqa: S301 (bytes of this very process)
     except Exception:
         return WorkError(f"A process of the pool failed: {error!r}.",
                          "".join(traceback.format_exception(error)))
