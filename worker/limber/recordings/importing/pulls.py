@@ -132,7 +132,7 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
     robot: Stream = found if chosen.holds == "robot" else _gripper(request)
     poses, wrenches = (np.ascontiguousarray(part) for part in np.hsplit(robot.values, 2))
     if not np.isfinite(poses).all(axis=1).any():
-        raise no_pose(request.source if chosen.holds == "robot" else Path(request.settings.robot))
+        raise no_pose(Path(request.settings.robot or request.source))
     entry = request.entry(
         "none" if chosen.holds == "robot" else chosen.holds, rest, drive=settings.drive,
         mode=settings.grasp_mode, sigma=settings.position_sigma or 1e-3,

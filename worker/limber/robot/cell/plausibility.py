@@ -140,7 +140,7 @@ def _place_slips(cell: "Cell") -> Iterator[str]:
     if cell.workspace is None:
         return
     low, high = np.array(cell.workspace.low_m), np.array(cell.workspace.high_m)
-    shoulder = matrices(cell.base.pose) @ np.r_[cell.arm.shoulder, 1.0]
+    shoulder = matrices(np.array(cell.base.pose)) @ np.r_[cell.arm.shoulder, 1.0]
     away = float(np.linalg.norm(shoulder[:3] - np.clip(shoulder[:3], low, high)))
     grasp = math.hypot(*cell.tool.grasp_pose[:3])
     # The flange is beyond the wrist by less than the reach of any arm.
