@@ -1,4 +1,4 @@
-"""Files changed at random, as damage and malice do: bytes, lines, numbers, JSON, arrays."""
+"""Files changed at random, as damage, malice and slips do: bytes, lines, numbers, units, titles."""
 
 import io
 import json
@@ -12,6 +12,10 @@ import numpy as np
 
 _NASTY_TEXT = ("nan", "inf", "-inf", "1e400", "-1", "0", "1e30", "99999999999", "4294967295", "",
                "true", "[]", "{}", "null", "x", "../../x", "1e-300", "<b>", "\0", "0 0 0")
+_FACTORS = (1e3, 1e-3, 1e6, 1e-6, 1e9, 57.29577951, 0.0254, -1.0, 0.0, 1e30, 1e200, 1e-300)
+"""From metres to millimetres, degrees, inches; from seconds to nanoseconds; and nonsense."""
+_TITLES = ("x", "X [mm]", "Force (kN)", "time_ms", "t_us", "//X", "", '"x"', "Zeit", "index",
+           "x_m", "nan", "a" * 300, "Fx [N]", "x,y")
 _NASTY_JSON = (None, True, -1, 0, 1e308, -1e308, 10**30, "", "x", "../../etc", [], {}, [[]],
                [None], ["x"], {"x": 1}, "1e400", "NaN", 0.5)
 _NASTY_BYTES = (b"\0", b"\xff", b"\x7f", b"\xff" * 4, b"\0" * 4, b"\xff\xff\xff\x7f", b"\xff" * 8,
@@ -19,13 +23,15 @@ _NASTY_BYTES = (b"\0", b"\xff", b"\x7f", b"\xff" * 4, b"\0" * 4, b"\xff\xff\xff\
 
 
 def mutated(content: bytes, kind: str, rng: np.random.Generator) -> bytes:
-    """Return changed content of a file that is ``text``, ``json``, ``npz`` or ``binary``."""
+    """Return changed content of a file that is ``text``, ``json``, ``npz``, ``binary`` or a command
+    line (``words``)."""
     ways: dict[str, list[Callable[[bytes, np.random.Generator], bytes]]] = {
-        "text": [_numbers_replaced, _numbers_replaced, _lines_changed, _bytes_changed],
+        "text": [_numbers_replaced, _numbers_replaced, _lines_changed, _bytes_changed,
+                 _column_scaled, _column_scaled, _title_changed],
         "json": [_value_replaced, _value_replaced, _value_replaced, _numbers_replaced,
-                 _bytes_changed],
-        "npz": [_array_changed, _array_changed, _array_changed, _bytes_changed],
-        "binary": [_bytes_changed]}
+                 _bytes_changed, _numbers_scaled],
+        "npz": [_array_changed, _array_changed, _array_changed, _bytes_changed, _array_scaled],
+        "binary": [_bytes_changed], "words": [_word_changed]}
     for _ in range(1 if rng.random() < 0.7 else int(rng.integers(2, 5))):
         found = ways[kind]
         content = found[rng.integers(len(found))](content, rng)
@@ -86,6 +92,89 @@ def _lines_changed(content: bytes, rng: np.random.Generator) -> bytes:
     return b"\n".join(lines)
 
 
+def _scaled(text: str, factor: float) -> str:
+    try:
+        return f"{float(text) * factor:.9g}"
+    except ValueError:
+        return text
+
+
+def _column_scaled(content: bytes, rng: np.random.Generator) -> bytes:
+    """One column in another unit, of another sign, constant, or exchanged with another."""
+    text = content.decode("latin-1")
+    lines = text.split("\n")
+    sign = max(",;\t ", key=lines[len(lines) // 2].count)
+    width = lines[len(lines) // 2].count(sign) + 1
+    at, other, way = (int(rng.integers(width)), int(rng.integers(width)), int(rng.integers(4)))
+    factor = float(_FACTORS[rng.integers(len(_FACTORS))])
+    for number, line in enumerate(lines):
+        fields = line.split(sign)
+        if len(fields) != width or (number == 0 and way != 3):
+            continue
+        if way == 3:
+            fields[at], fields[other] = fields[other], fields[at]
+        elif way == 2:
+            fields[at] = "0"
+        else:
+            fields[at] = _scaled(fields[at], factor)
+        lines[number] = sign.join(fields)
+    return "\n".join(lines).encode("latin-1")
+
+
+def _title_changed(content: bytes, rng: np.random.Generator) -> bytes:
+    """A word of the first line is another title, or unit."""
+    first, end, rest = content.partition(b"\n")
+    words = [part for part in first.replace(b";", b",").split(b",") if part]
+    if not words:
+        return _lines_changed(content, rng)
+    title = _TITLES[rng.integers(len(_TITLES))].encode()
+    return first.replace(words[int(rng.integers(len(words)))], title, 1) + end + rest
+
+
+def _numbers_scaled(content: bytes, rng: np.random.Generator) -> bytes:
+    """All numbers of a JSON list, or one number, in another unit."""
+    try:
+        tree = json.loads(content)
+    except ValueError:
+        return _bytes_changed(content, rng)
+    factor = float(_FACTORS[rng.integers(len(_FACTORS))])
+    places = [(holder, key) for _, holder, key in _places(tree)
+              if isinstance(holder[key], int | float) and not isinstance(holder[key], bool)]
+    if not places:
+        return content
+    holder, chosen = places[int(rng.integers(len(places)))]
+    for key in (range(len(holder)) if isinstance(holder, list) else [chosen]):
+        if isinstance(holder[key], int | float):
+            holder[key] = holder[key] * factor
+    return json.dumps(tree).encode()
+
+
+def _word_changed(content: bytes, rng: np.random.Generator) -> bytes:
+    """A command line with another value, a word less or twice, or a further option."""
+    from benchmarks.worker_command_lines import with_further_option
+
+    try:
+        line = json.loads(content)
+        assert isinstance(line, list) and line
+    except (ValueError, AssertionError):
+        return content
+    way = int(rng.integers(7))
+    at = int(rng.integers(len(line)))
+    if way == 0:
+        del line[at]
+    elif way == 1:
+        line.insert(at, line[at])
+    elif way >= 4:
+        line = with_further_option(line, rng)
+    values = [number for number, word in enumerate(line)
+              if number > 1 and word[:2] not in ("--", "-o") and "{" not in word]
+    if way >= 2 and values:
+        at = values[int(rng.integers(len(values)))]
+        line[at] = (_scaled(line[at], float(_FACTORS[rng.integers(len(_FACTORS))]))
+                    if rng.random() < 0.5 else _NASTY_TEXT[rng.integers(len(_NASTY_TEXT))])
+    return json.dumps([word.replace("\0", "\x01") for word in line]).encode()
+
+
 def _value_replaced(content: bytes, rng: np.random.Generator) -> bytes:
     try:
         tree = json.loads(content)
@@ -114,6 +203,27 @@ def _places(tree: Any, depth: int = 0) -> Any:
     for key in list(keys):
         yield depth, tree, key
         yield from _places(tree[key], depth + 1)
+
+
+def _array_scaled(content: bytes, rng: np.random.Generator) -> bytes:
+    """Numbers of an array in another unit, as dates, or complex."""
+    try:
+        with np.load(io.BytesIO(content)) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (ValueError, OSError, EOFError, KeyError, TypeError, NotImplementedError, SyntaxError,
+            tokenize.TokenError, zipfile.BadZipFile, zlib.error):
+        return _bytes_changed(content, rng)
+    numbers = [name for name, array in arrays.items() if array.dtype.kind in "fiu"]
+    if not numbers:
+        return content
+    name, way = numbers[int(rng.integers(len(numbers)))], int(rng.integers(6))
+    kind = {0: complex, 1: "datetime64[s]", 2: bool}.get(way)
+    with np.errstate(all="ignore"):
+        arrays[name] = (arrays[name] * _FACTORS[rng.integers(len(_FACTORS))] if kind is None else
+                        arrays[name].astype(np.int64).astype(kind))
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
 
 
 def _array_changed(content: bytes, rng: np.random.Generator) -> bytes:

@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.worker_bag_readers import BAG_READERS
 from benchmarks.worker_branch_readers import BRANCH_READERS, Reader, template_file
+from benchmarks.worker_command_lines import LINE_READERS
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Registry
 from limber.geometry.io.skeletons import SKELETONS
@@ -458,6 +459,6 @@ READERS: dict[str, Reader] = {
     "job TOML": Reader("text", _jobs, _read_jobs),
     "cell TOML": Reader("text", _cell, _read_cell),
     "session commands": Reader("text", _commands, _read_commands),
-    **BAG_READERS, **BRANCH_READERS,
+    **BAG_READERS, **BRANCH_READERS, **LINE_READERS,
 }
 """Readers by name."""
