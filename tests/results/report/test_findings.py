@@ -1,13 +1,11 @@
 """What was found, in sentences: numbers with units, and what is beyond an arm or the wood."""
 
 import numpy as np
-import pytest
 
 from limber.core.constants import DATA_COLOURS
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.planning.settings import PlanSettings
-from limber.results.report import estimate_figures, plan_figures
-from limber.results.report.findings import (
+from limber.planning.constraints.damage import Strength, assumed
+from limber.results.findings import (
     beyond_sentence,
     certificate_sentence,
     modulus_origin,
@@ -15,8 +13,8 @@ from limber.results.report.findings import (
     path_sentence,
     remarks_on,
 )
+from limber.results.report import estimate_figures, plan_figures
 from limber.results.report.report_tables import comparison_rows
-from limber.stages.paths.plan import _wood
 from limber.store import Branch
 
 PLAN = {"plan": {"length_m": 0.177, "peak_energy_j": 0.0555, "peak_force_n": 0.657,
@@ -65,19 +63,16 @@ def test_a_force_beyond_an_arm_is_said_beside_it():
     assert force[1] == "104" and force[-1] == "shortest: more than a UR10 carries (98 N)"
 
 
-@pytest.mark.parametrize(("settings", "over", "words"), [
-    ({}, ["plan", "baseline"], "0.6 % at which green wood breaks (assumed)"),
-    ({"wood": "ash"}, ["plan", "baseline"], "0.66 % at which ash breaks."),
-    ({"max_strain": 0.02}, None, "")])
-def test_a_plan_over_the_strength_of_the_wood_says_so(settings, over, words):
-    """Of the species' wood, else of green wood, assumed; not where the user knows his own."""
-    wood = _wood(PlanSettings(**settings), PLAN)
-    assert (wood and wood["paths_over"]) == over
-    plan = PLAN | {"wood": wood}
-    assert bool(beyond_sentence(plan).count("strain")) == bool(over)
-    assert words in beyond_sentence(plan)
-    gentle = {"plan": {"peak_strain": 0.004}, "baseline": {"peak_strain": 0.009}}
-    assert _wood(PlanSettings(), gentle)["paths_over"] == ["baseline"]
+def test_a_plan_over_the_strength_of_the_wood_says_so():
+    """Of the tested or the species' wood, else of green wood, assumed."""
+    told = PLAN | {"strength": assumed(0.0078)}
+    assert ("shortest and gentle: over the 0.6 % at which half of such branches break (green wood, "
+            "assumed)") in beyond_sentence(told)
+    ash = PLAN | {"strength": Strength.of_species("ash", 0.0).describe(0.0078)}
+    assert beyond_sentence(ash).count("0.66 %") == 1 and "ash" in beyond_sentence(ash)
+    gentle = told | {"plan": PLAN["plan"] | {"peak_strain": 0.004}}
+    assert "shortest: over the 0.6 %" in beyond_sentence(gentle)
+    assert "strain" not in beyond_sentence(PLAN)
 
 
 def test_a_modulus_says_where_it_is_from(tmp_path):

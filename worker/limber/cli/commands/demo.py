@@ -274,7 +274,7 @@ def _show_tables(demo: _Demo) -> None:
 
 def _found(demo: _Demo) -> list[str]:
     """What the demo found, in the sentences of its stages."""
-    from limber.results.report.findings import beyond_sentence, certificate_sentence, path_sentence
+    from limber.results.findings import beyond_sentence, certificate_sentence, path_sentence
 
     plan = demo.results["plan"]
     told = [path_sentence(plan), certificate_sentence(plan), beyond_sentence(plan)]

@@ -8,9 +8,9 @@ import numpy as np
 from limber.core.constants import MARK_COLOURS
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.results.findings import modulus_origin
 from limber.results.report.charts import chart, draw_faces, two_views
 from limber.results.report.estimate_figures import AXIS_DOTS, AXIS_LINES, OBSERVED, SIMULATED
-from limber.results.report.findings import modulus_origin
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 

@@ -14,9 +14,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.estimate_file import read_estimate
 from limber.geometry.skeleton.qsm_tables import Caliper
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.results.motion_files import read_frames_file
-from limber.results.report import figures, loads_section, swing_section
-from limber.results.report.findings import (
+from limber.results.findings import (
     ASSUMED,
     ASSUMED_PULL,
     beyond_sentence,
@@ -25,6 +23,8 @@ from limber.results.report.findings import (
     path_sentence,
     simulated_pull,
 )
+from limber.results.motion_files import read_frames_file
+from limber.results.report import figures, loads_section, swing_section
 from limber.results.report.path_sections import energy_section, execution_section, plan_section
 from limber.results.report.report_tables import (
     cause_rows,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from limber.results.report.findings import ASSUMED, remarks_on
+from limber.results.findings import ASSUMED, remarks_on
 
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,

@@ -59,8 +59,8 @@ import numpy as np
 
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loads.loaded_branch import NamedTarget
+from limber.results.findings import modulus_origin
 from limber.results.motion_files import node_average
-from limber.results.report.findings import modulus_origin
 from limber.results.scene.animation import add_motion
 from limber.results.scene.arrays import FORMAT, SceneData
 from limber.results.scene.colours import colour_scale

@@ -7,7 +7,7 @@ import numpy as np
 from limber.core.files.reading import read_arrays, read_columns, require_shapes
 from limber.planning.plan_file import read_plan_summary
 from limber.planning.search_files import read_trees
-from limber.results.report.findings import PATH_NAMES, SAME, remarks_on
+from limber.results.findings import PATH_NAMES, SAME, remarks_on
 from limber.results.scene.arrays import SceneData
 from limber.results.scene.colours import colour_scale, colours_of
 from limber.results.scene.graphs import energy_graph

@@ -268,7 +268,7 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 
 
 def _moduli_line(values: Mapping[str, Any]) -> str:
-    from limber.results.report.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
+    from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
 
     pull = simulated_pull(Branch.read(values["branch_folder"]))
     return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")

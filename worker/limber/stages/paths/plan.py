@@ -154,8 +154,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         if found.summary["stopped"] and finished:
             raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
                             "Run it again when there is time for it.")
-        found.summary["strength"] = strength_of_plan(
-            strength, found.plan, found.summary.get("in_motion"), progress)
+        # Whoever limits the strain knows the wood: nothing is assumed of it.
+        if strength is not None or settings.max_strain is None:
+            found.summary["strength"] = strength_of_plan(
+                strength, found.plan, found.summary.get("in_motion"), progress)
         pace = found.pace
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:
@@ -167,7 +169,6 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         progress(0.95, "writing")
         rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
         found.summary["setpoint_rate_hz"] = rate
-        found.summary["wood"] = _wood(settings, found.summary)
         stage.path(f"plans/{name}-setpoints.csv").write_text(_setpoints(motion, pace, rate),
                                                              encoding="utf-8")
         _write(stage, name, limits, pace, motion, grasp_model, found)
@@ -235,20 +236,6 @@ class _InCell:
                     f"clearance of {1e3 * self.clearance:.1f} mm.",
                     "The branch cannot be moved there.",
                     "Choose another goal, or correct the obstacle in the cell file.")
-
-
-def _wood(settings: PlanSettings, summary: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the strain at which the wood breaks, and the paths that are over it; None where the
-    user has set a limit of the strain for wood that he knows."""
-    from limber.mechanics.materials.species import SPECIES, STRENGTH_OVER_YOUNG
-
-    if settings.max_strain is not None:
-        return None
-    known = settings.wood and SPECIES[settings.wood].rupture_strain
-    most = known or STRENGTH_OVER_YOUNG
-    return {"name": settings.wood, "breaking_strain": most, "is_assumed": not known,
-            "paths_over": [path for path in ("plan", "baseline")
-                           if summary[path].get("peak_strain", 0.0) > most]}
 
 
 def _stiffer(branch: Branch) -> float:
@@ -359,7 +346,7 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 
 
 def _found_lines(values: Mapping[str, Any]) -> str:
-    from limber.results.report.findings import (
+    from limber.results.findings import (
         beyond_sentence,
         certificate_sentence,
         modulus_origin,

@@ -97,8 +97,8 @@ def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:
     """Return what is beyond an arm or the wood along a plan's paths, by measure.
 
     Args:
-        plan: Summary of a plan; ``robot`` names the arm it is for, ``wood`` has the strain at
-            which the wood breaks, and the paths that are over it.
+        plan: Summary of a plan; ``robot`` names the arm it is for, ``strength`` has the strain at
+            which half of such branches break, and its source.
 
     Returns:
         Sentences by ``peak_force_n`` and ``peak_strain``; nothing where all is within reach.
@@ -138,11 +138,11 @@ def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
 
 
 def _over_wood(path: str, plan: Mapping[str, Any]) -> str:
-    wood = plan.get("wood")
-    if not wood or path not in wood["paths_over"]:
+    strength = plan.get("strength")
+    if not strength or plan[path]["peak_strain"] <= strength["median_strain"]:
         return ""
-    return (f"over the {100 * wood['breaking_strain']:.2g} % at which "
-            f"{wood['name'] or 'green wood'} breaks{' (assumed)' if wood['is_assumed'] else ''}")
+    return (f"over the {100 * strength['median_strain']:.2g} % at which half of such branches "
+            f"break ({strength['source']})")
 
 
 def _with_interval(young: float, interval: Sequence[float | None] | None) -> str:
