@@ -19,7 +19,7 @@ SETTINGS = PlanSettings(iterations=300, engine="own", seed=3)
 
 @pytest.fixture(scope="module")
 def trials(ridge_field):
-    return run_trials(ridge_field, GraspGoal((0.1, 0.06, 0.02), 0.02), SETTINGS, 3)
+    return run_trials(ridge_field, GraspGoal((0.1, 0.06, 0.02), 0.02), SETTINGS, 3, workers=1)
 
 
 def test_trials_start_elsewhere_and_are_scored_alike(trials, ridge_field):
@@ -57,7 +57,7 @@ def test_the_table_has_means_deviations_and_changes(trials):
 def test_the_command_writes_table_and_figure(planned_branch, tmp_path, monkeypatch):
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     settings = CompareSettings(trials=1, iterations=300, engine="own", seed=3)
-    result = compare(folder, settings, progress=Progress(on_warning=pytest.fail))
+    result = compare(folder, settings, workers=1, progress=Progress(on_warning=pytest.fail))
     with (folder / "comparisons/planners.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["planner"] for row in rows] == list(COMPARED.values())

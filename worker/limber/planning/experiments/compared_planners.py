@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import NoPathError
+from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.planning.cost import STEP, measure_path, resample
 from limber.planning.field.energy_field import EnergyField
@@ -51,18 +52,14 @@ class ComparedTrial:
 
 
 def run_trials(field: EnergyField, goal: Goal, settings: PlanSettings, count: int, *,
-               progress: Progress = SILENT) -> list[ComparedTrial]:
+               workers: int | None = None, progress: Progress = SILENT) -> list[ComparedTrial]:
     """Return ``count`` trials; the seeds of starts and planners follow from ``settings.seed``."""
-    trials = []
-    for number in range(count):
-        part = progress.part(number / count, (number + 1) / count)
-        part(0.0, f"trial {number + 1} of {count}")
-        trials.append(_trial(field, goal, settings, number, part))
-    return trials
+    return run_tasks(_trial, [(field, goal, settings, number) for number in range(count)],
+                     workers=workers, progress=progress, message="planning from random starts")
 
 
 def _trial(field: EnergyField, goal: Goal, settings: PlanSettings, number: int,
-           progress: Progress) -> ComparedTrial:
+           progress: Progress = SILENT) -> ComparedTrial:
     own = settings.model_copy(update={"seed": settings.seed + number})
     start = field.rest
     try:

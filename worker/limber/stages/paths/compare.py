@@ -57,7 +57,8 @@ class CompareSettings(Settings):
 
 
 def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
-            force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+            workers: int | None = None, force: bool = False,
+            progress: Progress = SILENT) -> dict[str, Any]:
     """Stage ``compare``: plan from random starts with each planner, on the branch's energy field.
 
     Writes ``comparisons/NAME.csv``, a row a path, and ``comparisons/NAME.png``.
@@ -86,7 +87,8 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
     asked = PlanSettings(**{each: getattr(settings, each) for each in (
         "goal_tolerance", "seed", "max_detour", "iterations", "engine")})
     with branch.stage(key, settings, reads=reads) as stage:
-        trials = run_trials(field, goal, asked, settings.trials, progress=progress)
+        trials = run_trials(field, goal, asked, settings.trials, workers=workers,
+                            progress=progress)
         good = [trial for trial in trials if trial.scores]
         if not good:
             raise NoPathError(f"None of {len(trials)} trials has a path.", trials[0].trouble,
