@@ -7,13 +7,14 @@ import pytest
 
 from limber.planning import closed_passages
 from limber.planning.certificate.feasibility import judge
-from limber.planning.closed_passages import checked_wall, confirmed
+from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.local_error import LocalError
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
+from limber.planning.planners.easiest import EasiestWay
 
 
 def noisy(count, seed):
@@ -93,17 +94,28 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     low, high = Limits(force=0.3 * forces.min()), Limits(force=3.0 * forces.max())
     monkeypatch.setattr(Limits, "errors", lambda self, known: {})
     check = checked_wall(field, small_model, low, none, workers=1)
-    assert check.learnt is None and check.solved == 2
+    assert check.bears_out and check.learnt is None and check.solved == 2
     assert "2 states of the full model, where the way is closed, confirm it" in str(
         confirmed(none, check))
     refuted = checked_wall(field, small_model, high, none, workers=1)
-    assert len(refuted.learnt.poses) == 2
+    assert not refuted.bears_out and len(refuted.learnt.poses) == 2
     again = small_model.follow(refuted.learnt.poses[:1, :3], small_model.rest.displacement)[0]
     assert np.allclose(again.reaction_force, refuted.learnt.forces[0], atol=1e-3 * forces.max())
     wrong = LocalError(np.zeros((1, 3)), np.zeros(1), 1.0, 0.0, -1.0)  # the field says too much
     monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
     assert checked_wall(field, small_model, low, none, workers=1).learnt is not None
-    assert not NoWayError("Nothing.", "", "").wall.size
+    assert checked_wall(field, small_model, low, NoWayError("No."), workers=1).bears_out
+    monkeypatch.setattr(closed_passages, "solve_branch", lambda *_, **__: ([None], []))
+    unsolved = checked_wall(field, small_model, low, none, workers=1)
+    assert not unsolved.bears_out and unsolved.learnt is None
+
+
+def test_a_proof_that_is_not_borne_out_is_none():
+    """What is said then proves nothing, and names the limits."""
+    said = not_confirmed(Limits(force=4.0), EasiestWay(np.zeros((2, 3)), 1.04))
+    assert not said.is_proven and "force 4 N" in said.seen and "104 % of a limit" in said.why
+    assert "easiest" not in not_confirmed(Limits(force=4.0), None).why
+    assert NoWayError("No path exists.", "Proven.", "").is_proven
 
 
 def test_a_proof_tells_where_the_way_is_closed(half_rough):

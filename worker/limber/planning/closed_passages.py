@@ -19,6 +19,7 @@ from limber.planning.field.sampling import solve_branch
 from limber.planning.field.solved import samples_of
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.path_problem import UNPROVEN, NoWayError
+from limber.planning.planners.easiest import EasiestWay
 
 _STATES = 12  # of the branch that are solved
 _APART = 0.01  # [m] between them, and between them and known samples
@@ -31,35 +32,39 @@ class WallCheck:
 
     Attributes:
         solved: How many states have a solution.
-        learnt: What contradicts the proof, as samples; None where nothing does.
+        bears_out: Whether these states bear the proof out; also where no limit closes the way, but
+            the border of the sampled region does.
+        learnt: The states of a proof that they do not bear out, as samples.
     """
 
     solved: int
-    learnt: GraspSamples | None
+    bears_out: bool
+    learnt: GraspSamples | None = None
 
 
 def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: NoWayError, *,
                  workers: int | None = None, progress: Progress = SILENT) -> WallCheck:
     """Solve the branch where ``none`` says that the way is closed.
 
-    A pose without a solution is closed as well: the branch cannot be there.
+    A pose without a solution is closed as well: the branch cannot be there. Without any solution
+    nothing is borne out.
     """
     places = _chosen(none.wall)
     if not len(places):
-        return WallCheck(0, None)
+        return WallCheck(0, True)
     with SolverPool(grasp_model, workers) as solvers:
         good, _ = solve_branch(solvers, places, progress=progress)
     states = good[1:]
     if not states:
-        return WallCheck(0, None)
+        return WallCheck(0, False)
     samples = samples_of(states, np.empty((0, 3)))
     nodes = grasp_model.mesh.nodes + np.array([one.displacement for one in states])
     samples = replace(samples, added=limits.values(samples.positions, nodes))
     if not _contradicts(field, limits, samples).any():
-        return WallCheck(len(states), None)
+        return WallCheck(len(states), True)
     away = np.linalg.norm(samples.positions[:, None] - field.samples.positions[None], axis=2)
     new = np.flatnonzero(away.min(axis=1) > _LEARNT_APART)
-    return WallCheck(len(states), samples.take(new))
+    return WallCheck(len(states), False, samples.take(new) if len(new) else None)
 
 
 def _chosen(wall: np.ndarray) -> np.ndarray:
@@ -103,10 +108,14 @@ def confirmed(none: NoWayError, check: WallCheck) -> NoWayError:
                       "way is closed, confirm it.", none.fix)
 
 
-def not_confirmed(none: NoWayError, limits_in_words: str) -> NoWayError:
-    """Return the error of a proof that the full model does not bear out."""
+def not_confirmed(limits: Limits, easiest: EasiestWay | None) -> NoWayError:
+    """Return the error of a proof that the full model does not bear out; ``easiest`` is the way
+    that goes least over the limits."""
+    least = "" if easiest is None or easiest.worst <= 1.0 else (
+        f" By the field the easiest way takes {100.0 * easiest.worst:.0f} % of a limit, within its "
+        "error.")
     return NoWayError(
-        f"No path to the goal with{limits_in_words or ' known poses'} was found, {UNPROVEN}.",
-        "The energy field, its error counted, leaves no path, but the full model differs from it "
-        "by more where the way is closed.",
+        f"No path to the goal with{limits.in_words() or ' known poses'} was found, {UNPROVEN}.",
+        "The energy field, its error counted, leaves no path, but the full model does not confirm "
+        f"that where the way is closed.{least}",
         "Relax the limits slightly, or sample more poses with `limber energy --samples`.")

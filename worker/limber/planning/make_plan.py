@@ -30,6 +30,7 @@ from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_sid
 from limber.planning.path_problem import NoWayError
 from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
+from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
@@ -201,14 +202,15 @@ class _Rounds:
             ahead(0.0, "checking on the full model where the way is closed")
             check = checked_wall(self.field, self.grasp_model, self.limits, none,
                                  workers=self.workers, progress=ahead)
-            if check.learnt is not None and not is_last and len(check.learnt.poses):
+            if check.learnt is not None and not is_last:
                 self.progress.warn(
                     "No path exists by the energy field, but the full model differs from it where "
                     f"the way is closed: {len(check.learnt.poses)} poses are added.")
                 self.field = refit(self.field, check.learnt)
                 return
-            none = confirmed(none, check) if check.learnt is None else not_confirmed(
-                none, self.limits.in_words())
+            none = confirmed(none, check) if check.bears_out else not_confirmed(
+                self.limits, easiest_way(self.field, self.limits.on(self.field), self.start,
+                                         self.goal))
         if self.passages:
             none = said_after(none, len(self.passages), self.passages[-1].told)
         raise none
