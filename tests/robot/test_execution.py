@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.robot_cells import cell_file, robot_holding, standing_at
+from benchmarks.robot_cells import GRASP_POSE, cell_file, robot_holding, standing_at
 from benchmarks.robot_faults import restored
 from limber.core.errors import InputError, NoPathError, SafetyStop
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
@@ -298,6 +298,8 @@ def armed(planned_folder, tmp_path, robot, motion_settings, start_joints, monkey
         restored(robot)
         joints = start_joints if stands is None else stands(start_joints)
         robot.ask("stand", joints=list(map(float, joints)))
+        # As it is set on the pendant: it is put back afterwards, and the pose is that tool's.
+        robot.ask("tool", offset=list(GRASP_POSE))
         try:
             result = execute(planned_folder, "path", path, motion_settings,
                              ExecuteOptions(arm=True, confirm="path"))
