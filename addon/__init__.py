@@ -44,6 +44,7 @@ MODULES = (
     "overlays.cloud",
     "relative_paths",
     "last_used",
+    "warming",
     "command",
 )
 

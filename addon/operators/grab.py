@@ -25,6 +25,7 @@ _INTERVAL_SECONDS = 1 / 120
 one waits on average before it is seen."""
 _KEYS = ("Drag: bend | F: add a fruit | C: cut here | Enter: keep for a simulation | S, G: keep "
          "as the plan's start, goal | Esc: release and exit")
+_LOADING = "The branch is being loaded | Esc: exit"
 _PLACED = {"F": "fruit", "C": "cut"}
 _PANEL_SECONDS = 0.2
 _NAVIGATION = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WHEELINMOUSE", "WHEELOUTMOUSE",
@@ -124,6 +125,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._tint, self._reached = limits.Tint(self._surface), []
         self._panel_drawn = 0.0
         self._rest = meshes.positions(mesh)
+        self._is_ready = False
         self._mouse = self._waiting = None
         motion = self._surface.modifiers.get(animation.MODIFIER)
         self._had_motion = motion is not None and motion.show_viewport
@@ -137,7 +139,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
                                                              window=context.window)
         self._drawing = bpy.types.SpaceView3D.draw_handler_add(
             self._draw, (), "WINDOW", "POST_PIXEL")
-        context.workspace.status_text_set(_KEYS)
+        context.workspace.status_text_set(_LOADING)
         context.window_manager.modal_handler_add(self)
 
     def _modal(self, context, event):
@@ -187,6 +189,9 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._end(context)
             self.report({"ERROR"}, error)
             return {"CANCELLED"}
+        if self._session.hello and not self._is_ready:
+            self._is_ready = True
+            context.workspace.status_text_set(_KEYS)
         frame = self._session.frame(self._frame.sequence if self._frame else 0)
         if frame is not None:
             self._frame = frame

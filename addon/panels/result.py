@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches, preferences
+from .. import branches, preferences, warming
 from ..operators import live_loads, seeing
 from ..overlays import graph as viewport_graph
 from .comparing import draw_branches
@@ -37,6 +37,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
             column.label(text="Choose the Python that has limber:")
             column.operator("preferences.addon_show", text="Preferences",
                             icon="PREFERENCES").module = preferences.KEY
+        warming.draw(self.layout)
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
             _draw_live(self.layout, settings)

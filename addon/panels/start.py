@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches
+from .. import branches, warming
 from .sidebar import SidebarPanel
 
 
@@ -18,6 +18,7 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
             branches.find_surface(context.scene) is None)
 
     def draw(self, context):
+        warming.draw(self.layout)
         column = self.layout.column()
         column.scale_y = 1.3
         column.operator("limber.open_example", icon="PLAY")

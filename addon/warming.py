@@ -1,0 +1,94 @@
+"""After an installation the worker compiles its code once, in the background: for the first grab.
+
+It waits for nobody and keeps nobody: it is not among the jobs. What it has done is written down for
+the version of the worker, in the extension's own folder.
+"""
+
+import hashlib
+from pathlib import Path
+
+import bpy
+
+from . import jobs, preferences
+from .operators.worker_operator import redraw_sidebars
+from .worker import WorkerNotFound
+
+_FIRST_SECONDS, _LOOK_SECONDS = 2.0, 0.5
+_WARM = ("doctor", "--warm", "--json", "--progress", "json")
+_running: list[jobs.Job] = []
+
+
+def current() -> jobs.Job | None:
+    """Return the job that compiles now; None if nothing is compiled."""
+    return _running[0] if _running else None
+
+
+def begin() -> bool:
+    """Start to compile if that was not done for this worker yet; returns whether it was started."""
+    try:
+        command = preferences.worker_command()
+    except WorkerNotFound:
+        return False
+    if _done_file(command).is_file():
+        return False
+    job = jobs.Job("Compiling once", [*command, *_WARM])
+    try:
+        job.launch()
+    except OSError:
+        # The first job says why the worker does not start.
+        return False
+    _running[:] = [job]
+    return True
+
+
+def look() -> float | None:
+    """See how far it is; returns when to look again [s], or None when it has ended."""
+    job = current()
+    if job is None:
+        return None
+    state = job.poll()
+    redraw_sidebars(bpy.context)
+    if state is jobs.JobState.RUNNING:
+        return _LOOK_SECONDS
+    _running.clear()
+    if state is jobs.JobState.DONE:
+        path = _done_file(job.command[:-len(_WARM)])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return None
+
+
+def _done_file(command: list[str]) -> Path:
+    """Return the file that tells that this worker has compiled since the add-on was installed."""
+    installed = Path(__file__).stat().st_mtime_ns
+    name = hashlib.sha256(f"{command}{installed}".encode()).hexdigest()[:16]
+    try:
+        folder = Path(bpy.utils.extension_path_user(preferences.KEY, path="compiled"))
+    except ValueError:
+        # Not installed as an extension: a script, or a checkout.
+        folder = Path(bpy.app.tempdir)
+    return folder / name
+
+
+def draw(layout: bpy.types.UILayout) -> None:
+    """Draw how far it is, while it compiles."""
+    job = current()
+    if job is not None:
+        layout.progress(factor=job.fraction,
+                        text=f"Compiling once: {100 * job.fraction:.0f} %")
+
+
+def _begin_and_look() -> float | None:
+    return look() if current() is not None or begin() else None
+
+
+def register() -> None:
+    if not bpy.app.background:
+        bpy.app.timers.register(_begin_and_look, first_interval=_FIRST_SECONDS, persistent=True)
+
+
+def unregister() -> None:
+    if bpy.app.timers.is_registered(_begin_and_look):
+        bpy.app.timers.unregister(_begin_and_look)
+    while _running:
+        _running.pop().stop_now()
