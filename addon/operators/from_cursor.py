@@ -1,5 +1,6 @@
-"""Take a position from the 3D cursor, or a region from an object."""
+"""Take a position from the 3D cursor, or a region from an object or from selected points."""
 
+from pathlib import Path
 from typing import ClassVar
 
 import bpy
@@ -90,7 +91,60 @@ class LIMBER_OT_from_object(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LIMBER_OT_crop_scan(bpy.types.Operator):
+    """Keep only the part of the scan inside the active object's bounding box, or around the points
+    that are selected in the scan itself"""
+
+    bl_idname = "limber.crop_scan"
+    bl_label = "Crop to Active Object"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if _scan_of(context) is None or context.active_object is None:
+            cls.poll_message_set("Import a scan, add an object around the part to keep, and select "
+                                 "that object; or select points of the scan in Edit Mode")
+            return False
+        return True
+
+    def execute(self, context):
+        thing, scan = context.active_object, _scan_of(context)
+        places = _selected(scan) if thing == scan else [
+            scan.matrix_world.inverted() @ thing.matrix_world @ Vector(corner)
+            for corner in thing.bound_box]
+        if len(places) < 2:
+            self.report({"ERROR"}, "No points are selected. Select the points to keep in Edit "
+                                   "Mode, or an object around them.")
+            return {"CANCELLED"}
+        # The file's own numbers: in double precision, since maps have large ones.
+        offset = scan.get(branches.OFFSET_KEY, (0.0,) * 3)
+        settings = context.scene.limber.reconstruct
+        for name, bound in (("crop_low", min), ("crop_high", max)):
+            setattr(settings, name, [bound(place[axis] for place in places) + offset[axis]
+                                     for axis in range(3)])
+            setattr(settings, properties.OPEN + name, True)
+        self.report({"INFO"}, "The scan is cropped when it is reconstructed")
+        return {"FINISHED"}
+
+
+def _scan_of(context: bpy.types.Context) -> bpy.types.Object | None:
+    """Return the scan that is active, else that of the current branch."""
+    active = context.active_object
+    if active is not None and branches.SCAN_KEY in active:
+        return active
+    path = context.scene.limber.reconstruct.cloud
+    return next((thing for thing in context.scene.objects if branches.SCAN_KEY in thing
+                 and path and thing.name.startswith(f"{Path(path).stem} scan")), None)
+
+
+def _selected(scan: bpy.types.Object) -> list[Vector]:
+    if scan.mode == "EDIT":
+        scan.update_from_editmode()
+    return [vertex.co for vertex in scan.data.vertices if vertex.select]
+
+
 def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_crop_scan)
     bpy.utils.register_class(LIMBER_OT_from_object)
     bpy.utils.register_class(LIMBER_OT_from_cursor)
 
@@ -98,3 +152,4 @@ def register() -> None:
 def unregister() -> None:
     bpy.utils.unregister_class(LIMBER_OT_from_cursor)
     bpy.utils.unregister_class(LIMBER_OT_from_object)
+    bpy.utils.unregister_class(LIMBER_OT_crop_scan)

@@ -46,6 +46,8 @@ class StepPanel(SidebarPanel):
         _draw_fields(layout, context, view, names=step.fields)
         if step.name == "plan":
             layout.operator("limber.place_goal", icon="SPHERE")
+        elif step.name == "scan":
+            layout.operator("limber.crop_scan", icon="CUBE")
         elif step.name == "material":
             _draw_origin(layout, context)
             layout.operator_menu_enum("limber.material", "material", text="Known Materials")
