@@ -71,11 +71,10 @@ def _done_file(command: list[str]) -> Path:
 
 
 def draw(layout: bpy.types.UILayout) -> None:
-    """Draw how far it is, while it compiles."""
+    """Say how far it is while it compiles; in a header: nothing moves under the mouse."""
     job = current()
     if job is not None:
-        layout.progress(factor=job.fraction,
-                        text=f"Compiling once: {100 * job.fraction:.0f} %")
+        layout.label(text=f"Compiling {100 * job.fraction:.0f} %", icon="SORTTIME")
 
 
 def _begin_and_look() -> float | None:

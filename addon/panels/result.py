@@ -17,6 +17,9 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
     bl_label = "Branch"
     bl_order = 2
 
+    def draw_header_preset(self, context):
+        warming.draw(self.layout)
+
     def draw(self, context):
         settings = context.scene.limber
         surface = branches.find_surface(context.scene)
@@ -37,7 +40,6 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
             column.label(text="Choose the Python that has limber:")
             column.operator("preferences.addon_show", text="Preferences",
                             icon="PREFERENCES").module = preferences.KEY
-        warming.draw(self.layout)
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
             _draw_live(self.layout, settings)

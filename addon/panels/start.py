@@ -17,8 +17,10 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
             branches.SCAN_KEY in thing for thing in context.scene.objects) and (
             branches.find_surface(context.scene) is None)
 
-    def draw(self, context):
+    def draw_header_preset(self, context):
         warming.draw(self.layout)
+
+    def draw(self, context):
         column = self.layout.column()
         column.scale_y = 1.3
         column.operator("limber.open_example", icon="PLAY")

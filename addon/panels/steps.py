@@ -46,13 +46,13 @@ class StepPanel(SidebarPanel):
         _draw_fields(layout, context, view, names=step.fields)
         if step.name == "plan":
             layout.operator("limber.place_goal", icon="SPHERE")
-        elif step.name == "scan":
-            layout.operator("limber.crop_scan", icon="CUBE")
         elif step.name == "material":
             _draw_origin(layout, context)
             layout.operator_menu_enum("limber.material", "material", text="Known Materials")
         if step.scene_operator:
             _draw_scene_button(layout, context, step)
+            if step.name == "scan":
+                layout.operator("limber.crop_scan", icon="CUBE")
         else:
             _draw_stage(layout, context, view, is_primary=True)
         if step.name == "skeleton":

@@ -120,7 +120,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "first", "more"), [
-    ("scan", "limber.crop_scan", ("limber.import_cloud",)), ("skeleton", "limber.reconstruct", ()),
+    ("scan", "limber.import_cloud", ("limber.crop_scan",)), ("skeleton", "limber.reconstruct", ()),
     ("mesh", "limber.reconstruct", ()), ("material", "limber.color_by", ()),
     ("pulls", "limber.import_pull", ()), ("estimate", "limber.estimate", ()),
     ("plan", "limber.place_goal", ("limber.plan",)),
