@@ -92,6 +92,29 @@ def test_data_of_accuracy_say_where_they_are_from(path):
     assert any(row["count"] for row in record["rows"])
 
 
+def test_the_strains_of_species_are_those_of_the_code():
+    """The table of `--wood` has every species that it takes, to two digits."""
+    from limber.mechanics.materials.species import SPECIES, strain_limit
+
+    text = (GUIDE / "howto" / "limits.md").read_text(encoding="utf-8")
+    told = dict(re.findall(r"^\| `(\w+)` \| (\S+) %", text, re.MULTILINE))
+    assert told == {name: f"{100 * strain_limit(name):.2f}" for name, species in SPECIES.items()
+                    if species.rupture_strain is not None}
+
+
+def test_the_example_of_a_pull_is_imported(tmp_path):
+    """The tables that the guide offers to copy are a pull of the example branch."""
+    import shutil
+
+    import limber
+
+    branch = limber.open(shutil.copytree(ROOT / "blend_files" / "mature", tmp_path / "a.branch"))
+    files = ROOT / "scripts" / "examples" / "pull"
+    pull = branch.add_pull(files / "markers.csv", "copied", robot=str(files / "robot.csv"),
+                           quiet=True)
+    assert pull.poses.shape == (24, 6) and pull.markers.shape == (24, 4, 3)
+
+
 def test_tutorials_are_executed_and_pictures_have_scripts():
     """Seven tutorials whose commands run when the guide is built; twelve pictures."""
     tutorials = sorted((GUIDE / "tutorials").glob("*.md"))

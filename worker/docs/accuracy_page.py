@@ -36,6 +36,9 @@ CHAPTERS = {
         "optimum, the limits on the full model, and the certified bound.")),
     "robot": ("The robot", (
         "The real client library against the controller in software. No real robot was used.")),
+    "worker": ("What a newcomer meets", (
+        "`limber demo` on its generated branch, set-up aside: how long it takes on two shared "
+        "cores, and what it finds.")),
 }
 """What each bench is about, in the page's order."""
 
