@@ -1,4 +1,4 @@
-"""What was found, in sentences that the report's first part and the terminal share."""
+"""What was found, in sentences that report, scene and terminal share."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

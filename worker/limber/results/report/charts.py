@@ -24,20 +24,30 @@ def chart(width: float, height: float, across: str, up: str, *, has_grid: bool =
     return figure, axes
 
 
+_NUMBER_INCHES = 0.6  # that a number below an axis takes
+
+
 def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int]]]:
     """Return a figure of the front and the side of ``points`` [n, 3].
 
     Each view is its axes, which coordinate runs across it and which into it; z runs up.
     """
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import MaxNLocator
 
     extent = np.ptp(points, axis=0)
     height = 7.0
     widths = np.clip(height * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
     figure, axes = plt.subplots(1, 2, figsize=(widths.sum() + 2.5, height), layout="constrained",
                                 width_ratios=widths)
-    for axis, label in zip(axes, "xy", strict=True):
+    for axis, label, width in zip(axes, "xy", widths, strict=True):
         axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
+        # A view may be as thin as a branch: few numbers, upright, which then do not overlap.
+        drawn = min(width, height * float(np.ptp(points[:, "xy".index(label)]) / extent[2]))
+        axis.xaxis.set_major_locator(MaxNLocator(
+            max(1, int(drawn / _NUMBER_INCHES)), steps=[1, 2, 5, 10]))
+        if drawn < 2 * _NUMBER_INCHES:
+            axis.tick_params(axis="x", rotation=90)
         axis.grid(alpha=0.25)
     return figure, [(axes[0], 0, 1), (axes[1], 1, 0)]
 

@@ -1,5 +1,7 @@
 """What was found, in sentences: numbers with units, and what is beyond an arm or the wood."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from limber.core.constants import DATA_COLOURS
@@ -14,6 +16,7 @@ from limber.results.findings import (
     remarks_on,
 )
 from limber.results.report import estimate_figures, plan_figures
+from limber.results.report.charts import two_views
 from limber.results.report.report_tables import comparison_rows
 from limber.store import Branch
 
@@ -118,3 +121,17 @@ def test_a_flat_search_is_not_drawn():
                                    "plan": history(None, 2.0, 1.0)})
     assert [*found] == ["plan"]
     np.testing.assert_array_equal(found["plan"], [[1, 2], [2, 1]])
+
+
+def test_numbers_below_a_thin_view_do_not_overlap():
+    """A branch is often as thin as one number is wide."""
+    tall = np.array([[0.0, 0.0, 0.0], [0.03, 0.12, 0.4], [0.0, 0.02, 0.2]])
+    figure, views = two_views(tall)
+    for axis, across, _depth in views:
+        axis.plot(tall[:, across], tall[:, 2])
+    figure.canvas.draw()
+    for axis, _across, _depth in views:
+        low, high = axis.get_xlim()
+        shown = [label.get_window_extent() for label, at in zip(
+            axis.get_xticklabels(), axis.get_xticks(), strict=True) if low <= at <= high]
+        assert shown and all(one.x1 < other.x0 for one, other in pairwise(shown))
