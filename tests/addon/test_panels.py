@@ -58,7 +58,7 @@ class Layout:
 
     def label(self, text="", icon="NONE", **_):
         assert icon in ICONS
-        self.calls.append(("label", text, None))
+        self.calls.append(("label", text, icon))
 
     def progress(self, factor, text, **_):
         self.calls.append(("progress", factor, text))
@@ -234,6 +234,21 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
         assert f"{1e-6 * value:.3g}" in estimate.names("label")
     assert f"1:  {1e-6 * estimated['young_pa'][0]:.3g}" in estimate.names("label")
     assert "limber.graph" in plan.names("operator") and "limber.graph" in estimate.names("operator")
+
+
+@pytest.mark.parametrize(("over", "icon"), [(["baseline"], "CHECKMARK"), (["plan"], "BLANK1")])
+def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, icon):
+    """What is proven of its cost stands without a tick, below what is wrong with it."""
+    comparing = importlib.import_module("limber_addon.panels.comparing")
+    layout, path = Layout(), {"length_m": 0.1, "peak_strain": 0.007}
+    comparing.draw_paths(layout, {
+        "plan": path, "baseline": path, "certificate": {"gap_percent": 1.0},
+        "wood": {"breaking_strain": 0.006, "paths_over": over}}, None)
+    assert {"Gentle", "Shortest"} <= set(layout.names("label"))
+    proven = next(call for call in layout.calls if str(call[1]).startswith("Proven"))
+    assert proven[2] == icon
+    warned = ("label", "Over the strain that breaks wood: 0.6 %", "ERROR") in layout.calls
+    assert warned == ("plan" in over)
 
 
 @pytest.mark.slow

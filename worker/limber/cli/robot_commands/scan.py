@@ -13,8 +13,8 @@ from limber.cli.main import Run, stage_command
 @stage_command("scan")
 @click.option("--address", default="127.0.0.1", show_default=True, help="Address of the virtual "
                                                                         "robot.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True,
-              help="PLY file to write.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("scan.ply"),
+              show_default=True, help="PLY file to write.")
 @click.option("--middle", type=float, nargs=3, required=True, metavar="X Y Z",
               help="Point that the cameras look at, in the branch's frame [m].")
 @click.option("--distance", default=0.6, show_default=True, help="Distance of the cameras from it "

@@ -15,7 +15,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 
 @dataclass(frozen=True)
 class SectionMean:
-    """Takes the mean over a control point's part of the branch, by length.
+    """Takes the mean over a control point's part of the main path, by length.
 
     Attributes:
         low, high: Lower and upper node of the cylinder around each tetrahedron, shape [tet_count].
@@ -38,6 +38,8 @@ class SectionMean:
             weights: Part of each control point in each tetrahedron, shape [tet_count, K].
         """
         low, high, fraction, _ = on_cylinders(skeleton, mesh.centroids)
+        # A twig's own bending has no part in that of the branch which carries it.
+        weights = weights * np.isin(high, skeleton.main_path())[:, None]
         radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
         # Volume over cross-section: each piece of the branch counts by its length.
         share = (weights * (np.abs(mesh.volumes) / radius**2)[:, None]).T
