@@ -9,11 +9,12 @@ from limber.planning import closed_passages
 from limber.planning.certificate.feasibility import judge
 from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.limits import Limits
-from limber.planning.cost import CostWeights
+from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.local_error import LocalError
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
+from limber.planning.plan_file import read_plan
 from limber.planning.planners.easiest import EasiestWay
 
 
@@ -130,3 +131,19 @@ def test_a_proof_tells_where_the_way_is_closed(half_rough):
     assert found.proven and len(found.wall) > 20
     assert (np.abs(found.wall[:, 0]) < 0.1).all()
     assert half_rough.load(found.wall, "strain").min() > 1.5
+
+
+@pytest.mark.parametrize("name", ["strain", "force", "energy", "axial_force"])
+def test_a_limit_that_a_known_path_keeps_is_never_proven_impossible(planned_branch, name):
+    """The path's own peak on the full model as the limit, on a field of few samples: whatever the
+    field says of it, there is a path."""
+    field = EnergyField.read(planned_branch / "energy.npz")
+    way = read_plan(planned_branch / "plans/there.json").plan
+    peaks = {"strain": way.strains, "force": way.force_sizes, "energy": way.energies,
+             "axial_force": np.abs(way.axial_forces)}
+    limits = Limits(**{name: (1.0 + 1e-6) * float(peaks[name].max())})
+    start, end = way.poses[[0, -1], :3]
+    goal = GraspGoal(tuple(map(float, end)), 0.005)
+    found = judge(GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
+                                beyond=limits.beyond(field), errors=limits.errors(field)), 40_000)
+    assert not found.proven

@@ -22,6 +22,7 @@ from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.planning_branches import ARC_NAMES, Subject, arcs, forked
 from benchmarks.planning_confidence import SURE_ROW, Sure, run_sure, sure_rows
 from benchmarks.planning_detours import DETOUR_ROWS, Detour, detour_rows, run_detour
+from benchmarks.planning_goals import GOAL_ROWS, RegionGoal, goal_rows, run_region_goal
 from benchmarks.planning_limits import (
     COVERED_ROW,
     NEAR_ROWS,
@@ -51,7 +52,7 @@ _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8
 _TIMED_STARTS = 3  # of each branch, where only times are asked
 _Start = tuple[str, int, int]
 """Branch, number, seed."""
-_Kept = TypeVar("_Kept", Trial, Detour, NearLimit)
+_Kept = TypeVar("_Kept", Trial, Detour, NearLimit, RegionGoal)
 
 
 @dataclass(frozen=True)
@@ -263,6 +264,19 @@ def _near_limit_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], sour
                    ) -> NearLimit:
     (name, number, own), model, known, _ = task
     return run_near_limit(model, known, number, own, branch=name, source=source)
+
+
+def _region_goals(setting: Setting) -> list[Row]:
+    """Goals in regions of each kind, on all branches in turn, as many as there is time for."""
+    run = _Run(setting)
+    return goal_rows(_planned(run, RegionGoal, _region_goal_of, run.kept("goals"),
+                              run.starts_of(lambda _: True, setting.at_most(12, 2))))
+
+
+def _region_goal_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str,
+                    ) -> RegionGoal:
+    (name, number, own), model, known, _ = task
+    return run_region_goal(model, known, number, own, branch=name, source=source)
 
 
 def _stated_errors(setting: Setting) -> list[Row]:
@@ -548,6 +562,7 @@ PARTS = {
     "trials": Part(_trial_rows, 150, (*_BOUND_ROWS, *_TIME_ROWS, *_FULL_ROWS, *map(
         _saved_asked, _AGAINST), _FROM_REST), grows=True),
     "near-limits": Part(_near_limits, 150, NEAR_ROWS, grows=True),
+    "goals": Part(_region_goals, 150, GOAL_ROWS, grows=True),
     "stated-errors": Part(_stated_errors, 60, (COVERED_ROW,), grows=True),
     "no-path": Part(_no_path_rows, 80, (_NO_PATH,), grows=True),
     "sure": Part(_sure_table, 120, (SURE_ROW,), grows=True),
