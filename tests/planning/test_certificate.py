@@ -355,6 +355,26 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
             assert ridge_field.energy(middles) @ pieces >= held.energy_bound
 
 
+def test_no_path_short_enough_leaves_the_cells_that_count(well_field):
+    """Every point that is reached and left within the length lies in an open cell; far cells are
+    closed."""
+    line = np.linalg.norm(np.array(GOAL.position) - START)
+    problem = replace(problem_on(well_field), longest=1.1 * line)
+    grid, cell = first_grid(problem)
+    numbers = np.argwhere(grid.open_cells)
+    centres = grid.points(numbers + 0.5)
+    near = np.zeros(grid.open_cells.shape, bool)
+    near[tuple(numbers.T)] = np.linalg.norm(centres - GOAL.position, axis=1) <= (
+        GOAL.tolerance + grid.spacing)
+    found = lower_bound._short_enough(problem, grid, grid.open_cells, near, cell)
+    points = grid.points(numbers + np.random.default_rng(0).uniform(size=numbers.shape))
+    through = np.linalg.norm(points - START, axis=1) + np.maximum(
+        np.linalg.norm(points - GOAL.position, axis=1) - GOAL.tolerance, 0.0)
+    short = through <= problem.longest
+    assert short.sum() > 50 and found[tuple(numbers[short].T)].all()
+    assert found.sum() < 0.7 * grid.open_cells.sum()
+
+
 @pytest.mark.slow
 def test_a_length_is_kept_as_a_limit(ridge_field):
     """From the path round the ridge: just as long as allowed, and gentler than the shortest."""

@@ -230,16 +230,16 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     slopes = problem.weights.energy * grid.along_edges(force)
     ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
     goal = about_goal(problem, grid, ground)
-    if problem.longest < np.inf:
-        open_cells = _short_enough(problem, grid, open_cells, goal.near, cell)
-        ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing,
-                         problem.weights.length)
     if not goal.meets:
         if problem.goal.uncertainty(problem.energy_field) > 0.0:
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
                             "of reach, but by less than the error of the energy field.")
         wall = over & scipy.ndimage.binary_dilation(open_cells, _NEAR)
         raise _separated(problem, grid, open_cells, grid.points(np.argwhere(wall) + 0.5))
+    if problem.longest < np.inf:
+        open_cells = _short_enough(problem, grid, open_cells, goal.near, cell)
+        ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing,
+                         problem.weights.length)
     to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
     lower = spline_value(to_goal, cell) - slack
