@@ -74,6 +74,16 @@ def test_markers_of_motion_capture(tmp_path, name):
     assert len(stream) == COUNT
 
 
+@pytest.mark.parametrize("name", ["vicon.csv", "qualisys.tsv", "opensim.txt"])
+def test_a_capture_of_one_frame_is_refused(tmp_path, name):
+    """Its last line may be cut short, and then there is none."""
+    text = FILES[name]
+    (tmp_path / name).write_text(text[:text.index("0.150000" if name == "qualisys_header.tsv"
+                                                  else "150.000000")])
+    with pytest.raises(InputError):
+        marker_stream(tmp_path / name)
+
+
 def test_the_reported_motive_file():
     if not MOTIVE.exists():
         pytest.skip("the reports are not beside this checkout")

@@ -141,6 +141,9 @@ def test_points_of_colmap(tmp_path):
         stream.write("99 1.5 2.5")
     with pytest.raises(InputError, match="line 204 has 3 values"):
         read_points(tmp_path / "points3D.txt")
+    (tmp_path / "points3D.txt").write_text("# POINT3D_ID, X, Y, Z\n7 1 2 3\n8 4 5 6\n")
+    with pytest.raises(InputError, match=r"line 2 has 4 values.*at least 8"):
+        read_points(tmp_path / "points3D.txt")
 
 
 @pytest.mark.parametrize("end", ["\n", " \n", "\r\n"])

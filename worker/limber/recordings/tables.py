@@ -173,8 +173,8 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
         at = next((k for k, title in enumerate(titles) if re.fullmatch(_COUNTERS, title.plain)),
                   None)
         used = () if at is None else (at,)
-        count = np.arange(len(table.values)) if at is None else table.values[:, at]
-        times = (count - np.nanmin(count)) / rate_hz
+        count = np.arange(float(len(table.values))) if at is None else table.values[:, at]
+        times = (count - np.nanmin(count, initial=np.inf)) / rate_hz
     else:
         raise InputError(
             f"{table.path} has the columns {', '.join(table.titles)}.",

@@ -185,7 +185,12 @@ def _colmap(path: Path, text: str) -> Columns:
     if not lines:
         raise ColumnsError(f"{path} has no points.", "A COLMAP reconstruction was expected.",
                            "Export it again.")
-    return Columns(names, names, _numbers(path, lines, None, "\n".join(cut), names)[1])
+    values = _numbers(path, lines, None, "\n".join(cut), names)[1]
+    if values.shape[1] < len(names):
+        raise ColumnsError(f"{path}, line {_place(text, lines[0])} has {values.shape[1]} values.",
+                           f"A point of COLMAP has at least {len(names)}: {', '.join(names)}.",
+                           "Export it again.")
+    return Columns(names, names, values)
 
 
 def _without_counts(lines: list[str]) -> list[str]:
@@ -360,7 +365,8 @@ def _with_words(path: Path, lines: list[str], separator: str | None, text: str,
 
 
 def _place(text: str, line: str) -> int:
-    return text.splitlines().index(line) + 1
+    return next((k for k, other in enumerate(text.splitlines(), start=1)
+                 if other.startswith(line)), 1)
 
 
 def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:

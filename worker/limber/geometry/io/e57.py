@@ -47,8 +47,11 @@ def read_e57(path: Path) -> Cloud:
     text = content[_logical(start, page):_logical(start, page) + length]
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise _damaged(path, "its XML defines entities")
-    # Without entities an XML text is no larger than its file.
-    root = ElementTree.fromstring(text.decode("utf-8"))  # noqa: S314
+    try:
+        # Without entities an XML text is no larger than its file.
+        root = ElementTree.fromstring(text.decode("utf-8"))  # noqa: S314
+    except (UnicodeDecodeError, ElementTree.ParseError) as error:
+        raise _damaged(path, f"its XML is invalid ({error})") from error
     for each in root.iter():
         each.tag = each.tag.rpartition("}")[2]
     scans = [_scan(path, content, page, each) for each in root.findall("./data3D/vectorChild")]

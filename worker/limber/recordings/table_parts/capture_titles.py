@@ -50,7 +50,7 @@ def capture_preamble(above: Sequence[Sequence[str]], width: int) -> Preamble:
         rate = next((row[0] for row in above if row and _is_number(row[0])
                      and not any(row[1:])), None)
     unit = _stated(above, _UNITS)
-    return Preamble(titles, float(rate) if rate is not None and _is_number(rate) else None,
+    return Preamble(titles, float(rate) if rate and _is_number(rate) and float(rate) else None,
                     unit or ("mm" if is_qualisys else None))
 
 
