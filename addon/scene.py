@@ -321,8 +321,9 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     rest = meshes.new_mesh("Rest shape", data.arrays["vertices"], data.arrays["faces"])
     material = materials.plain_material("Rest shape", COLORS["rest"], alpha=0.25)
     ghost = add_object(shown.collection, "Rest shape", rest, material)
-    # In the viewport, lines: the moving branch stays in sight.
+    # In the viewport, lines, and on demand: they lie over colours that mean numbers.
     ghost.display_type = "WIRE"
+    ghost.hide_viewport = True
     shown.objects["rest"] = [ghost]
     speed = own_speed(scene, frames)
     header = animation.attach_cache(shown.surface, data.folder / frames["file"], speed=speed)

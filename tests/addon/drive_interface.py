@@ -123,7 +123,8 @@ def played():
     return bpy.context.scene.frame_current > 1
 
 
-drive([open_sidebar, open_tab, picture("tab"), click(399), imported, click(313), reconstructed,
+drive([open_sidebar, open_tab, picture("tab"), click(399), imported, picture("imported"),
+       click(313), reconstructed,
        start_slow_job, slow_job_reports, picture("job"), click(145), job_cancelled,
        open_result, opened, picture("opened"), play, played, picture("playing"),
        start_slow_job, slow_job_left_running], longest=200)
