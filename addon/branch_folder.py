@@ -5,7 +5,7 @@ Only the worker writes it. An unreadable file counts as missing; the worker repo
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -45,6 +45,11 @@ class BranchRecord:
         record = self.stages.get(key)
         # Two stages may make the same thing (a pull): the settings tell which one did.
         return record if record and set(record.settings) <= set(stage.fields) else None
+
+    def has(self, patterns: Iterable[str]) -> bool:
+        """Whether the folder has a file for each of these: its name, or the start of one."""
+        starts = [pattern.split("{name}")[0] for pattern in patterns]
+        return all(any(name.startswith(start) for name in self.files) for start in starts)
 
     def names(self, pattern: str) -> list[str]:
         """Return the names of what the folder has, sorted.

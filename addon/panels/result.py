@@ -2,11 +2,12 @@
 
 import bpy
 
-from .. import branches, preferences, warming
+from .. import branches, preferences, properties, warming
 from ..operators import live_loads, seeing
 from ..overlays import graph as viewport_graph
 from .comparing import draw_branches
 from .sidebar import SidebarPanel
+from .steps import next_stage
 
 _NO_GRAPH = {"young": "Estimate first", "energy": "Plan a path first",
              "force": "Estimate from a pull with forces first"}
@@ -29,9 +30,15 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         if surface is None and branches.branches(context.scene):
             self.layout.label(text="Not shown: press Open Result", icon="INFO")
         draw_branches(self.layout, context)
+        following = next_stage(context.scene)
+        if following is not None:
+            button = self.layout.operator(
+                f"limber.{properties.attribute_name(following.name)}",
+                text=f"Next: {following.label}", icon="FORWARD")
+            button.branch_uuid = branches.current_uuid(context.scene)
         if surface is not None:
-            self.layout.prop(settings.scene, "plan")
-            self.layout.prop(settings.scene, "motion")
+            self.layout.prop(settings.scene, "plan", placeholder="the newest")
+            self.layout.prop(settings.scene, "motion", placeholder="of the plan")
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
         self.layout.prop(settings, "show_expert")
         if not preferences.has_worker():
@@ -77,29 +84,47 @@ def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, setting
         body.label(text=note)
     if info.get("frame_scalars"):
         body.prop(settings, "each_frame")
-    spans = ""
-    shown = surface.get(branches.FRAME_SCALAR_KEY)
-    active = surface.data.color_attributes.active_color
-    names = list(info["scalars"])
-    for pair in zip(names[::2], [*names[1::2], ""], strict=False):
-        row = body.row(align=True)
-        for name in filter(None, pair):
-            is_shown = name == shown if shown else active is not None and (
-                active.name == f"{name}_color")
-            title, _, rest = _scale(info, settings, name)["title"].partition(" (")
-            button = row.operator("limber.color_by", text=title[0].upper() + title[1:],
-                                  depress=is_shown)
-            button.scalar, button.each_frame = name, settings.each_frame
-            if is_shown:
-                spans = _span(info["scalars"][name], rest)
-    if spans:
-        body.label(text=spans, icon="COLOR")
+    name = _shown_scalar(surface)
+    title, _, rest = _scale(info, settings, name)["title"].partition(" (") if name else ("", "", "")
+    body.menu(LIMBER_MT_colours.bl_idname, text=_upper(title) or "Choose", icon="COLOR")
+    if name:
+        body.label(text=_span(info["scalars"][name], rest), icon="BLANK1")
     if "stress_over_strength" in info["scalars"]:
         row = body.row(heading="Strength [Pa]")
         row.prop(settings.scene, "use_strength", text="")
         value = row.row()
         value.active = settings.scene.use_strength
         value.prop(settings.scene, "strength", text="")
+
+
+class LIMBER_MT_colours(bpy.types.Menu):
+    """What the branch can be coloured by."""
+
+    bl_idname = "LIMBER_MT_colours"
+    bl_label = "Colour By"
+
+    def draw(self, context):
+        surface, settings = branches.find_surface(context.scene), context.scene.limber
+        info = branches.info_of(surface)
+        for name in info["scalars"]:
+            title = _scale(info, settings, name)["title"].partition(" (")[0]
+            entry = self.layout.operator(
+                "limber.color_by", text=_upper(title),
+                icon="CHECKMARK" if name == _shown_scalar(surface) else "BLANK1")
+            entry.scalar, entry.each_frame = name, settings.each_frame
+
+
+def _shown_scalar(surface: bpy.types.Object) -> str:
+    """Return the quantity that the branch is coloured by; nothing if by none."""
+    if shown := surface.get(branches.FRAME_SCALAR_KEY):
+        return shown
+    active = surface.data.color_attributes.active_color
+    name = "" if active is None else active.name.removesuffix("_color")
+    return name if name in branches.info_of(surface)["scalars"] else ""
+
+
+def _upper(title: str) -> str:
+    return title[:1].upper() + title[1:]
 
 
 def _scale(info: dict, settings, name: str) -> dict:
@@ -139,8 +164,10 @@ def _draw_in_sight(layout: bpy.types.UILayout, surface: bpy.types.Object, settin
 
 
 def register() -> None:
+    bpy.utils.register_class(LIMBER_MT_colours)
     bpy.utils.register_class(LIMBER_PT_result)
 
 
 def unregister() -> None:
     bpy.utils.unregister_class(LIMBER_PT_result)
+    bpy.utils.unregister_class(LIMBER_MT_colours)

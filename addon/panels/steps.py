@@ -10,7 +10,7 @@ from .. import branch_folder, branches, jobs, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
 from ..plain_words import choice_title, first_sentence, plain
 from ..stages import Field, Stage, stages
-from ..steps import PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
+from ..steps import FIRST, PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
 from ..steps import next_step as step_after
 from .comparing import draw_moduli, draw_paths
 from .pulls import draw_pulls
@@ -109,6 +109,25 @@ def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
             state, _ = state_of(scene, other.stage)
     is_done = state is StepState.DONE and step.view.stage == "plan"
     return StepState.OVER_STRENGTH if is_done and stress_share(scene) > 1.0 else state
+
+
+def next_stage(scene: bpy.types.Scene) -> Stage | None:
+    """Return the first step's stage that was not run for the branch as it is, and can be now: what
+    it needs is there or set. None where there is none."""
+    folder = branches.current_folder(scene)
+    record = None if folder is None else branch_folder.read_record(folder)
+    for step in STEPS if record is not None else ():
+        stage = stages()[step.view.stage]
+        if step.scene_operator or stage.moves_robot or stage.makes_branch:
+            continue
+        values = properties.values_of(properties.group_of(scene, stage), stage)
+        needs = [name for name in stage.reads
+                 if name not in stages()[FIRST.get(stage.name, stage.name)].writes]
+        is_ready = record.has(needs) and all(
+            values[field.name] for field in stage.own_fields if field.is_required)
+        if is_ready and step_state(scene, step) in (StepState.NOT_RUN, StepState.STALE):
+            return stage
+    return None
 
 
 def stress_share(scene: bpy.types.Scene) -> float:

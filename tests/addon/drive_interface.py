@@ -124,7 +124,7 @@ def played():
 
 
 drive([open_sidebar, open_tab, picture("tab"), click(399), imported, picture("imported"),
-       click(313), reconstructed,
+       click(365), reconstructed,
        start_slow_job, slow_job_reports, picture("job"), click(145), job_cancelled,
        open_result, opened, picture("opened"), play, played, picture("playing"),
        start_slow_job, slow_job_left_running], longest=200)

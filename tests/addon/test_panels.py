@@ -40,6 +40,10 @@ class Layout:
             ).properties
         self.calls.append(("menu", name, text))
 
+    def menu(self, name, text, icon="NONE"):
+        assert hasattr(bpy_module().types, name) and icon in ICONS
+        self.calls.append(("menu", name, text))
+
     def panel(self, name, default_closed=False):
         self.calls.append(("panel", name, None))
         return Layout(self.calls), Layout(self.calls)
@@ -344,3 +348,30 @@ def test_every_choice_has_a_tooltip(bpy, panels):
             assert field.description, (stage.name, field.name)
             for item in getattr(group.bl_rna.properties[field.name], "enum_items", ()):
                 assert item.description, (stage.name, field.name, item.identifier)
+
+
+@pytest.mark.slow
+def test_the_next_step_is_a_button(bpy, panels, tmp_path):
+    """What was not run and can be: not an estimate without pulls; the plan, which samples first."""
+    steps = importlib.import_module("limber_addon.panels.steps")
+    scene = bpy.context.scene
+    assert steps.next_stage(scene) is None
+    shutil.copytree(EXAMPLE, tmp_path / "example")
+    bpy.ops.limber.open_result(directory=str(tmp_path / "example"))
+    assert steps.next_stage(scene).name == "report"
+    path = tmp_path / "example" / "branch.json"
+    content = json.loads(path.read_text())
+    for key in ("plan:to-goal", "energy", "estimate"):
+        del content["stages"][key]
+    path.write_text(json.dumps(content))
+    assert steps.next_stage(scene).name == "estimate"
+    for name in [name for name in content["files"] if name.startswith("pulls/")]:
+        del content["files"][name]
+    content["files"].pop("energy.npz", None)
+    path.write_text(json.dumps(content))
+    assert steps.next_stage(scene).name == "plan"
+    drawn = _draw(panels("result"), bpy.context)
+    assert ("operator", "limber.plan", "Next: Plan Path") in drawn.calls
+    menu = Layout()
+    bpy.types.LIMBER_MT_colours.draw(SimpleNamespace(layout=menu), bpy.context)
+    assert len(menu.names("operator")) == 7
