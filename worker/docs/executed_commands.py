@@ -12,7 +12,8 @@ Three directives work in one folder for each page, which begins empty:
     Shows a picture that the commands before it have made.
 
 A command that ends otherwise than expected is a warning, and so fails `scripts/docs`. With
-``-D run_commands=0`` nothing is run and the pages show the commands alone.
+``-D run_commands=0`` nothing is run and the pages show the commands alone. Tutorials move no robot
+but the virtual one.
 """
 
 import os
@@ -31,6 +32,8 @@ LOG = logging.getLogger(__name__)
 RUNS = "_runs"
 """The folder below the guide's sources in which each page has its own."""
 SECONDS = 400
+STOPPED_FOR_SAFETY = 4
+"""The exit code of a robot that was stopped: a busy computer can do that, so it is tried again."""
 
 
 def setup(app: Any) -> dict[str, Any]:
@@ -71,9 +74,12 @@ class Run(Directive):
         folder.mkdir(parents=True, exist_ok=True)
         word, *words = shlex.split(line)
         program = {"limber": [sys.executable, "-m", "limber"], "python": [sys.executable]}[word]
-        done = subprocess.run(
-            [*program, *words], cwd=folder, capture_output=True, text=True, check=False,
-            timeout=SECONDS, env={**os.environ, "COLUMNS": "96", "NO_COLOR": "1"})
+        for _ in range(2):
+            done = subprocess.run(
+                [*program, *words], cwd=folder, capture_output=True, text=True, check=False,
+                timeout=SECONDS, env={**os.environ, "COLUMNS": "96", "NO_COLOR": "1"})
+            if done.returncode != STOPPED_FOR_SAFETY:
+                break
         text = (done.stdout + done.stderr).replace(f"{folder}{os.sep}", "").rstrip()
         if done.returncode != self.options.get("exit", 0):
             LOG.warning("`%s` ended with exit code %d:\n%s", line, done.returncode, text[-1500:],
