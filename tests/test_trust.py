@@ -131,6 +131,12 @@ def test_options_are_finite_and_directions_have_a_length(name, value):
     ("mechanics:SimulateSettings", {"young": 1e12}, "between 1 kPa and 100 GPa"),
     ("estimation:EstimateSettings", {"young": 0.1}, "for 0.1 GPa write 0.1e9"),
     ("estimation:EstimateSettings", {"density": 900e3}, "between 50 and 3000"),
+    ("estimation:PredictSettings", {"weight": 1e29}, "no branch bears 1e+29 N"),
+    ("estimation:PredictSettings", {"load": (0.0, 0.0, -250e3)}, "for -250000 mN write -250"),
+    ("mechanics:SimulateSettings", {"grasp_force": (1e30, 0.0, 0.0)}, "no branch bears"),
+    ("mechanics:SimulateSettings", {"load_at": ((0, 0, 0.3, 0, 0, 1e6),)}, "no branch bears"),
+    ("mechanics:SimulateSettings", {"mass_at": ((0, 0, 0.3, 1e5),)}, "no branch bears"),
+    ("recordings:ImportSettings", {"weight": 1e6}, "for 1e+06 mN write 1000"),
     ("estimation:SwingSettings", {"density": 1.1}, "for 1.1 g/cm^3 write 1100"),
     ("estimation:VirtualPullSettings", {"young": (1e8, 9.0)}, "for 9 GPa write 9e9")])
 def test_moduli_and_densities_are_those_of_matter(model, values, told):

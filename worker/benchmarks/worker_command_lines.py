@@ -29,7 +29,7 @@ _LINES: dict[str, list[list[str]]] = {
         ["import-pull", "{branch}", "{in}/robot.csv", "--name", "p"]],
     "mesh": [["mesh", "{in}/branch.swc", "-o", "{out}/a.branch", "--unit", "m"]],
     "skeleton": [["skeleton", "{branch}"]],
-    "target": [["target", "{branch}", "--name", "fruit", "--position", "0", "0", "0.3"]],
+    "target": [["target", "{branch}", "fruit", "--at", "0", "0", "0.3", "--mass", "0.1"]],
     "vibration": [["vibration", "{branch}", "{in}/ring.csv"]],
     "export": [["export", "{branch}", "-o", "{out}/b.urdf"],
                ["export", "{branch}", "-o", "{out}/b.swc"]],

@@ -31,25 +31,42 @@ Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
 """A direction: three numbers that are not all 0; of any length."""
 
 
-def _possible_young(value: float) -> float:
-    if not YOUNG_PA[0] <= value <= YOUNG_PA[1]:
-        likely = f"; for {value:g} GPa write {value:g}e9" if 1e-2 <= value < 1e3 else ""
-        raise ValueError(f"it is in Pa, and that of a branch is between 1 kPa and 100 GPa{likely}")
-    return value
-
-
-def _possible_density(value: float) -> float:
-    if not DENSITY_KG_M3[0] <= value <= DENSITY_KG_M3[1]:
-        likely = f"; for {value:g} g/cm^3 write {1000 * value:g}" if 0.05 <= value <= 3 else ""
-        raise ValueError("it is in kg/m^3, and that of a branch is between 50 and 3000" + likely)
-    return value
-
-
 YOUNG_PA, DENSITY_KG_M3 = (1e3, 1e11), (50.0, 3000.0)
-Young = Annotated[float, AfterValidator(_possible_young)]
-"""A Young's modulus [Pa] that a branch, or a model of one, can have."""
-Density = Annotated[float, AfterValidator(_possible_density)]
-"""A density [kg/m^3] likewise."""
+MOST_FORCE_N = 1e5
+"""What a branch, or a model of one, can have, and what it can bear."""
+
+
+def possible_young(given: Any) -> Any:
+    """Validate one Young's modulus [Pa], several or None; ValueError names the likely slip."""
+    for value in _numbers(given):
+        if not YOUNG_PA[0] <= value <= YOUNG_PA[1]:
+            likely = f"; for {value:g} GPa write {value:g}e9" if 1e-2 <= value < 1e3 else ""
+            raise ValueError("it is in Pa, and that of a branch is between 1 kPa and 100 GPa"
+                             + likely)
+    return given
+
+
+def possible_density(given: Any) -> Any:
+    """Validate a density [kg/m^3] or None, likewise."""
+    for value in _numbers(given):
+        if not DENSITY_KG_M3[0] <= value <= DENSITY_KG_M3[1]:
+            likely = f"; for {value:g} g/cm^3 write {1000 * value:g}" if 0.05 <= value <= 3 else ""
+            raise ValueError("it is in kg/m^3, and that of a branch is between 50 and 3000"
+                             + likely)
+    return given
+
+
+def possible_force(given: Any) -> Any:
+    """Validate a force [N], its parts or None, likewise."""
+    for value in _numbers(given):
+        if abs(value) > MOST_FORCE_N:
+            raise ValueError(f"it is in N, and no branch bears {value:g} N; for {value:g} mN write "
+                             f"{value / 1000:g}")
+    return given
+
+
+def _numbers(given: Any) -> tuple[float, ...]:
+    return () if given is None else given if isinstance(given, tuple) else (given,)
 
 
 class OneOf:

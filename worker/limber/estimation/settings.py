@@ -2,9 +2,16 @@
 
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from limber.core.settings import Density, GraspMode, Groups, Settings, Young
+from limber.core.settings import (
+    GraspMode,
+    Groups,
+    Settings,
+    possible_density,
+    possible_force,
+    possible_young,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,12 +47,12 @@ class EstimateSettings(Settings):
     fractions: tuple[float, ...] = Field(
         (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
             "main path.")
-    young: Young | None = Field(
+    young: float | None = Field(
         None, gt=0, description="Initial Young's modulus [Pa]. Default: from the measured force.")
     poisson: float | None = Field(
         None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --fit-poisson is "
             "given.")
-    density: Density | None = Field(None, gt=0, description="Density [kg/m^3].")
+    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     field: Literal["open", "inverse_distance"] = Field(
@@ -82,6 +89,9 @@ class EstimateSettings(Settings):
         "The pulls are simulated on each one to include the uncertainty of the shape in the "
         "intervals. 0: only the uncertainty of the radii.")
 
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
+
 
 class SwingSettings(Settings):
     """How Young's modulus and damping are found from a free swing."""
@@ -97,12 +107,14 @@ class SwingSettings(Settings):
     periods: float = Field(6.0, ge=2, le=30, description="Number of periods after the release "
         "that are used.")
     poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
-    density: Density | None = Field(None, gt=0, description="Density [kg/m^3].")
+    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     density_sigma: float = Field(
         0.1, ge=0, description="Relative standard deviation of the density. A swing determines "
         "the modulus through inertia, so this uncertainty enters the modulus in full.")
+
+    _density = field_validator("density")(possible_density)
 
 
 class VirtualPullSettings(Settings):
@@ -119,11 +131,11 @@ class VirtualPullSettings(Settings):
     }
     common = ("cell_errors", "seed")
 
-    young: tuple[Young, ...] = Field(
+    young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
         "generated branch, or a gradient from 160 to 40 MPa.")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
-    density: Density = Field(900.0, gt=0, description="True density [kg/m^3].")
+    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
     motion: Literal["quasi_static", "dynamic"] = Field(
         "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
         "the branch; with --drive force it pulls and releases it.")
@@ -224,6 +236,10 @@ class VirtualPullSettings(Settings):
         duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
         return np.linspace(0.0, duration, self.frame_count)
 
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
+    _force = field_validator("weight")(possible_force)
+
 
 class PredictSettings(Settings):
     """A load on a branch whose Young's modulus has been estimated."""
@@ -242,3 +258,5 @@ class PredictSettings(Settings):
         None, description="Steady force in any direction, in the branch's frame [N].")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
+
+    _force = field_validator("weight", "load")(possible_force)

@@ -2,9 +2,9 @@
 
 from typing import ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from limber.core.settings import Density, Direction, Groups, Settings, Young
+from limber.core.settings import Direction, Groups, Settings, possible_density, possible_young
 
 GRASP_FRACTION = 2.0 / 3.0
 """Where a branch is held, along its main path, if nothing is said."""
@@ -146,14 +146,17 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     twig_order: int = Field(
         9, ge=0, le=9, description="Leave twigs of a higher branching order out of the mesh, and "
             "keep their mass.")
-    young: Young = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
+    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
-    density: Density = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
+    density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
     leaf_density: float = Field(
         0.2, ge=0, description="Mass of leaves per area of one side [kg/m^2].")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main "
             "path.")
+
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
 
 
 class MeshSurfaceSettings(Settings):
@@ -178,11 +181,14 @@ class MeshSurfaceSettings(Settings):
     mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's limit of processor time "
                                    "[s].")
     mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
-    young: Young = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
+    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
-    density: Density = Field(900.0, gt=0, description="Density [kg/m^3].")
+    density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the axis.")
+
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
 
 
 class BranchSpec(Settings):

@@ -2,9 +2,10 @@
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from limber.core.settings import GraspMode, Groups, OneOf, Settings, Young
+from limber.core.constants import STANDARD_GRAVITY
+from limber.core.settings import GraspMode, Groups, OneOf, Settings, possible_force, possible_young
 from limber.mechanics.materials.material_registry import material_names
 
 Point = tuple[float, float, float]
@@ -70,7 +71,7 @@ class SimulateSettings(Settings):
     lumped_mass: bool = Field(
         False, description="Lump the mass at the nodes instead of using the consistent mass "
             "matrix.")
-    young: Young | None = Field(
+    young: float | None = Field(
         None, gt=0, description="Young's modulus of the whole branch [Pa]. Default: the mesh's.")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
@@ -83,3 +84,14 @@ class SimulateSettings(Settings):
     damping_stiffness: float = Field(0.002, ge=0, description="Stiffness-proportional Rayleigh "
         "damping [s].")
     vtu: bool = Field(False, description="Also write a VTU series for ParaView.")
+
+    _force = field_validator("grasp_force")(possible_force)
+    _young = field_validator("young")(possible_young)
+
+    @field_validator("load_at", "mass_at")
+    @classmethod
+    def _possible_loads(cls, given: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+        for placed in given:
+            force = placed[3:] if len(placed) > 4 else (placed[3] * STANDARD_GRAVITY,)
+            possible_force(force)
+        return given

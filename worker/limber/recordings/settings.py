@@ -2,9 +2,9 @@
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from limber.core.settings import GraspMode, Groups, OneOf, Settings
+from limber.core.settings import GraspMode, Groups, OneOf, Settings, possible_force
 from limber.recordings.importing.recording_formats import kind_names
 
 
@@ -96,3 +96,5 @@ class ImportSettings(Settings):
     yolo_prompt: str | None = Field(
         None, description="Prompt for open-vocabulary models.")
     yolo_class: str | None = Field(None, description="Name of the class that is the branch.")
+
+    _force = field_validator("weight", "load")(possible_force)
