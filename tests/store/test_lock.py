@@ -1,10 +1,12 @@
 """Who may write to a branch folder."""
 
+import errno
 import os
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -95,3 +97,23 @@ def test_a_read_only_folder_is_read(branch: Branch):
             pass
     finally:
         branch.folder.chmod(0o755)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX locks")
+@pytest.mark.parametrize("code", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_disk_without_locks_is_told_from_another_writer(branch: Branch, monkeypatch, code):
+    """Some network disks have none: nobody else is writing, and the message does not say so."""
+    import fcntl
+
+    def none(*_args):
+        raise OSError(code, os.strerror(code))
+    # What a killed program left, where a file stands for the lock.
+    (branch.folder / ".run.lock").write_text("1\nelsewhere\n")
+    monkeypatch.setattr(fcntl, "flock", none)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(BranchFolderError, match="has no file locks") as told, \
+                branch.stage("second"):
+            pytest.fail("the stage began")
+    assert "Another Limber" not in str(told.value) and ".run.lock may help" in str(told.value)
+    Branch.read(branch.folder).verify()

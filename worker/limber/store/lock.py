@@ -24,6 +24,7 @@ COMMIT_LOCK = ".lock"
 RUN_LOCK = ".run.lock"
 HOLDER = ".run.json"
 _COMMIT_WAIT_SECONDS = 60.0
+_NO_LOCKS = frozenset((errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK))
 
 
 @contextmanager
@@ -47,6 +48,8 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
     try:
         _acquire(lock, folder, 0.0)
     except Timeout as error:
+        if _lacks_locks(folder / RUN_LOCK):
+            raise _no_locks(folder, RUN_LOCK) from error
         raise BranchBusyError(
             f"Another Limber is writing to {folder}: {_holder(folder)}.",
             "Two writers would corrupt each other's results. Reading is still possible.",
@@ -78,6 +81,8 @@ def commit_lock(folder: Path) -> Iterator[None]:
     try:
         _acquire(lock, folder, _COMMIT_WAIT_SECONDS)
     except Timeout as error:
+        if _lacks_locks(folder / COMMIT_LOCK):
+            raise _no_locks(folder, COMMIT_LOCK) from error
         raise BranchFolderError(
             f"{folder} has been locked by another Limber for a minute.",
             "Two stages must not enter results at once.", "Wait for it to end, or stop it.",
@@ -123,12 +128,42 @@ def _is_held(path: Path) -> bool:
         os.close(handle)
 
 
+def _lacks_locks(path: Path) -> bool:
+    """Whether the file system has no locks: that a file is there then stands for one, and stays
+    when its program is killed."""
+    if sys.platform == "win32":
+        return False
+    import fcntl
+
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except OSError as error:
+        return error.errno in _NO_LOCKS
+    finally:
+        os.close(handle)
+
+
+def _no_locks(folder: Path, name: str) -> BranchFolderError:
+    return BranchFolderError(
+        f"The disk of {folder} has no file locks.",
+        "Two programs that write there cannot be kept apart; or one that was killed has left its "
+        f"{name}.", f"Work on a copy on a local disk. If no other Limber is running, removing "
+        f"{folder / name} may help.")
+
+
 def _acquire(lock: BaseFileLock, folder: Path, wait_seconds: float) -> None:
     try:
         lock.acquire(timeout=wait_seconds)
     except OSError as error:
         if isinstance(error, Timeout):
             raise
+        if error.errno in _NO_LOCKS:
+            raise _no_locks(folder, Path(lock.lock_file).name) from error
         raise BranchFolderError(
             f"{folder} cannot be written to ({error.strerror or error}).",
             "Results are written there.",
