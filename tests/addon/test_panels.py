@@ -240,19 +240,22 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
     assert "limber.graph" in plan.names("operator") and "limber.graph" in estimate.names("operator")
 
 
-@pytest.mark.parametrize(("over", "icon"), [(["baseline"], "CHECKMARK"), (["plan"], "BLANK1")])
-def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, icon):
-    """What is proven of its cost stands without a tick, below what is wrong with it."""
+@pytest.mark.parametrize(("over", "stress", "icon", "warning"), [
+    (False, 0.5, "CHECKMARK", ""), (True, 0.5, "BLANK1", "Strain 1.2 x the strength (green wood)"),
+    (False, 1.8, "BLANK1", "May break: stress 1.8 times the strength")])
+def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, stress, icon, warning):
+    """What is proven of its cost stands without a tick, above what is wrong with it."""
     comparing = importlib.import_module("limber_addon.panels.comparing")
     layout, path = Layout(), {"length_m": 0.1, "peak_strain": 0.007}
     comparing.draw_paths(layout, {
         "plan": path, "baseline": path, "certificate": {"gap_percent": 1.0},
-        "wood": {"breaking_strain": 0.006, "paths_over": over}}, None)
+        "strength": {"peak_strain": 0.0072, "median_strain": 0.006, "over": over,
+                     "source": "green wood"}}, None, stress)
     assert {"Gentle", "Shortest"} <= set(layout.names("label"))
     proven = next(call for call in layout.calls if str(call[1]).startswith("Proven"))
     assert proven[2] == icon
-    warned = ("label", "Over the strain that breaks wood: 0.6 %", "ERROR") in layout.calls
-    assert warned == ("plan" in over)
+    errors = [call[1] for call in layout.calls if call[0] == "label" and call[-1] == "ERROR"]
+    assert errors == ([warning] if warning else [])
 
 
 @pytest.mark.slow
