@@ -147,7 +147,7 @@ def test_results_print_and_are_frozen(example, key):
 
 
 @pytest.mark.parametrize("key, columns", [
-    ("estimate", 4), ("energy", 7), ("plan:to-goal", 12), ("pull:pull-1", 13)])
+    ("estimate", 7), ("energy", 7), ("plan:to-goal", 12), ("pull:pull-1", 13)])
 def test_results_become_tables_and_pictures(example, key, columns):
     """Columns of one length with units in their names; a figure that no window keeps open."""
     import matplotlib.pyplot as plt

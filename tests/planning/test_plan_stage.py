@@ -25,7 +25,7 @@ from limber.planning.goals.chosen_pose import default_goal, hemisphere_goal
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_summary import doubts_of
 from limber.planning.two_paths import PlanSettings
-from limber.results.report.plan_figures import convergence, report_figures
+from limber.results.report.plan_figures import convergence, report_figures, searched
 from limber.stages.paths.energy import EnergySettings, sample_energy_field
 from limber.stages.paths.plan import plan as plan_paths
 from limber.store import Branch
@@ -344,8 +344,8 @@ def test_figures_draw(planned_branch, tmp_path):
 
 def test_a_planner_that_found_its_first_path_late_is_drawn():
     """Grids without a path yet have no cost: the curve begins where there is one."""
-    plan = SimpleNamespace(summary={"convergence": {"baseline": [], "plan": [
+    found = searched({"baseline": [], "plan": [
         {"iteration": 1, "cost": None}, {"iteration": 2, "cost": 2.0},
-        {"iteration": 3, "cost": 1.0}]}})
-    (line,) = convergence(plan).axes[0].lines
+        {"iteration": 3, "cost": 1.0}]})
+    (line,) = convergence(found).axes[0].lines
     assert line.get_xdata().tolist() == [2, 3] and line.get_ydata().tolist() == [2.0, 1.0]

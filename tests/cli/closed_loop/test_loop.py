@@ -17,7 +17,7 @@ from limber.cli.closed_loop.cell_layout import (
 )
 from limber.cli.closed_loop.comparison import comparison
 from limber.cli.closed_loop.loop import ClosedLoop
-from limber.cli.commands.robot import _points
+from limber.cli.robot_commands.calibrate import _points
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress

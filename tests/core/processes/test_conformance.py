@@ -121,7 +121,8 @@ class InAddon:
         self.jobs = importlib.import_module(f"{package.__name__}.jobs")
         monkeypatch.setattr(self.jobs, "_GRACE_SECONDS", 0.3)
         # The worker's own Python finds itself; that of the tests finds this tree.
-        monkeypatch.setattr(self.jobs, "worker_environment", lambda: dict(os.environ))
+        started = importlib.import_module(f"{package.__name__}.worker_process")
+        monkeypatch.setattr(started, "worker_environment", lambda: dict(os.environ))
 
     def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None,
             outcome: Outcome | None = None) -> Outcome:

@@ -425,7 +425,7 @@ class Plan(Result):
         energy_saved: Against the shortest path [%].
         cost: Of the gentle path on the energy field, dimensionless: the planner weighs energy and
             length, each over its scale. With a ``max_detour``: the energy along it [J m].
-        bound: No path costs less than that, in the same unit: the certificate.
+        bound: No path costs less than that, dimensionless or [J m] as the cost: the certificate.
         gap: Largest cost of the gentle path above that of the best one [%]; None if unknown.
 
     >>> way = limber.open("a.branch").results["plan:to-goal"]
