@@ -50,6 +50,8 @@ def test_the_end_says_what_where_and_what_next():
     then = command_to_type("limber estimate {branch_folder}", values)
     assert then == "limber estimate 'my trees/a.branch'"
     assert command_to_type("limber plan {branch_folder} --name {name}", values) == ""
+    assert command_to_type("{name:if}limber verify {branch_folder}", values) == ""
+    assert command_to_type("{branch_folder:if}limber doctor", values) == "limber doctor"
     assert closing_lines(["Done."], "a.branch", then) == [
         "Done.", "in    a.branch", f"next  {then}"]
     assert closing_lines(["Done."]) == ["Done."]
@@ -65,5 +67,5 @@ def test_every_stage_says_what_it_found_and_proposes_commands_that_exist(name):
             if field is not None and spec:
                 assert spec.lstrip("|") in UNITS or spec[0] == ".", (line, spec)
     if stage.then:
-        program, command, *_rest = stage.then.split()
+        program, command, *_rest = stage.then.rpartition(":if}")[2].split()
         assert program == "limber" and command in stage_summaries()

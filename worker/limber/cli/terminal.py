@@ -52,7 +52,7 @@ def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[st
 
 def command_to_type(template: str, values: Mapping[str, Any]) -> str:
     """Return a command with its names and paths filled in, quoted for a shell; empty where one of
-    them is not there."""
+    them is not there. ``{name:if}`` asks for a value and stands for nothing."""
     try:
         return _QUOTED.vformat(template, (), values)
     except _NotThere:
@@ -111,7 +111,7 @@ class _Quoted(_Filled):
     """Fills names and paths into a command."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        return shlex.quote(str(value))
+        return "" if format_spec == "if" else shlex.quote(str(value))
 
 
 _FILLED, _QUOTED = _Filled(), _Quoted()

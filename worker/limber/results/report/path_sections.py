@@ -3,6 +3,7 @@
 from limber.core.errors import InputError
 from limber.core.files.reading import read_arrays
 from limber.planning.field.energy_field import EnergyField
+from limber.results.findings import beyond_sentence
 from limber.results.report import execution_section as execution
 from limber.results.report import figures
 from limber.results.report.report_tables import comparison_rows
@@ -61,6 +62,8 @@ def plan_section(branch: Branch, name: str) -> Section:
         section.text.append(
             "A simulation over time on the full model, with inertia and at "
             f"{1e3 * moving['speed_m_s']:.0f} mm/s, keeps all limits. Peaks: {peaks}.")
+    if beyond := beyond_sentence(plan):
+        section.text.append(beyond)
     for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
     return section

@@ -325,4 +325,4 @@ STAGE = StageDescription(
            "{radius_max_m:m}.",
            "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}.",
            "{done_count} scans reconstructed, {failed_count} failed."),
-    then="limber skeleton {output}", step="skeleton", label="Reconstruct")
+    then="{tet_count:if}limber skeleton {output}", step="skeleton", label="Reconstruct")
