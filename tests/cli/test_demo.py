@@ -2,12 +2,13 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from limber.cli import main
 from limber.cli.commands import demo
-from limber.core.errors import NoPathError
+from limber.core.errors import NoPathError, WorkError
 from limber.stages.command_line import options_of, without_foreign_options
 from limber.store import Branch
 
@@ -149,3 +150,25 @@ def test_sentences_and_brackets_with_other_options_are_left_out() -> None:
     text = "At 0.5 m (--voxel 0.1) well-known. Give --b-c 1.5, or --a. Or --b."
     assert without_foreign_options(text, {"--b", "--a"}) == "At 0.5 m well-known. Or --b."
     assert without_foreign_options(text, {"--b", "--a", "--b-c", "--voxel"}) == text
+
+
+@pytest.mark.parametrize("in_goal", [True, False])
+def test_a_demo_with_a_robot_ends_with_what_came_of_it(monkeypatch, tmp_path, capsys, in_goal):
+    """Intervals, flower and force in a sentence; a picture that failed is not named."""
+    result = {"branch": "loop.branch", "covered": [True, False], "flower_in_goal": in_goal,
+              "force_within_share": 0.987}
+    monkeypatch.setattr("limber.cli.closed_loop.loop.ClosedLoop",
+                        lambda *_arguments, **_options: SimpleNamespace(run=lambda: result))
+    monkeypatch.setattr("limber.cli.closed_loop.comparison.comparison", lambda _result: [])
+
+    def run(arguments, _progress=None):
+        if arguments[0] == "scene":
+            raise WorkError("There is no Blender.")
+        return {"report": "loop.branch/report.html"}
+    monkeypatch.setattr(demo, "run_stage", run)
+    assert main.call(["demo", "--robot", "-o", str(tmp_path)]) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("1 of 2 intervals contain the true modulus; the flower "
+                               + ("was brought to its goal" if in_goal else "did not reach"))
+    assert "98.7 % of it" in told.out and "report  loop.branch/report.html" in told.out
+    assert "picture" not in told.out and "There is no picture" in told.err
