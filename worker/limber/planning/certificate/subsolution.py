@@ -41,7 +41,8 @@ RIM = 2
 
 _ROUNDS = 8  # of local reweighting; ends when nothing is over by more than _CLOSE
 _CLOSE = 1.0005
-_IDLE = 2  # rounds one after the other in which nothing is over by less end it as well,
+_IDLE = 2  # rounds one after the other that bring nothing end it as well,
+_WORTH = 1.004  # times less is what a round has to bring; less is not worth its time
 _LARGE = 100_000  # one alone where so many cells are asked: it takes a third of a second there
 
 
@@ -207,22 +208,21 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     factor = 1.0 / steep if steep > 0.0 else float(bound[held].min())
     rate, beside = bound, held
     least, best, of_best, idle = np.inf, bound, factor, 0
-    patience = _IDLE if len(asked) < _LARGE else 1
     for _ in range(rounds):
         values = march(rate, near, held, factor * lengths, ground.spacing)
         u.ravel()[places] = values
         over = np.ones(len(places))
         over[own] = np.maximum(_excess(u, *ground, asked), 1.0)
         worst = float(over.max())
-        idle += 1
+        idle = 0 if worst < least / _WORTH else idle + 1
         if worst < least:
-            least, best, of_best, idle = worst, values, factor, 0
-        if worst <= _CLOSE or idle == patience:
+            least, best, of_best = worst, values, factor
+        if worst <= _CLOSE or idle == (_IDLE if len(asked) < _LARGE else 1):
             break
         factor /= float(over[beside].max())
         beside = about
-        # The largest of the neighbours: reweighting cell by cell stirs up a chequerboard.
         over[held] = 1.0
+        # The largest of the neighbours: cell by cell stirs up a chequerboard.
         rate = rate / _most_about(over, numbers, places)
     # The rescaling is what makes it a proof; the rounds before only keep it small.
     u.ravel()[places] = best / least
