@@ -55,7 +55,7 @@ class LocalError:
             return cls(places, sizes**2, 1.0, np.inf, most)
         floor = _LEAST * float(np.median(sizes))
         squares = sizes**2 + floor**2
-        near = _spacing(places)**2
+        near = max(_spacing(places)**2, 1e-18)
         foretold = np.sqrt(_means(places, places, squares, near, True))
         shares = np.sort(np.maximum(above, 0.0) / np.maximum(foretold, 1e-300))
         # One more than there are: the place that is asked about is as good as any sample.
