@@ -15,11 +15,11 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _INTERVAL_SECONDS = 0.05
 _LONGEST_PLANT_M = 300.0
 """No plant is so large: a file with larger numbers is not in metres."""
-_KINDS = (".ply", ".xyz", ".txt", ".csv")
+_KINDS = (".ply", ".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts", ".xyzrgb")
 
 
 class LIMBER_OT_import_cloud(bpy.types.Operator):
-    """Show a point cloud (PLY, XYZ, TXT, CSV) in the scene"""
+    """Show a point cloud (PLY, XYZ, TXT, CSV, TSV, ASC, PTS, XYZRGB) in the scene"""
 
     bl_idname = "limber.import_cloud"
     bl_label = "Import Scan"

@@ -55,7 +55,7 @@ FILES = {
     "qualisys_header.tsv": "NO_OF_FRAMES\t20\nFREQUENCY\t100\nMARKER_NAMES\tM1\tM2\nFrame\tTime\t"
                            "M1 X\tM1 Y\tM1 Z\tM2 X\tM2 Y\tM2 Z\n"
                            + rows(lambda k: [str(k + 1), f"{k / 100:.5f}"], 1e3, "\t"),
-    "opensim.txt": "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\t"
+    "opensim.trc": "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\t"
                    "Units\tOrigDataRate\n100.0\t100.0\t20\t2\tmm\t100.0\nFrame#\tTime\tM1\t\t\tM2"
                    "\t\t\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"
                    + rows(lambda k: [str(k + 1), f"{k / 100:.5f}"], 1e3, "\t"),
@@ -74,7 +74,7 @@ def test_markers_of_motion_capture(tmp_path, name):
     assert len(stream) == COUNT
 
 
-@pytest.mark.parametrize("name", ["vicon.csv", "qualisys.tsv", "opensim.txt"])
+@pytest.mark.parametrize("name", ["vicon.csv", "qualisys.tsv", "opensim.trc"])
 def test_a_capture_of_one_frame_is_refused(tmp_path, name):
     """Its last line may be cut short, and then there is none."""
     text = FILES[name]

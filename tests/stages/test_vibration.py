@@ -91,6 +91,8 @@ def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
     ("t,a\n1,1\n", "two samples"),
     ("b,a\n1,1\n", "No column is named time"),
     ("time_s,a\n" + "".join(f"{k},1\n" for k in range(40)) + "1e12,1\n", "gaps"),
+    ("time_s,a\n" + "".join(f"{k / 50},{k % 7}\n" for k in range(40)) + "3600,1\n", "gaps"),
+    ("time_s,a,b\n" + "".join(f"{k / 50},3,{k}\n" for k in range(90)), "changes"),
     ("time_s,a\n" + "".join(f"{k},{k % 2}\n" for k in range(9)), "At least 32"),
 ])
 def test_a_record_that_cannot_be_used(branch, tmp_path, content, told):

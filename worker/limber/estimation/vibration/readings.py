@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from limber.core.errors import InputError
 from limber.recordings.time_series import Stream
 
 _BAND = 0.15
@@ -38,17 +39,27 @@ def ringing_columns(record: Stream) -> Stream:
 
     Accelerations of other directions, a temperature, a voltage, a counter stand beside the reading
     in a logger's table. Where no column rings clearly, all that change are kept.
+
+    Raises:
+        InputError: none changes, or they only count.
     """
     changing = [k for k in range(record.values.shape[1])
                 if not _is_counter(record.values[:, k])]
+    if not changing:
+        raise InputError(f"No column of the record changes ({', '.join(record.columns)}), but for "
+                         "those that only count.", "A vibration goes to and fro.",
+                         "Check the file and the sensor.")
     spectra = {k: _spectrum(record.times, record.values[:, k]) for k in changing}
-    used = [k for k, found in spectra.items() if found.rings] or changing
+    ringing = [k for k, found in spectra.items() if found.rings]
+    used = ringing or changing
     others = [title for k, title in enumerate(record.columns) if k not in used]
-    if not others or not used:
+    if not others:
         return record
-    told = (f"Columns taken as readings, because they ring: "
-            f"{', '.join(record.columns[k] for k in used)}. "
-            f"Not used, because they do not: {', '.join(others)}.")
+    taken = ", ".join(record.columns[k] for k in used)
+    told = (f"Columns taken as readings, because they ring: {taken}. Not used, because they do "
+            f"not: {', '.join(others)}." if ringing else
+            f"No column rings clearly. Columns taken as readings, because they change: {taken}. "
+            f"Not used: {', '.join(others)}.")
     return replace(record, values=record.values[:, used],
                    columns=tuple(record.columns[k] for k in used),
                    warnings=(*record.warnings, told))

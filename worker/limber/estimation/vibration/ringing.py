@@ -26,7 +26,8 @@ _COUNTS = r"frames?|samples?|index|framenumber|subframes?"
 """Columns that count the rows."""
 _MOST_MODES = 4
 _LEAST_READINGS = 32
-_MOST_STEPS = 2e6
+_MOST_STEPS, _MOST_GAPS = 2e6, 10
+"""Steps of a record; over its readings."""
 _LEAST_TURNS = 3.0
 _PERIODS = 60
 """So many of the first are used: what comes later is noise, or somebody at the branch."""
@@ -95,7 +96,8 @@ def read_record(path: Path) -> Stream:
     if not used:
         raise InputError(f"{path} has no complete column of readings beside its times.",
                          "A record needs at least one.", "Correct the file.")
-    if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
+    steps = (times[-1] - times[0]) / np.median(np.diff(times))
+    if not steps < min(_MOST_STEPS, _MOST_GAPS * len(times)):
         raise InputError(f"{path} has gaps that are far longer than its time steps.",
                          "The analysis needs uniform time steps.",
                          "Give a part of the record without gaps.")

@@ -6,7 +6,7 @@ from typing import Literal
 
 from limber.geometry.io.formats import Format, Registry
 
-_TABLES = (".csv", ".tsv", ".txt")
+_TABLES = (".csv", ".tsv", ".txt", ".trc")
 _HERE = "limber.recordings.importing"
 _READERS = f"{_HERE}.readers"
 
