@@ -92,6 +92,8 @@ def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
     ("b,a\n1,1\n", "No column is named time"),
     ("time_s,a\n" + "".join(f"{k},1\n" for k in range(40)) + "1e12,1\n", "gaps"),
     ("time_s,a\n" + "".join(f"{k / 50},{k % 7}\n" for k in range(40)) + "3600,1\n", "gaps"),
+    ("time,a\n" + "".join(f"{k / 2},{np.exp(-k / 90) * np.cos(k / 22):.5f}\n"
+                          for k in range(600)), "another unit"),
     ("time_s,a,b\n" + "".join(f"{k / 50},3,{k}\n" for k in range(90)), "changes"),
     ("time_s,a\n" + "".join(f"{k},{k % 2}\n" for k in range(9)), "At least 32"),
 ])

@@ -97,7 +97,7 @@ def in_seconds(where: str, stamps: np.ndarray, unit: str | None, is_clock: bool,
     others = known[known != 0]
     if len(others) > 2 and others.min() > max(_EARLIEST, 100 * np.median(np.diff(others))):
         times = np.where(times == 0, np.nan, times)
-    scale, notes = (TIME_UNITS_S[unit], []) if unit else _recognised(where, times, whole)
+    scale, notes = (TIME_UNITS_S[unit], []) if unit else _recognised(where, times)
     return times * scale, notes
 
 
@@ -109,7 +109,7 @@ def _unwrapped(stamps: np.ndarray, period: float) -> np.ndarray:
     return stamps + period * np.r_[0, np.cumsum(steps < -0.5 * period)]
 
 
-def _recognised(where: str, stamps: np.ndarray, whole: bool) -> tuple[float, list[str]]:
+def _recognised(where: str, stamps: np.ndarray) -> tuple[float, list[str]]:
     """Seconds in one count of stamps without a unit, and what to tell of it."""
     known = stamps[np.isfinite(stamps)]
     if len(known) < 3:
@@ -118,15 +118,15 @@ def _recognised(where: str, stamps: np.ndarray, whole: bool) -> tuple[float, lis
     for unit in ("ms", "us", "ns"):
         if _EARLIEST < size * TIME_UNITS_S[unit] < _LATEST:
             return TIME_UNITS_S[unit], []
-    if step < (1.0 if whole else 5.0):
+    if step < 1.0:
         return 1.0, []
     fix = "If it has another unit, name it in the title of the column, such as t_s or t_ms."
     if step < 5.0:
         if len(known) < _LEAST:
             return 1.0, [f"{where} does not state a unit and has steps of {step:g}. Seconds are "
                          f"assumed. {fix}"]
-        raise InputError(f"{where} does not state a unit and has whole numbers in steps of "
-                         f"{step:g}.", "They can be seconds or milliseconds.",
+        raise InputError(f"{where} does not state a unit and has steps of {step:g}.",
+                         "They can be seconds or milliseconds.",
                          "Name the unit in the title of the column: t_s or t_ms.")
     for unit in ("ms", "us", "ns"):
         if _FASTEST < step * TIME_UNITS_S[unit] <= _SLOWEST:

@@ -31,6 +31,8 @@ _MESH_DEVIATION = 0.02
 _CLOSE = 1.15
 """Modes within this ratio of the first may be the one that is seen: two planes of bending."""
 _ROUNDS = 8
+_SLOWEST_HZ, _FASTEST_HZ = 0.05, 1000.0
+"""No plant's branch swings slower or faster: its record's times are in another unit."""
 
 
 class VibrationInputs(BranchInputs):
@@ -95,6 +97,10 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
         seen = identify(rung.times, rung.values, settings.start)
         for text in seen.warnings:
             progress.warn(text)
+        if not _SLOWEST_HZ < seen.frequencies[0] < _FASTEST_HZ:
+            raise InputError(f"{record} has a first frequency of {seen.frequencies[0]:.3g} Hz.",
+                             "No branch swings like that. Its times are in another unit.",
+                             "Name the unit in the title of the times: t_s, t_ms or t_us.")
         progress(0.3, "modulus of that frequency")
         model = load_branch(branch, progress=progress).model
         told = young_of(_with_sensor(model, settings), seen, settings)
