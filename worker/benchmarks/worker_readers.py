@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.worker_bag_readers import BAG_READERS
 from benchmarks.worker_branch_readers import BRANCH_READERS, Reader, template_file
 from benchmarks.worker_command_lines import LINE_READERS
+from benchmarks.worker_scanner_files import SCANNER_READERS
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Registry
 from limber.geometry.io.skeletons import SKELETONS
@@ -459,6 +460,6 @@ READERS: dict[str, Reader] = {
     "job TOML": Reader("text", _jobs, _read_jobs),
     "cell TOML": Reader("text", _cell, _read_cell),
     "session commands": Reader("text", _commands, _read_commands),
-    **BAG_READERS, **BRANCH_READERS, **LINE_READERS,
+    **BAG_READERS, **BRANCH_READERS, **LINE_READERS, **SCANNER_READERS,
 }
 """Readers by name."""

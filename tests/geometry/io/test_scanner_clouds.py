@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
 from limber.geometry.io.clouds import read_points
-from limber.geometry.io.e57 import _checksums
+from limber.geometry.io.e57 import checksums
 
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform(-2, 2, (50, 3)).round(4)
@@ -86,13 +86,13 @@ def e57(path, columns, extra=("", ()), pose=""):
     content = struct.pack("<8sIIQQQQ", b"ASTM-E57", 1, 0, 0, logical // 1020 * 1024
                           + logical % 1020, len(xml), 1024) + section + xml
     pages = np.frombuffer(content + bytes(-len(content) % 1020), np.uint8).reshape(-1, 1020)
-    path.write_bytes(np.hstack([pages, _checksums(pages).astype(">u4")[:, None].view(np.uint8)]
+    path.write_bytes(np.hstack([pages, checksums(pages).astype(">u4")[:, None].view(np.uint8)]
                                ).tobytes())
 
 
-def test_checksums_are_those_of_the_standard():
+def testchecksums_are_those_of_the_standard():
     """CRC-32C of the digits 1 to 9, from RFC 3720's kin."""
-    assert _checksums(np.frombuffer(b"123456789", np.uint8)[None])[0] == 0xE3069283
+    assert checksums(np.frombuffer(b"123456789", np.uint8)[None])[0] == 0xE3069283
 
 
 @pytest.mark.parametrize("columns", [FLOATS, SCALED, WIDE, SPHERES])

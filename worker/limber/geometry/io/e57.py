@@ -75,15 +75,15 @@ def _content(path: Path) -> tuple[bytes, int]:
     if not 64 <= page <= 1 << 20 or page & (page - 1) or len(raw) % page:
         raise _damaged(path, "its size is not a whole number of pages")
     pages = raw.reshape(-1, page)
-    wrong = _checksums(pages[:, :-4]) != pages[:, -4:].copy().view(">u4").ravel()
+    wrong = checksums(pages[:, :-4]) != pages[:, -4:].copy().view(">u4").ravel()
     if wrong.any():
         raise _damaged(path, f"{int(wrong.sum())} of its {len(pages)} pages do not match their "
                        "checksums")
     return pages[:, :-4].tobytes(), int(page)
 
 
-def _checksums(pages: np.ndarray) -> np.ndarray:
-    """CRC-32C of each row, shape [n]."""
+def checksums(pages: np.ndarray) -> np.ndarray:
+    """Return the CRC-32C of each row of bytes, shape [n]."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = (table >> 1) ^ np.where(table & 1, np.uint32(0x82F63B78), np.uint32(0))

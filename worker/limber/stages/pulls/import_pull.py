@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,7 +23,6 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.recordings.importing.import_request import BranchFrame, RobotKnown
-
 
 
 class ImportInputs(BranchInputs):
@@ -142,10 +142,18 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
                        force=options.force, progress=progress)
 
 
+def _moved(values: Mapping[str, Any]) -> str | None:
+    """Say how far the points of a load's recording moved."""
+    if "displacement_m" not in values:
+        return None
+    farthest = float(np.linalg.norm(values["displacement_m"], axis=-1).max())
+    return f"The points moved by up to {1e3 * farthest:.3g} mm under the load."
+
+
 STAGE = StageDescription(
     "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
     writes=("pulls/{name}/",),
     found=("Pull {pull} ({kind}): {frame_count} frames of {point_count} points.",
-           "The points moved by {displacement_m:m} under the load.",
+           _moved,
            "Force over displacement: {slope_n_per_m:.3g} N/m."),
     then="limber estimate {branch_folder}", step="pulls", label="Import Pull")
