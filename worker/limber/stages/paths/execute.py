@@ -99,6 +99,25 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         NoPathError: the arm cannot follow the path; says where and why.
         SafetyStop: it was stopped; the log is in the folder all the same.
     """
+    branch, cell, settings, motion, result = planned_motion(
+        folder, name, cell_file, settings, progress=progress, is_to_move=options.arm)
+    if not options.arm:
+        _write_preview(branch, name, settings, cell, motion)
+        return result | {"armed": False, "reached": None, "stop_reason": None,
+                         "after_stop": None, "peak_force_n": None, "path_error_m": None}
+    require_confirmation(name, options.confirm, cell, progress)
+    return _armed(branch, cell, name, settings, options, motion, result, progress)
+
+
+def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings, *,
+                   progress: Progress, is_to_move: bool,
+                   ) -> tuple[Branch, Cell, ExecuteSettings, RobotMotion, dict[str, Any]]:
+    """Return branch, cell, settings and the motion of a plan, checked for the robot, and what was
+    computed of it.
+
+    Raises:
+        InputError, NoPathError: as :func:`execute`.
+    """
     from limber.robot.cell.cell import read_cell
     from limber.robot.cell.compatibility import check_branch, check_plan, require_payload
 
@@ -111,7 +130,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     if warning := check_plan(told.get("robot"), cell):
         progress.warn(warning)
     settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
-    if options.arm:
+    if is_to_move:
         require_payload(cell)
     from limber.robot.motion.execution import robot_motion
     from limber.robot.motion.expected_wrench import Predicted
@@ -135,12 +154,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
     result = _summary(cell, motion)
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
-    if not options.arm:
-        _write_preview(branch, name, settings, cell, motion)
-        return result | {"armed": False, "reached": None, "stop_reason": None,
-                         "after_stop": None, "peak_force_n": None, "path_error_m": None}
-    require_confirmation(name, options.confirm, cell, progress)
-    return _armed(branch, cell, name, settings, options, motion, result, progress)
+    return branch, cell, settings, motion, result
 
 
 def _told(branch: Branch, name: str) -> dict[str, Any]:

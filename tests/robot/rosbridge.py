@@ -1,0 +1,104 @@
+"""A rosbridge server for tests: an arm that follows trajectories, and its force sensor."""
+
+import contextlib
+import json
+import threading
+import time
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import serve
+
+STEP = 0.008
+_NAMES = [f"{name}_joint" for name in (
+    "elbow", "shoulder_lift", "shoulder_pan", "wrist_1", "wrist_2", "wrist_3")]
+_ORDER = [2, 1, 0, 3, 4, 5]  # of the arm's joints in those names
+
+
+class RosBridge:
+    """Serves on a free port; a context manager.
+
+    Attributes:
+        joints: Where the arm stands, in its own order [rad], shape [6].
+        wrench: What the sensor tells besides noise [N, N m], shape [6].
+        heard: Operations that came, each with its time.
+        silent: Topics that send nothing.
+    """
+
+    def __init__(self, joints):
+        self.joints, self.speeds = np.array(joints, float), np.zeros(6)
+        self.wrench, self.heard, self.silent = np.zeros(6), [], set()
+        self.followed, self.stands_at = [], None
+        self._goal, self._open = None, []
+        self._rng = np.random.default_rng(0)
+
+    def __enter__(self):
+        self._server = serve(self._serve, "127.0.0.1", 0, compression=None,
+                             close_timeout=0.2)
+        self.url = f"ws://127.0.0.1:{self._server.socket.getsockname()[1]}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        return self
+
+    def __exit__(self, *_exception):
+        for socket in self._open:
+            socket.close()
+        self._server.shutdown()
+
+    def _serve(self, socket):
+        self._open.append(socket)
+        listening = threading.Thread(target=self._listen, args=(socket,), daemon=True)
+        listening.start()
+        began, count = time.monotonic(), 0
+        try:
+            while listening.is_alive():
+                count += 1
+                self._step(socket)
+                self._send(socket, "/joint_states", count, {
+                    "name": _NAMES, "position": self.joints[_ORDER].tolist(),
+                    "velocity": self.speeds[_ORDER].tolist(), "effort": []})
+                told = self.wrench + 0.02 * self._rng.standard_normal(6)
+                self._send(socket, "/force_torque_sensor_broadcaster/wrench", count, {"wrench": {
+                    kind: dict(zip("xyz", map(float, part), strict=True))
+                    for kind, part in (("force", told[:3]), ("torque", told[3:]))}})
+                time.sleep(max(began + count * STEP - time.monotonic(), 0.0))
+        except ConnectionClosed:
+            return
+
+    def _send(self, socket, topic, count, message):
+        if topic not in self.silent:
+            seconds = count * STEP
+            stamp = {"sec": int(seconds), "nanosec": round(1e9 * (seconds % 1))}
+            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": {
+                "header": {"stamp": stamp, "frame_id": ""}, **message}}))
+
+    def _step(self, socket):
+        before = self.joints.copy()
+        if self._goal is not None:
+            goal, times, ways, at = self._goal
+            at = min(at + STEP, times[-1])
+            self.joints = np.array([np.interp(at, times, ways[:, k]) for k in range(6)])
+            self.followed.append(self.joints.copy())
+            self._goal = (goal, times, ways, at)
+            if at >= times[-1]:
+                self._goal = None
+                socket.send(json.dumps({"op": "action_result", "id": goal["id"], "status": 4,
+                                        "action": goal["action"], "values": {"error_code": 0},
+                                        "result": True}))
+        self.speeds = (self.joints - before) / STEP
+
+    def _listen(self, socket):
+        with contextlib.suppress(ConnectionClosed):
+            for text in socket:
+                self._hear(json.loads(text))
+
+    def _hear(self, order):
+        self.heard.append((time.monotonic(), order))
+        if order["op"] == "send_action_goal":
+            points = order["args"]["trajectory"]["points"]
+            order_of = [order["args"]["trajectory"]["joint_names"].index(name) for name in _NAMES]
+            ways = np.array([point["positions"] for point in points])[:, order_of][:, _ORDER]
+            self._goal = (order, np.array([
+                point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
+                for point in points]), ways, 0.0)
+        elif order["op"] == "cancel_action_goal":
+            self._goal = None

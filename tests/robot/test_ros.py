@@ -1,0 +1,187 @@
+"""The door to ROS 2, against a rosbridge server in the test: followed, guarded, stopped in time."""
+
+import gc
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.robot.rosbridge import RosBridge
+
+from limber.core.errors import InputError, SafetyStop, WorkError
+from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.real_time import claim_real_time
+from limber.robot.motion.expected_wrench import ExpectedWrench
+from limber.robot.motion.joint_path import joint_path
+from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.ros import guarded
+from limber.robot.ros.bridge import Bridge
+from limber.robot.ros.guarded import RosRobot, Topics
+from limber.robot.ros.messages import JointStates, goal_of
+
+CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
+            tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
+ROOT = Path(__file__).parents[2]
+HOME = np.array(CELL.arm.home)
+TOOL = matrices(np.array(CELL.tool.grasp_pose))
+
+
+@pytest.fixture
+def _first_in_line():
+    """This process before others, as the command claims it, and the server's threads with it."""
+    claim_real_time()
+    # A whole search for garbage through all that a test process holds takes longer than 50 ms.
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def line(way: float, speed: float = 0.05) -> Trajectory:
+    start = pose_vectors(CELL.arm.forward(HOME) @ TOOL)
+    poses = densely(np.array([start, start + [0, way, 0, 0, 0, 0]]))
+    joints = joint_path(CELL.arm, matrices(poses) @ np.linalg.inv(TOOL), start=HOME).joints
+    return Trajectory(along(poses, speed, 0.5), poses, ExpectedWrench.nothing(poses), joints)
+
+
+def robot_at(bridge: RosBridge, taken: list | None = None) -> RosRobot:
+    robot = RosRobot(CELL, Bridge(bridge.url), Topics(),
+                     None if taken is None else lambda *row: taken.append(row))
+    robot.tare(0.25)
+    return robot
+
+
+@pytest.mark.real_time
+@pytest.mark.usefixtures("_first_in_line")
+def test_a_plan_is_followed_and_a_force_stops_it_in_time():
+    """All samples at 125 Hz; then a push: stop topic and cancel within 0.1 s, and standstill."""
+    with RosBridge(HOME) as server:
+        taken = []
+        robot = robot_at(server, taken)
+        path = line(0.02)
+        assert robot.follow(path) == {"event": "reached"}
+        assert server.joints == pytest.approx(path.joints[-1])
+        times = np.array([row[0] for row in taken])
+        assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 0.008), abs=1e-6)
+        assert len(times) > 0.9 * path.duration / 0.008
+        server.joints = HOME.copy()
+        time.sleep(0.05)
+        while robot._take(robot._bridge.receive(0.005)) is not None or np.abs(
+                robot.last.joints - HOME).max() > 1e-6:
+            continue
+        pushed = []
+
+        def push() -> None:
+            pushed.append(time.monotonic())
+            server.wrench = np.array([0, 0, 30.0, 0, 0, 0])
+        threading.Timer(0.4, push).start()
+        event = robot.follow(line(0.1))
+        assert event["event"] == "stopped" and event["stands"]
+        assert "force" in event["reason"]
+        stops = {order["op"]: at for at, order in server.heard
+                 if order["op"] == "cancel_action_goal" or order.get("msg") == {"data": True}}
+        assert set(stops) == {"publish", "cancel_action_goal"}
+        assert max(stops.values()) - pushed[0] < 0.1
+        # After a stop only a person's choice moves it again.
+        with pytest.raises(SafetyStop, match="Choose"):
+            robot.guard.begin()
+
+
+@pytest.mark.real_time
+@pytest.mark.usefixtures("_first_in_line")
+@pytest.mark.parametrize("fault, told", [
+    (lambda server: server.silent.add("/joint_states"), "no data from the robot"),
+    (lambda server: server.silent.add("/force_torque_sensor_broadcaster/wrench"),
+     "the wrench has been silent")])
+def test_silence_stops_it(fault, told):
+    with RosBridge(HOME) as server:
+        robot = robot_at(server)
+        threading.Timer(0.2, fault, (server,)).start()
+        event = robot.follow(line(0.1))
+        assert event["event"] == "stopped" and told in event["reason"]
+        assert any(order["op"] == "cancel_action_goal" for _, order in server.heard)
+
+
+def test_an_arm_elsewhere_is_refused_and_nobody_there_is_told_soon():
+    elsewhere = HOME + [0, 0, 0, 0, 0, 0.8]
+    with RosBridge(elsewhere) as server:
+        with pytest.raises(SafetyStop, match="wrist 3"):
+            robot_at(server).follow(line(0.02))
+        assert not any(order["op"] == "send_action_goal" for _, order in server.heard)
+    began = time.monotonic()
+    with pytest.raises(WorkError, match="No rosbridge answers"):
+        Bridge(server.url)
+    assert time.monotonic() - began < 3.0
+
+
+def test_with_the_branch_held_the_tare_of_the_approach_is_used(monkeypatch, tmp_path):
+    """One robot tares with 2 N of bias; the next would take a held branch for nothing."""
+    monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
+    with RosBridge(HOME) as server:
+        with pytest.raises(SafetyStop, match="No tare is known"):
+            RosRobot(CELL, Bridge(server.url), Topics()).recall_tare()
+        server.wrench = np.array([2.0, 0, 0, 0, 0, 0])
+        robot_at(server)
+        server.wrench = np.array([2.0, 0, 5.0, 0, 0, 0])
+        robot = RosRobot(CELL, Bridge(server.url), Topics())
+        robot.recall_tare()
+        times, forces = robot.watched(0.1)
+        assert len(times) > 5 and forces.mean(axis=0) == pytest.approx([2, 0, 5], abs=0.1)
+        now, _ = robot._chain.wrench(robot.last, robot._reading)
+        assert np.linalg.norm(now[:3]) == pytest.approx(5.0, abs=0.2)
+
+
+def test_a_topic_that_sends_nothing_is_named(monkeypatch):
+    monkeypatch.setattr("limber.robot.ros.guarded.SECONDS", 0.3)
+    with RosBridge(HOME) as server:
+        server.silent.add("/force_torque_sensor_broadcaster/wrench")
+        with pytest.raises(WorkError, match="Nothing came on /force_torque_sensor_broadcaster"):
+            RosRobot(CELL, Bridge(server.url), Topics())
+
+
+def test_joints_come_by_name_in_any_order_and_missing_numbers_are_none():
+    names = ["elbow_joint", "tool_joint", *(f"{name}_joint" for name in CELL.arm.ros_joints
+                                            if name != "elbow")]
+    states = JointStates(CELL, names)
+    assert states.ordered == [f"{name}_joint" for name in CELL.arm.ros_joints]
+    message = {"header": {"stamp": {"sec": 3, "nanosec": 500000000}}, "name": names,
+               "position": [HOME[2], 9.0, HOME[0], HOME[1], *HOME[3:]], "velocity": [0.1] * 7}
+    sample = states.sample(message, 1.0)
+    assert sample.clock == 3.5 and sample.joints == pytest.approx(HOME)
+    assert sample.pose == pytest.approx(pose_vectors(CELL.arm.forward(HOME) @ TOOL))
+    step = CELL.arm.forward(HOME + 1e-6 * sample.joint_speeds) @ TOOL
+    moved = (step[:3, 3] - sample.pose[:3]) / 1e-6
+    assert sample.speed[:3] == pytest.approx(moved, abs=1e-4)
+    assert np.isnan(states.sample(message | {"velocity": []}, 1.0).joint_speeds).all()
+    with pytest.raises(InputError, match="0 joints of ROS are named like elbow"):
+        JointStates(CELL, names[1:])
+
+
+def test_a_goal_carries_times_and_ends_at_rest():
+    path = line(0.02)
+    points = goal_of(path, ["a"] * 6)["trajectory"]["points"]
+    assert points[0]["velocities"] == points[-1]["velocities"] == [0.0] * 6
+    assert points[-1]["positions"] == pytest.approx(path.joints[-1])
+    end = points[-1]["time_from_start"]
+    assert end["sec"] + 1e-9 * end["nanosec"] == pytest.approx(path.duration)
+
+
+def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
+    """What it decides by; the node itself needs ROS, and is compiled only."""
+    package = ROOT / "scripts" / "examples" / "ros2" / "limber_stop"
+    monkeypatch.syspath_prepend(str(package))
+    from limber_stop.watch import Watch
+
+    watch = Watch(0.3)
+    assert not watch.is_silent(100.0)
+    assert not watch.heard(False, 100.0) and not watch.is_silent(100.2)
+    assert watch.is_silent(100.31) and not watch.is_silent(100.4)
+    assert watch.heard(True, 101.0) and not watch.is_silent(102.0)
+    for path in package.rglob("*.py"):
+        compile(path.read_text(encoding="utf-8"), str(path), "exec")
+    assert guarded._BEAT_SECONDS < 0.3 / 2

@@ -1,0 +1,115 @@
+"""Move a robot through ROS 2 by rosbridge: `limber ros check`, `limber ros follow`."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from limber.cli.main import Run, stage_command
+
+_SECONDS = 1.0
+_LEGS = ("approach", "path", "return", "leaving")
+
+
+@click.group("ros")
+def command() -> None:
+    """Move a robot through ROS 2; only rosbridge is needed, no ROS on this computer.
+
+    rosbridge has no password: use it on the robot's own network alone.
+    """
+
+
+def _url(function: Any) -> Any:
+    return click.option("--url", default="ws://127.0.0.1:9090", show_default=True,
+                        help="Address of rosbridge.")(function)
+
+
+@stage_command("check")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@_url
+def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
+    """Read joint states and wrenches, and move nothing."""
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.ros.bridge import Bridge
+    from limber.robot.ros.guarded import RosRobot, Topics
+
+    cell = read_cell(cell_file)
+    bridge = Bridge(url)
+    try:
+        robot = RosRobot(cell, bridge, Topics())
+        ages, forces = robot.watched(_SECONDS)
+    finally:
+        bridge.close()
+    assert robot.last is not None
+    return {"url": url, "arm": cell.arm.name, "joints_rad": robot.last.joints,
+            "samples_per_second": len(ages) / _SECONDS,
+            "longest_gap_s": float(np.diff(ages).max()) if len(ages) > 1 else None,
+            "force_without_tare_n": forces.mean(axis=0), "force_sigma_n": forces.std(axis=0)}
+
+
+@stage_command("follow")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+@click.option("--name", default="path", show_default=True, help="Name of the plan.")
+@click.option("--leg", type=click.Choice(_LEGS), default="approach", show_default=True,
+              help="Part of the motion. Close the gripper after the approach, and open it after "
+              "the return.")
+@click.option("--speed", default=0.03, show_default=True, help="Speed of the gripper [m/s].")
+@click.option("--arm", "armed", is_flag=True, help="Move the robot. Default: a dry run.")
+@click.option("--confirm", help="The plan's name, to confirm that the robot may move.")
+@_url
+def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, speed: float,
+           armed: bool, confirm: str | None, url: str) -> dict[str, Any]:
+    """Follow one leg of a plan by the joint trajectory controller, under the guard.
+
+    A stop cancels the goal and publishes True on /limber/stop. A websocket is no safety channel:
+    run the node of scripts/examples/ros2 beside the controller, which also acts on silence.
+    """
+    from limber.core.errors import InputError, SafetyStop
+    from limber.robot.driver.real_time import claim_real_time
+    from limber.robot.ros.bridge import Bridge
+    from limber.robot.ros.guarded import RosRobot, Topics
+    from limber.stages.paths.execute import ExecuteSettings, planned_motion
+
+    _, cell, _, motion, result = planned_motion(
+        branch_folder, name, cell_file, ExecuteSettings(speed=speed), progress=run.progress,
+        is_to_move=armed)
+    trajectory = {"approach": motion.approach, "path": motion.path, "return": motion.way_back,
+                  "leaving": motion.leaving}[leg]
+    result |= {"leg": leg, "leg_seconds": trajectory.duration, "armed": armed}
+    if not armed:
+        return result
+    if confirm != name:
+        raise InputError("Nobody confirmed that the robot may move.", "",
+                         f"Give --confirm {name}, with the workspace free and a hand at the "
+                         "emergency stop.")
+    bridge = Bridge(url)
+    try:
+        robot = RosRobot(cell, bridge, Topics())
+        if leg in ("path", "return"):
+            robot.recall_tare()
+        else:
+            robot.tare(_SECONDS)
+        claim_real_time()
+        began = time.monotonic()
+        event = robot.follow(trajectory)
+    except ConnectionError as error:
+        raise SafetyStop(f"{error}.", "Whether the arm stands is not known.",
+                         "Check the robot; its stop node acts on silence.") from error
+    finally:
+        bridge.close()
+    for text in robot.warnings:
+        run.progress.warn(text)
+    result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason"),
+               "followed_s": time.monotonic() - began}
+    if not result["reached"]:
+        raise SafetyStop(f"The robot was stopped: {event['reason']}.", "" if event.get("stands")
+                         else "It did not stand within a second.", "Check the branch and the "
+                         "robot before anything moves.", result=result)
+    return result
+
+
+for each in (check, follow):
+    command.add_command(each)

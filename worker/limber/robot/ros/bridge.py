@@ -1,0 +1,90 @@
+"""A client of rosbridge: JSON over a websocket (rosbridge_suite, "rosbridge v2 Protocol").
+
+The maintained package websockets carries it, and every wait has a limit. roslibpy speaks the same
+protocol, but through a reactor (Twisted) that a process can start only once and whose thread
+delivers messages without their time of arrival.
+"""
+
+import json
+import time
+from contextlib import ExitStack
+from typing import Any
+
+from limber.core.errors import WorkError
+from limber.core.json_lines import json_object
+from limber.core.optional import require_extra
+
+SECONDS = 2.0
+"""Longest wait for any answer."""
+
+
+class Bridge:
+    """A connection to a rosbridge server.
+
+    Args:
+        url: Such as ``ws://127.0.0.1:9090``.
+
+    Raises:
+        WorkError: nothing answers there, or websockets is not installed.
+    """
+
+    def __init__(self, url: str):
+        require_extra("ros", ("websockets",), "The door to ROS 2")
+        from websockets.exceptions import InvalidHandshake, InvalidURI
+        from websockets.sync.client import connect
+
+        self.url, self._around = url, ExitStack()
+        try:
+            # Uncompressed: a sample is small, and what waits for a stop is short of time.
+            self._socket = self._around.enter_context(connect(
+                url, open_timeout=SECONDS, close_timeout=0.5, ping_interval=None,
+                compression=None, proxy=None))
+        except (OSError, TimeoutError, InvalidHandshake, InvalidURI) as error:
+            raise WorkError(f"No rosbridge answers at {url} ({error}).",
+                            "Limber reaches ROS 2 through it.",
+                            "Start it: ros2 launch rosbridge_server rosbridge_websocket_launch.xml "
+                            "(see scripts/examples/ros2).") from error
+
+    def send(self, **content: Any) -> None:
+        """Send an operation.
+
+        Raises:
+            ConnectionError: the connection was lost.
+        """
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            self._socket.send(json.dumps(content))
+        except (ConnectionClosed, OSError) as error:
+            raise ConnectionError(f"the connection to {self.url} was lost") from error
+
+    def receive(self, seconds: float) -> dict[str, Any] | None:
+        """Return the next message, waiting at most ``seconds``; None where none came.
+
+        Raises:
+            ConnectionError: the connection was lost.
+        """
+        from websockets.exceptions import ConnectionClosed
+
+        end = time.monotonic() + seconds
+        while True:
+            try:
+                text = self._socket.recv(max(end - time.monotonic(), 0.0))
+            except TimeoutError:
+                return None
+            except (ConnectionClosed, OSError) as error:
+                raise ConnectionError(f"the connection to {self.url} was lost") from error
+            if (content := json_object(text)) is not None:
+                return content
+
+    def subscribe(self, topic: str, kind: str) -> None:
+        """Ask for all messages of a topic."""
+        self.send(op="subscribe", topic=topic, type=kind, throttle_rate=0, queue_length=0)
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Announce a topic that is published from here."""
+        self.send(op="advertise", topic=topic, type=kind)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._around.close()

@@ -1,0 +1,291 @@
+"""A robot behind a rosbridge, moved by trajectories under the guard.
+
+The controller in ROS follows the whole trajectory by itself (FollowJointTrajectory). The guard
+reads joint states and wrenches as they come; where it stops, the goal is cancelled and the stop
+topic is published. That a node beside the controller acts on that topic, and on silence, is what
+``scripts/examples/ros2`` shows: a websocket is no safety channel.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import SafetyStop, WorkError
+from limber.core.numerics.rigid_kernels import frame_of, turn_between, turned_wrench
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.delays import HoldUps
+from limber.robot.driver.force_sensors import Reading, WrenchChain
+from limber.robot.driver.guard import Decision, Guard, GuardSettings, Verdict
+from limber.robot.interface import Sample
+from limber.robot.motion.start_check import require_start
+from limber.robot.motion.trajectory import Trajectory
+from limber.robot.motion.way_file import WayFile, read_way
+from limber.robot.ros.bridge import SECONDS, Bridge
+from limber.robot.ros.messages import (
+    FOLLOW,
+    JOINT_STATE,
+    STOP,
+    WRENCH,
+    JointStates,
+    goal_of,
+    wrench_of,
+)
+
+_LISTEN_SECONDS = 0.01
+_BEAT_SECONDS = 0.1
+_OLDEST_READING_SECONDS = 0.05
+_STANDS_RAD_S = 1e-3
+_SUCCEEDED = 4  # action_msgs/msg/GoalStatus
+_OFF_PATH_M = 0.02  # a controller in ROS is behind its trajectory by a time that it does not tell
+
+
+@dataclass(frozen=True)
+class Topics:
+    """What the robot's topics and actions are called; by default as the UR driver has them."""
+
+    joint_states: str = "/joint_states"
+    wrench: str = "/force_torque_sensor_broadcaster/wrench"
+    stop: str = "/limber/stop"
+    trajectory: str = "/scaled_joint_trajectory_controller/follow_joint_trajectory"
+
+
+class RosRobot:
+    """A robot and its force sensor as ROS tells of them.
+
+    Args:
+        cell: Arm, tool, sensor and limits.
+        bridge: Connection to rosbridge.
+        topics: Their names.
+        on_sample: Called with time [s], pose [6] and smoothed wrench [6], branch frame.
+
+    Attributes:
+        warnings: What held the loop up.
+
+    Raises:
+        WorkError: a topic sends nothing.
+    """
+
+    def __init__(self, cell: Cell, bridge: Bridge, topics: Topics,
+                 on_sample: Callable[[float, np.ndarray, np.ndarray], None] | None = None):
+        self._cell, self._bridge, self._topics = cell, bridge, topics
+        self._on_sample = on_sample
+        self.guard = Guard(cell.arm, GuardSettings(cell.limits, cell.joint_limits, cell.workspace,
+                                                   off_path=_OFF_PATH_M), cell.arm.rate)
+        self._chain = WrenchChain(cell)
+        self._sensor = frame_of(np.array(cell.sensor.pose))
+        self._base = frame_of(np.array(cell.base.pose))
+        self._states: JointStates | None = None
+        self._reading: Reading | None = None
+        self._reading_at = 0.0
+        self.last: Sample | None = None
+        self.smooth = np.full(6, np.nan)
+        self._goals = 0
+        self.warnings: list[str] = []
+        self._hold_ups = HoldUps(_LISTEN_SECONDS,
+                                 lambda **told: self.warnings.append(told["text"]))
+        for topic, kind in ((topics.joint_states, JOINT_STATE), (topics.wrench, WRENCH),
+                            (topics.stop, STOP)):
+            bridge.subscribe(topic, kind)
+        bridge.advertise(topics.stop, STOP)
+        self._require_topics()
+
+    def _require_topics(self) -> None:
+        end = time.monotonic() + SECONDS
+        while self.last is None or self._reading is None:
+            if time.monotonic() > end:
+                silent = self._topics.joint_states if self.last is None else self._topics.wrench
+                raise WorkError(f"Nothing came on {silent} within {SECONDS:g} s.",
+                                "The guard needs joint states and wrenches.",
+                                "Check the topic's name with `ros2 topic list`, and that its node "
+                                "runs.")
+            self._take(self._bridge.receive(_LISTEN_SECONDS))
+
+    def _take(self, message: dict[str, Any] | None) -> Sample | None:
+        """Take a message; returns the sample that it is, if it is one."""
+        if message is None or message.get("op") != "publish":
+            return None
+        topic, content, arrived = message.get("topic"), message["msg"], time.monotonic()
+        if topic == self._topics.wrench:
+            raw = wrench_of(content)
+            self._reading_at = arrived
+            self._reading = Reading(turned_wrench(self._sensor[:3, :3], raw, self._sensor[:3, 3]),
+                                    0.0, raw)
+            return None
+        if topic != self._topics.joint_states:
+            return None
+        if self._states is None:
+            self._states = JointStates(self._cell, content["name"])
+        self.last = self._states.sample(content, arrived)
+        return self.last
+
+    def watched(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """Only read for ``seconds``: when samples came [s], shape [n], and raw forces, [n, 3]."""
+        times, forces = [], []
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if (sample := self._take(self._bridge.receive(_LISTEN_SECONDS))) is not None:
+                assert self._reading is not None
+                times.append(sample.arrived)
+                forces.append(self._reading.wrench[:3])
+        return np.array(times), np.array(forces).reshape(-1, 3)
+
+    def recall_tare(self) -> None:
+        """Judge forces by the tare of the leg before: the gripper holds the branch now.
+
+        Raises:
+            SafetyStop: none is known.
+        """
+        followed = read_way(self._cell)
+        if followed is None or followed.bias is None:
+            raise SafetyStop("No tare is known from the approach.",
+                             "With the branch in the gripper the sensor cannot be tared.",
+                             "Follow the approach first, then close the gripper.")
+        self._chain.bias = followed.bias
+        self._warm_up()
+        self.guard.tared()
+
+    def tare(self, seconds: float = 0.5) -> np.ndarray:
+        """Take the present force as nothing; returns the tare's standard error [6].
+
+        Raises:
+            WorkError: too few readings, or the gripper is touched.
+        """
+        self._chain.start_tare()
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if (sample := self._take(self._bridge.receive(_LISTEN_SECONDS))) is not None:
+                assert self._reading is not None
+                self._chain.wrench(sample, self._reading)
+        sigma = self._chain.end_tare()
+        self._warm_up()
+        self.guard.tared()
+        kept = WayFile(self._cell)
+        kept.begin()
+        kept.tared(self._chain.bias)
+        kept.close()
+        return sigma
+
+    def _warm_up(self) -> None:
+        """Judge once what is here: what is compiled or loaded for it must not hold a motion up."""
+        assert self.last is not None and self._reading is not None
+        guard = Guard(self._cell.arm, GuardSettings(self._cell.limits, self._cell.joint_limits),
+                      self._cell.arm.rate)
+        guard.tared()
+        guard.begin()
+        now, _ = self._chain.wrench(self.last, self._reading)
+        guard.look(self.last, wrench=now, raw=np.stack([self._reading.raw] * 2), expected=now,
+                   uncertainty=np.eye(6), grasp=self.last.pose[:3], sent=self.last.pose[:3])
+        turn_between(self.last.pose, self.last.pose)
+
+    def follow(self, trajectory: Trajectory) -> dict[str, Any]:
+        """Follow a trajectory to its end; returns the event that ended it, as
+        :meth:`.RobotLink.follow`: ``reached``, or ``stopped`` with its reason.
+
+        Raises:
+            SafetyStop: the arm is not at its start, or the guard refuses.
+        """
+        sample = self.last
+        assert sample is not None and self._states is not None and trajectory.joints is not None
+        require_start(sample.pose, sample.joints, trajectory.poses[0], trajectory.joints[0],
+                      self._cell.arm.joint_names)
+        if np.abs(sample.joint_speeds).max() > _STANDS_RAD_S:
+            raise SafetyStop("The arm moves already.", "Something else drives it.",
+                             "Stop it, and begin again.")
+        self.guard.begin()
+        self._goals += 1
+        goal = f"limber-{self._goals}"
+        self._bridge.send(op="send_action_goal", id=goal, action=self._topics.trajectory,
+                          action_type=FOLLOW, feedback=False,
+                          args=goal_of(trajectory, self._states.ordered))
+        place, beat = 0, 0.0
+        self._hold_ups.set_off()
+        while True:
+            if time.monotonic() - beat > _BEAT_SECONDS:
+                # That we are alive; the node beside the controller stops it where this ends.
+                beat = time.monotonic()
+                self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": False})
+            message = self._bridge.receive(_LISTEN_SECONDS)
+            if message is not None:
+                self._hold_ups.note(None if self.last is None else self.last.arrived, moving=True)
+            if (ended := self._ended(message, goal)) is not None:
+                return ended
+            if (sample := self._take(message)) is not None:
+                place = self._nearest(trajectory, sample.joints, place)
+                decision = self._judge(trajectory, sample, place)
+            else:
+                decision = self._silence()
+            if decision.verdict != Verdict.GO:
+                return self._stop(goal, decision)
+
+    def _silence(self) -> Decision:
+        """Judge that nothing came; a loop that was held up itself listens once more."""
+        assert self.last is not None
+        self._hold_ups.note(self.last.arrived, moving=True)
+        held_up = self._hold_ups.has_just_woken
+        return self.guard.silence(0.0 if held_up else time.monotonic() - self.last.arrived)
+
+    def _ended(self, message: dict[str, Any] | None, goal: str) -> dict[str, Any] | None:
+        """What ended a goal from the other side: its result, or a stop by somebody."""
+        if message is None:
+            return None
+        if message.get("op") == "action_result" and message.get("id") == goal:
+            if message.get("result") and message.get("status", _SUCCEEDED) == _SUCCEEDED:
+                self.guard.end()
+                return {"event": "reached"}
+            told = (message.get("values") or {})
+            why = told.get("error_string") if isinstance(told, dict) else str(told)
+            return self._stop(goal, self.guard.event(
+                f"the controller in ROS ended the motion ({why or 'no reason was given'})"))
+        if message.get("op") == "publish" and message.get("topic") == self._topics.stop and (
+                message["msg"].get("data")):
+            return self._stop(goal, self.guard.event("a stop was published"))
+        return None
+
+    def _judge(self, trajectory: Trajectory, sample: Sample, place: int) -> Decision:
+        assert self._reading is not None
+        reading = Reading(self._reading.wrench, sample.arrived - self._reading_at,
+                          self._reading.raw)
+        now, self.smooth = self._chain.wrench(sample, reading)
+        grasp = self._base @ frame_of(sample.pose)
+        if self._on_sample is not None:
+            self._on_sample(sample.clock, sample.pose, self.smooth)
+        if reading.age > _OLDEST_READING_SECONDS:
+            return self.guard.event(f"the wrench has been silent for {reading.age:.3f} s")
+        expected, uncertainty = self._expected(trajectory, sample, place)
+        return self.guard.look(
+            sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
+            uncertainty=uncertainty, grasp=grasp[:3, 3], sent=trajectory.poses[place, :3])
+
+    def _expected(self, trajectory: Trajectory, sample: Sample, place: int,
+                  ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        if trajectory.expected is None:
+            return None, None
+        wrench, slopes, covariance = trajectory.expected.at(min(place, len(trajectory.times) - 2),
+                                                            0.0)
+        planned = trajectory.poses[min(place, len(trajectory.times) - 2)]
+        off = np.concatenate((sample.pose[:3] - planned[:3], turn_between(planned, sample.pose)))
+        turn = self._base[:3, :3]
+        return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
+
+    @staticmethod
+    def _nearest(trajectory: Trajectory, joints: np.ndarray, place: int) -> int:
+        """The place on the way nearest to ``joints``, from the last one on."""
+        assert trajectory.joints is not None
+        ahead = trajectory.joints[place:place + 50]
+        return place + int(np.abs(ahead - joints).max(axis=1).argmin())
+
+    def _stop(self, goal: str, decision: Decision) -> dict[str, Any]:
+        """Stop by both ways, and see that the arm stands."""
+        self.guard.event(str(decision))
+        self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": True})
+        self._bridge.send(op="cancel_action_goal", id=goal, action=self._topics.trajectory)
+        told = {"event": "stopped", "reason": str(decision)}
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            sample = self._take(self._bridge.receive(_LISTEN_SECONDS))
+            if sample is not None and np.abs(sample.joint_speeds).max() < _STANDS_RAD_S:
+                return told | {"stands": True}
+        return told | {"stands": False}

@@ -1,0 +1,100 @@
+"""Messages of ROS 2 as the robot's own values: joint states, wrenches, trajectories."""
+
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.robot.cell.cell import Cell
+from limber.robot.interface import Sample
+from limber.robot.motion.trajectory import Trajectory
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+STOP = "std_msgs/msg/Bool"
+FOLLOW = "control_msgs/action/FollowJointTrajectory"
+
+
+def stamp_of(message: dict[str, Any]) -> float:
+    """Return the time of a message with a header [s]."""
+    stamp = message["header"]["stamp"]
+    return float(stamp["sec"]) + 1e-9 * float(stamp.get("nanosec", stamp.get("nsecs", 0)))
+
+
+class JointStates:
+    """Turns joint states into samples of a cell's arm.
+
+    Args:
+        cell: Its arm and tool.
+        names: As the first message has them.
+
+    Raises:
+        InputError: a joint of the arm is missing, or fits two names.
+
+    Attributes:
+        ordered: The names in the arm's order.
+    """
+
+    def __init__(self, cell: Cell, names: list[str]):
+        self._arm = cell.arm
+        self._tool = matrices(np.array(cell.tool.grasp_pose))
+        self._chosen, self.ordered = [], []
+        for wanted in cell.arm.ros_joints:
+            found = [k for k, name in enumerate(names) if wanted in name]
+            if len(found) != 1:
+                raise InputError(f"{len(found)} joints of ROS are named like {wanted}: "
+                                 f"{', '.join(names)}.", f"A {cell.arm.name} has one.",
+                                 "Check robot.model in the cell file and the topic of the joint "
+                                 "states.")
+            self._chosen.append(found[0])
+            self.ordered.append(names[found[0]])
+
+    def sample(self, message: dict[str, Any], arrived: float) -> Sample:
+        """Return the sample of a message that came at ``arrived`` [s, monotonic]; what ROS does
+        not tell is as of a robot that runs.
+
+        Numbers that are missing are NaN, which the guard stops for.
+        """
+        joints = self._of(message, "position")
+        speeds = self._of(message, "velocity")
+        flange = self._arm.forward(joints)
+        speed = self._arm.jacobian(joints) @ speeds
+        lever = flange[:3, :3] @ self._tool[:3, 3]
+        speed[:3] += np.cross(speed[3:], lever)
+        return Sample(clock=stamp_of(message), arrived=arrived, joints=joints,
+                      joint_speeds=speeds, pose=pose_vectors(flange @ self._tool), speed=speed,
+                      wrench=np.zeros(6), robot_mode=7, safety_mode=1, runtime_state=2,
+                      slider=1.0)
+
+    def _of(self, message: dict[str, Any], name: str) -> np.ndarray:
+        values = message.get(name) or []
+        if len(values) <= max(self._chosen):
+            return np.full(len(self._chosen), np.nan)
+        return np.array([np.nan if values[k] is None else values[k] for k in self._chosen], float)
+
+
+def wrench_of(message: dict[str, Any]) -> np.ndarray:
+    """Return force and torque of a stamped wrench [N, N m], shape [6]."""
+    told = message["wrench"]
+    values = [told[kind].get(axis) for kind in ("force", "torque") for axis in "xyz"]
+    return np.array([np.nan if value is None else value for value in values], float)
+
+
+def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
+    """Return the goal of FollowJointTrajectory for a trajectory with joints.
+
+    Args:
+        names: Of the joints in ROS, in the arm's order.
+    """
+    if trajectory.joints is None:
+        raise InputError("The motion has no joint angles.", "ROS follows joint angles.", "")
+    speeds = np.gradient(trajectory.joints, trajectory.times, axis=0)
+    speeds[0] = speeds[-1] = 0.0
+    points = []
+    for time, joints, speed in zip(trajectory.times, trajectory.joints, speeds, strict=True):
+        nanoseconds = round(1e9 * float(time))
+        points.append({"positions": joints.tolist(), "velocities": speed.tolist(),
+                       "time_from_start": {"sec": nanoseconds // 10**9,
+                                           "nanosec": nanoseconds % 10**9}})
+    return {"trajectory": {"joint_names": names, "points": points}}
