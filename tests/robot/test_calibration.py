@@ -83,6 +83,23 @@ def test_mirrored_points_are_named_as_such(mirror):
         fit_base(touched_at(flat), flat @ mirror)
 
 
+@pytest.mark.parametrize("factor", [1000.0, 1.03])
+def test_points_in_another_unit_are_named_as_such(factor):
+    """Millimetres, and a scan that is 3 % too large."""
+    with pytest.raises(InputError, match=rf"multiplied by {1 / factor:.4g}\."):
+        fit_base(factor * touched_at(ON_BRANCH), ON_BRANCH, largest_residual=0.002)
+
+
+def test_two_points_that_were_swapped_are_named():
+    names = ["rim", "twig", "pot", "fork", "tip"]
+    touched = touched_at(ON_BRANCH)[[0, 1, 3, 2, 4]]
+    with pytest.raises(InputError, match="only when pot and fork are swapped"):
+        fit_base(touched, ON_BRANCH, names=names)
+    moved = touched_at(ON_BRANCH) + [[0.05, 0, 0], *np.zeros((4, 3))]
+    with pytest.raises(InputError, match="Point rim has a residual of"):
+        fit_base(moved, ON_BRANCH, names=names)
+
+
 def test_the_command_states_each_points_residual(branch_folder, tmp_path, capfd):
     """And refuses three points before anything is touched."""
     write_cell(tmp_path / "cell.toml", Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}))

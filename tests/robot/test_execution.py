@@ -49,8 +49,8 @@ def test_a_base_is_found_from_touched_points():
 @pytest.mark.parametrize("spoil, told", [
     (lambda a, b: (a[:2], b[:2]), "Four or more"),
     (lambda a, b: (a, np.outer(np.arange(6), [0, 0, 0.1])), "across their line"),
-    (lambda a, b: (a[[1, 0, 2, 3, 4, 5]], b), "Point"),
-    (lambda a, b: (1000 * a, b), "Point"),
+    (lambda a, b: (a[[1, 0, 2, 3, 4, 5]], b), "only when 1 and 2 are swapped"),
+    (lambda a, b: (1000 * a, b), r"multiplied by 0\.001\."),
 ])
 def test_bad_points_are_named(spoil, told):
     points = np.random.default_rng(0).uniform(-0.2, 0.3, (6, 3))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -151,7 +152,7 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
     require_frame(touched, names, "as they were touched", largest_residual)
     frame, residuals = _registered(touched, on_branch)
     if residuals.max() > largest_residual:
-        raise _off(residuals, _registered(-touched, on_branch)[1], names, largest_residual)
+        raise _off(residuals, touched, on_branch, names, largest_residual)
     # Six unknowns come out of 3 n numbers.
     sigma = float(np.sqrt((residuals**2).sum() / (3 * len(touched) - 6)))
     return BaseFit(pose_vectors(frame), residuals, sigma / np.sqrt(len(touched)),
@@ -165,18 +166,38 @@ def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray,
     return frame, np.linalg.norm(touched @ frame[:3, :3].T + frame[:3, 3] - on_branch, axis=1)
 
 
-def _off(residuals: np.ndarray, mirrored: np.ndarray, names: Sequence[str],
-         largest_residual: float) -> InputError:
-    """Return why points do not fit, from what is left of each and of their mirror image [m, n]."""
+def _off(residuals: np.ndarray, touched: np.ndarray, on_branch: np.ndarray,
+         names: Sequence[str], largest_residual: float) -> InputError:
+    """Return why points [n, 3] do not fit: what would have to be done to them so that they do."""
     off = ", ".join(f"{name} {1000 * value:.1f}"
                     for name, value in zip(names, residuals, strict=True))
-    if mirrored.max() <= largest_residual:
+
+    def fits(points: np.ndarray) -> bool:
+        return bool(_registered(points, on_branch)[1].max() <= largest_residual)
+    if fits(-touched):
         return InputError("The points fit only when mirrored. Without mirroring, the residuals "
                           f"[mm] are: {off}.", "So one of the frames is left-handed.",
                           "Correct the signs or the order of its axes.")
+    factor = _size(on_branch) / _size(touched)
+    if fits(factor * touched):
+        return InputError(f"The points fit only when the touched ones are multiplied by "
+                          f"{factor:.4g}. As they are, the residuals [mm] are: {off}.",
+                          "So one of the two lists is in another unit, or the scan has another "
+                          "scale.", "Give both in metres; check the scan's scale by a length.")
+    for first, second in combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[first, second]] = second, first
+        if fits(touched[order]):
+            return InputError(f"The points fit only when {names[first]} and {names[second]} are "
+                              f"swapped. As they are, the residuals [mm] are: {off}.",
+                              "So they were touched in another order.",
+                              "Swap them in the list, or touch them again.")
     worst = int(residuals.argmax())
     return InputError(f"Point {names[worst]} has a residual of {1000 * residuals[worst]:.1f} mm; "
-                      "all residuals [mm]: "
-                      f"{off}.", "It was confused with another point, or the units "
-                                            "differ.",
-                      "Touch it again, or omit it.")
+                      f"all residuals [mm]: {off}.", "It was confused with another point, or "
+                      "touched beside its place.", "Touch it again, or omit it.")
+
+
+def _size(points: np.ndarray) -> float:
+    """Root mean square distance of points [n, 3] from their middle."""
+    return float(np.sqrt(((points - points.mean(axis=0))**2).sum(axis=1).mean()))
