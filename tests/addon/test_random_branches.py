@@ -75,6 +75,14 @@ class Run:
         other.rename(one)
         aside.rename(other)
 
+    def undo(self):
+        if self.bpy.ops.ed.undo.poll():
+            self.bpy.ops.ed.undo()
+
+    def redo(self):
+        if self.bpy.ops.ed.redo.poll():
+            self.bpy.ops.ed.redo()
+
     def target(self, *, late=False):
         """Press the button as it was drawn; ``late``: after another branch became current."""
         scene = self.bpy.context.scene
@@ -142,12 +150,16 @@ def quick_worker(worker_here, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1])
 def test_random_operators_write_to_the_named_branch_alone(bpy, three, quick_worker, seed):
-    """Opened, clicked, chosen, renamed, deleted, swapped on the disk, written: all in any order."""
+    """Opened, clicked, chosen, renamed, deleted, undone, swapped on the disk, written."""
     run = Run(bpy, three, seed)
     kinds = ["open", "switch", "switch", "choose", "rename", "delete", "swap", "target",
-             "target", "late_target"]
+             "target", "late_target", "undo", "redo"]
     for _ in range(COUNT):
-        getattr(run, run.chance.choice(kinds))()
+        kind = run.chance.choice(kinds)
+        getattr(run, kind)()
+        if kind not in ("undo", "redo"):
+            # As Blender does after an operator of a button.
+            bpy.ops.ed.undo_push(message=kind)
         run.check()
     assert len(run.written) > COUNT / 20, "too little was written to tell"
     assert len(set(run.written.values())) > 1
