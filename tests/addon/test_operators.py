@@ -263,6 +263,8 @@ def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatc
 def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
     """What a script gives a stage is what the panels show, and what the worker gets."""
     jobs = importlib.import_module("limber_addon.jobs")
+    # The branch has no energy field: here it is not sampled first.
+    monkeypatch.delitem(importlib.import_module("limber_addon.steps").FIRST, "plan")
     started = []
     monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     with pytest.raises(RuntimeError, match="division"):
