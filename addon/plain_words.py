@@ -6,6 +6,8 @@ from .stages import Field, Stage, stages
 
 _OPTION = re.compile(r"--(?P<name>[a-z][a-z0-9-]*)(?:[ =](?P<value>[^\s,;:()]+))?")
 _COMMAND = re.compile(r"`limber (?P<name>[a-z-]+)[^`]*`")
+_BUTTONS = {"doctor": "Check the Worker"}
+"""Of commands that are no stages."""
 _SENTENCE = re.compile(r"(?<=[.?!])\s+(?=[A-Z])")
 
 
@@ -38,7 +40,7 @@ def choice_title(stage: Stage, option: str, value: object) -> str:
 
 def _label(name: str) -> str:
     stage = stages().get(name)
-    return stage.label if stage is not None and stage.label else ""
+    return stage.label if stage is not None and stage.label else _BUTTONS.get(name, "")
 
 
 def _setting(match: re.Match, stage: Stage | None) -> str:

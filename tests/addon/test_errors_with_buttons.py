@@ -1,11 +1,16 @@
 """An error of the worker in the panel: a short sentence, a button for each choice, a mark."""
 
+import ast
 import importlib
 import json
+import re
 import sys
+from pathlib import Path
 
 import pytest
 from tests.addon.test_panels import _draw_step
+
+WORKER = Path(__file__).parents[2] / "worker" / "limber"
 
 
 def part(name):
@@ -77,3 +82,24 @@ def test_options_are_told_by_their_titles(addon, stage, text, wanted):
     """As the panels call them; what no panel has stays as it is."""
     words = part("plain_words").plain(text, part("stages").stages()[stage])
     assert words == (text if wanted is None else wanted)
+
+
+@pytest.mark.slow
+def test_every_error_of_a_stage_is_told_without_the_command_line(addon):
+    """Each text that the worker raises, as far as a step of the tab can meet it. Slow: reads all of
+    the worker's source."""
+    plain = part("plain_words").plain
+    known = {"`limber cache --clear`": "no panel has the cache",
+             "`limber scene`": "what runs Blender by itself",
+             "--no-reduced": "of `limber session`, which the grab runs without it"}
+    left = {}
+    for room in ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation",
+                 "planning", "store", "session", "results", "stages"):
+        for path in (WORKER / room).rglob("*.py"):
+            raised = (node.exc for node in ast.walk(ast.parse(path.read_text()))
+                      if isinstance(node, ast.Raise) and node.exc is not None)
+            for text in (each.value for one in raised for each in ast.walk(one)
+                         if isinstance(each, ast.Constant) and isinstance(each.value, str)):
+                for hit in re.findall(r"--[a-z][a-z-]+|`limber [^`]*`", plain(text)):
+                    left.setdefault(hit, path.name)
+    assert not {hit: name for hit, name in left.items() if hit not in known}

@@ -43,7 +43,8 @@ def test_imports_of_its_own_are_relative():
 
 def test_only_the_scene_script_is_a_program():
     """Jobs and the search for the worker stay free of bpy: threads live there."""
-    for name in ("jobs.py", "worker.py", "clouds.py", "scans.py", "scene_data.py", "session.py"):
+    for name in ("jobs.py", "worker.py", "worker_process.py", "plain_words.py", "clouds.py",
+                 "scans.py", "scene_data.py", "session.py"):
         assert "import bpy" not in (ADDON / name).read_text()
 
 
