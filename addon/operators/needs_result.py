@@ -23,29 +23,44 @@ def branch_property() -> Any:
 
 
 def needed_folder(scene: bpy.types.Scene, uuid: str = "") -> Path:
-    """Return the folder of the branch with a UUID, by default of the current one.
+    """Return the folder of the branch with a UUID, by default of the current one, to work in it.
 
     One that a job is about to make will do.
 
     Raises:
         ValueError: there is none, or the folder has another branch than the one that is shown.
     """
-    folder = branches.current_folder(scene)
     if uuid and branches.current_uuid(scene) not in ("", uuid):
         # Another one has become the current one since the button was drawn.
         meant = branches.shown_with(scene, uuid)
         if len(meant) != 1:
             raise ValueError("The branch that was meant is no longer in the scene. Choose a branch "
                              "in the panel Branch, then press the button again.")
-        folder = Path(bpy.path.abspath(meant[0][branches.FOLDER_KEY]))
+        folder = _there(Path(bpy.path.abspath(meant[0][branches.FOLDER_KEY])))
+    else:
+        folder = folder_to_open(scene)
+    check_identity(scene, folder, uuid)
+    return folder
+
+
+def folder_to_open(scene: bpy.types.Scene) -> Path:
+    """Return the folder of the current branch, whichever branch it has by now.
+
+    Raises:
+        ValueError: there is none.
+    """
+    folder = branches.current_folder(scene)
     if folder is None:
         raise ValueError("This scene has no branch folder. Choose a branch folder with Open "
                          "Result in the panel Branch, or enter its path under Folder there.")
+    return _there(folder)
+
+
+def _there(folder: Path) -> Path:
     if not (folder / branch_folder.MANIFEST).is_file() and not jobs.works_in(str(folder)):
         raise ValueError(f"{folder} has no file {branch_folder.MANIFEST}. Choose a branch folder "
                          "under Folder in the panel Branch. If the folder was moved, use Find the "
                          "Folder Again there.")
-    check_identity(scene, folder, uuid)
     return folder
 
 

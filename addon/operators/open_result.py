@@ -8,7 +8,7 @@ import bpy
 
 from .. import branch_folder, branches, frame_colours, properties, scene, scene_data
 from ..stages import stages
-from .needs_result import needed_folder
+from .needs_result import folder_to_open
 from .viewing import clear_view, look_at
 from .worker_operator import WorkerOperator
 
@@ -46,7 +46,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
                 raise ValueError(f"{folder} is not a branch folder because it has no file "
                                  f"{branch_folder.MANIFEST}. Choose another folder.")
         else:
-            folder = needed_folder(context.scene)
+            folder = folder_to_open(context.scene)
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-open-")
         stage = stages()["scene"]
         values = properties.values_of(properties.group_of(context.scene, stage), stage,

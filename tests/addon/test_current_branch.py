@@ -125,6 +125,18 @@ def test_a_button_means_the_branch_that_it_was_drawn_for(bpy, two):
 
 
 @pytest.mark.slow
+def test_a_folder_that_has_another_branch_by_now_is_shown_before_it_is_written(bpy, two):
+    """Replaced on the disk: steps refuse, Open Result shows what is there, and then they work."""
+    folders, (_, shown) = two
+    shown[part("branches").UUID_KEY] = "another"
+    with pytest.raises(RuntimeError, match=r"another branch now.*Open Result"):
+        bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3))
+    assert bpy.ops.limber.open_result() == {"FINISHED"}
+    assert bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
+    assert [_targets(folder) for folder in folders] == [[], ["flower"]]
+
+
+@pytest.mark.slow
 def test_a_refused_folder_leaves_the_current_one(bpy, two, tmp_path):
     """What cannot be opened is not where the next step writes."""
     folders, _ = two
