@@ -3,6 +3,7 @@
 `scripts/bench worker --only readme` runs those of the README.
 """
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -38,6 +39,52 @@ def test_a_shown_command_is_understood(line):
         command = command.get_command(click.Context(command), name)
         assert command is not None, name
     command.make_context(name, words)
+
+
+def test_the_readmes_figures_are_the_benches(monkeypatch):
+    """Run scripts/make_readme_figures where a table in worker/docs/data is new."""
+    monkeypatch.syspath_prepend(ROOT / "worker" / "docs")
+    import readme_figures
+
+    _, _, rest = README.read_text(encoding="utf-8").partition(f"{readme_figures.BEGIN}\n")
+    assert rest.partition(f"\n{readme_figures.END}")[0] == readme_figures.table()
+
+
+def test_the_readmes_picture_moves_and_is_small():
+    """scripts/make_moving_picture draws it: five steps, under 3 MB."""
+    from PIL import Image
+
+    path = ROOT / "worker" / "docs" / "pictures" / "limber.webp"
+    assert path.name in README.read_text(encoding="utf-8") and path.stat().st_size < 3e6
+    with Image.open(path) as picture:
+        assert picture.n_frames > 50 and picture.width >= 600
+
+
+def test_a_figure_without_a_row_is_an_error(monkeypatch):
+    """A bench that says it otherwise does not leave an old figure."""
+    monkeypatch.syspath_prepend(ROOT / "worker" / "docs")
+    import readme_figures
+
+    monkeypatch.setitem(readme_figures.FIGURES, "forks",
+                        readme_figures.Figure("scans", "one-sided", r"(no such words)"))
+    with pytest.raises(LookupError, match="no such words"):
+        readme_figures.table()
+
+
+def _said(pattern: str) -> float:
+    """A number of the README's prose."""
+    return float(re.search(pattern, " ".join(README.read_text(encoding="utf-8").split()))[1])
+
+
+def test_the_readmes_times_and_sizes_are_as_measured():
+    """Within a quarter of what `scripts/bench worker --only demo` has found."""
+    rows = json.loads((ROOT / "worker/docs/data/worker.json").read_text(encoding="utf-8"))["rows"]
+    measured = {row["measure"]: row["measured"] for row in rows}
+    spent = re.search(r"; (\d+) s", measured["limber demo: by the clock; processor time"])[1]
+    size = measured["all packages, installed"].removesuffix(" GB")
+    assert _said(r"demo takes (\d+) seconds of processor time") == pytest.approx(float(spent),
+                                                                               rel=0.25)
+    assert _said(r"and (\d\.\d) GB of disk") == pytest.approx(float(size), rel=0.25)
 
 
 def test_the_readme_is_short_and_shows_commands():
