@@ -5,6 +5,7 @@ Only the worker writes it. An unreadable file counts as missing; the worker repo
 
 import hashlib
 import json
+import stat
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -88,6 +89,9 @@ def read_record(folder: Path) -> BranchRecord | None:
     try:
         about = path.stat()
     except OSError:
+        return None
+    if not stat.S_ISREG(about.st_mode):
+        # Blender would wait for whoever writes to a pipe.
         return None
     return _read(path, about.st_mtime_ns, about.st_size)
 

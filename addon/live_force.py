@@ -35,8 +35,12 @@ class LiveForce:
 def read(folder: Path, now: float | None = None) -> LiveForce | None:
     """Return the force that the robot at a branch measures; None while no robot moves, or if the
     file is invalid."""
+    path = folder / FILE
+    if not path.is_file():
+        # There is none; or a pipe, which Blender would wait for.
+        return None
     try:
-        told = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        told = json.loads(path.read_text(encoding="utf-8"))
         if told["format"] != FORMAT or (time.time() if now is None else now) - told["at"] > (
                 _OLDEST_SECONDS):
             return None

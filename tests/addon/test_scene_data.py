@@ -3,6 +3,7 @@
 import importlib
 import io
 import json
+import os
 import zipfile
 
 import numpy as np
@@ -116,3 +117,13 @@ def test_damaged_files_are_refused(reader, data, tmp_path):
     assert refused > 60
     with pytest.raises(reader.SceneDataError):
         reader.read_scene_data(tmp_path / "missing.npz")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
+def test_a_pipe_in_a_branch_folder_is_not_waited_for(addon, tmp_path):
+    """Nobody writes to it: Blender would stand still at the next redraw."""
+    for module, name, function in (("branch_folder", "branch.json", "read_record"),
+                                   ("live_force", None, "read")):
+        part = importlib.import_module(f"limber_addon.{module}")
+        os.mkfifo(tmp_path / (name or part.FILE))
+        assert getattr(part, function)(tmp_path) is None

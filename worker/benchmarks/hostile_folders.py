@@ -138,7 +138,7 @@ def _hard_link(folder: Path, rng: np.random.Generator) -> None:
 
 def _special(folder: Path, rng: np.random.Generator) -> None:
     """A pipe, a socket or a folder where a file belongs; nobody writes to the pipe."""
-    place = folder / _drawn(_PLACES[:19], folder, rng)
+    place = folder / _drawn(_PLACES, folder, rng)
     if place.is_dir():
         shutil.rmtree(place)
     place.unlink(missing_ok=True)
