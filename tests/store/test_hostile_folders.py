@@ -13,7 +13,7 @@ import pytest
 
 from limber.cli.main import call
 from limber.core.errors import BranchFolderError, InputError
-from limber.core.files.safe_names import inside, relative_name
+from limber.core.files.safe_names import FOLLOW_LINKS, inside, relative_name
 from limber.store import Branch, journal
 from limber.store.lock import commit_lock
 
@@ -134,6 +134,20 @@ def test_a_folder_with_nothing_but_a_link_for_a_lock_is_refused(tmp_path):
     with pytest.raises(BranchFolderError, match="is a link"):
         Branch.create(tmp_path / "a.branch")
     assert (tmp_path / "victim.txt").read_text() == "precious"
+
+
+def test_links_are_followed_where_the_user_says_so(folder, tmp_path):
+    """A large file that is kept on another disk; a name that leads out is refused all the same."""
+    shutil.move(folder / "x.txt", tmp_path / "large.txt")
+    (folder / "x.txt").symlink_to(tmp_path / "large.txt")
+    assert call(["--follow-links", "verify", str(folder)]) == 0
+    assert FOLLOW_LINKS not in os.environ and call(["verify", str(folder)]) == 2
+    (folder / "branch.json").write_text(_changed(folder, **{"../../victim.txt": "evil"}))
+    assert call(["--follow-links", "verify", str(folder)]) == 2
+    report = tmp_path / "bug.zip"
+    assert call(["--follow-links", "bug-report", str(folder), "-o", str(report), "--data"]) == 0
+    with zipfile.ZipFile(report) as archive:
+        assert "branch/x.txt" not in archive.namelist()
 
 
 def test_a_branch_folder_may_itself_be_a_link(folder, tmp_path):

@@ -88,12 +88,20 @@ class _Commands(click.Group):
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(VERSION, prog_name="limber")
-def main() -> None:
+@click.option("--follow-links", is_flag=True, help=(
+    "Follow links inside branch folders and recordings, which may lead anywhere: only for those "
+    "that you made yourself."))
+def main(follow_links: bool) -> None:
     """Turn the scan of a plant branch into a simulation that behaves like it, and move it gently.
 
     Exit codes: 0 done, 2 wrong usage or input, 3 the work failed, 4 stopped for safety,
     130 cancelled.
     """
+    if follow_links:
+        from limber.core.files.safe_names import FOLLOW_LINKS
+
+        os.environ[FOLLOW_LINKS] = "1"
+        click.get_current_context().call_on_close(lambda: os.environ.pop(FOLLOW_LINKS, None))
 
 
 class Run:

@@ -1,7 +1,8 @@
 """Names that files contain and that become paths: they may not lead out of their folder.
 
 A branch folder or a recording may come from anybody. Each name in it that is used as a path goes
-through :func:`inside`, and a folder with links is refused before anything in it is written.
+through :func:`inside`, and a folder with links is refused before anything in it is written. A user
+who made the links says so (``limber --follow-links``); names must stay inside all the same.
 """
 
 import os
@@ -15,6 +16,8 @@ from limber.core.errors import InputError
 _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_. +-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_. +-]*)*")
 """Names that need no closer look: manifests list thousands of them."""
 _MOST_LEVELS = 32
+FOLLOW_LINKS = "LIMBER_FOLLOW_LINKS"
+"""Set to 1 where links may be followed; processes that a command starts inherit it."""
 
 
 def relative_name(name: str) -> str:
@@ -52,7 +55,7 @@ def inside(folder: Path, name: str) -> Path:
     path = Path(folder)
     for part in PurePosixPath(relative_name(name)).parts:
         path = path / part
-        if is_link(path):
+        if is_link(path) and not _may_follow():
             raise _link_error(path)
     return path
 
@@ -71,8 +74,12 @@ def refuse_links(folder: Path) -> None:
                              f"as {Path(place).relative_to(folder).as_posix()[:100]}.",
                              "Limber writes no such folder.", "Remove it.")
         for name in folders + files:
-            if is_link(path := Path(place, name)):
+            if is_link(path := Path(place, name)) and not _may_follow():
                 raise _link_error(path)
+
+
+def _may_follow() -> bool:
+    return os.environ.get(FOLLOW_LINKS) == "1"
 
 
 def is_link(path: Path) -> bool:
@@ -99,4 +106,5 @@ def has_other_names(path: Path) -> bool:
 def _link_error(path: Path) -> InputError:
     return InputError(f"{path} is a link.",
                       "It may point outside its folder, where Limber must not read or write.",
-                      "Replace it with a copy of its target, or remove it.")
+                      "Replace it with a copy of its target, or remove it. If you made it "
+                      "yourself, use `limber --follow-links COMMAND ...`.")
