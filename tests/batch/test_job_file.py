@@ -191,3 +191,12 @@ def test_lines_of_nested_tables():
 def test_units(value, unit, wanted):
     assert in_unit(value, unit) == pytest.approx(wanted) if wanted != "auto" else (
         in_unit(value, unit) == wanted)
+
+
+def test_an_endless_sweep_is_refused_before_it_is_made(write):
+    """A hundred values of eight settings: no memory is taken for their combinations."""
+    values = list(range(1, 101))
+    told = refusal(write(SCANS + "[job.sweep]\n" + "".join(
+        f'"reconstruct.{name}" = {values}\n' for name in (
+            "seed", "young", "density", "poisson", "up", "twig_radius", "twig_order", "leaves"))))
+    assert "The sweep has 1e+16 combinations" in told and "line 6" in told

@@ -7,6 +7,7 @@ Scans, folders, inputs and ``out`` may be addresses, as fsspec knows them
 """
 
 import itertools
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,11 @@ class _Reader:
                 self.problems.add((*at, key), f"{key} needs a list of values.")
             else:
                 choices.append([(key, value) for value in values])
+        count = math.prod(map(len, choices))
+        if count > _MOST_BRANCHES:
+            self.problems.add(at, f"The sweep has {count:.3g} combinations; {_MOST_BRANCHES} are "
+                              "possible.")
+            return [{}]
         return [dict(choice) for choice in itertools.product(*choices)]
 
     def check_folders(self, branches: list[BranchJob]) -> None:
