@@ -190,6 +190,16 @@ def test_damage_of_an_interrupted_folder_is_found(folder, capsys):
     assert "x.txt (other content)" in capsys.readouterr().err
 
 
+def test_texts_of_a_folder_do_not_steer_the_terminal(folder, capsys):
+    """A stage's name that would set the window's title, printed as the one to run again."""
+    content = json.loads((folder / "branch.json").read_text())
+    content["files"]["x.txt"]["stage"] = "a\x1b]0;title\x07\x9b31m"
+    (folder / "branch.json").write_text(json.dumps(content))
+    (folder / "x.txt").write_text("new")
+    assert call(["verify", str(folder)]) == 2
+    assert "a?]0;title??31m" in capsys.readouterr().err
+
+
 def test_a_bug_report_takes_nothing_through_links(folder, tmp_path):
     """A file elsewhere that a link names stays at home, also with --data."""
     (folder / "notes.txt").symlink_to(tmp_path / "victim.txt")

@@ -13,6 +13,7 @@ import functools
 import importlib
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -39,6 +40,9 @@ from limber.version import VERSION
 
 if TYPE_CHECKING:
     from limber.stages.registry import StageDescription
+
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def command_summaries() -> dict[str, str]:
@@ -241,7 +245,7 @@ def call(arguments: list[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         return 130
     except LimberError as error:
-        click.echo(f"error: {error}", err=True)
+        _say(f"error: {error}")
         return error.exit_code
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
@@ -269,7 +273,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
     outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
     result: dict[str, Any] = {}
     lines = JsonSink() if progress_style == "json" else None
-    state = Run(lines, functools.partial(click.echo, err=True))
+    state = Run(lines, _say)
     code = 0
     try:
         with contextlib.ExitStack() as around:
@@ -312,18 +316,23 @@ def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
     return offers(stage_schema(name), f"{error.why} {error.fix}")
 
 
+def _say(text: str) -> None:
+    """Print on standard error; names and texts of files cannot steer the terminal."""
+    click.echo(_CONTROL.sub("?", text), err=True)
+
+
 def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,
                    closing: list[str]) -> None:
     if style == "json":
         print(json.dumps(_plain(outcome | result), allow_nan=False), flush=True)
     if outcome["error"]:
-        click.echo(f"error: {outcome['error']}", err=True)
+        _say(f"error: {outcome['error']}")
     elif style != "json":
         # Warnings were said when they came up.
         shown = {k: v for k, v in _plain(result).items() if k != "warnings"}
         is_short = bool(closing) and style == "short"
         for line in closing if is_short else [*result_lines(shown), *closing]:
-            click.echo(line)
+            click.echo(_CONTROL.sub("?", line))
         click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s"
                    + (" (--verbose shows all values)" if is_short else ""))
 
