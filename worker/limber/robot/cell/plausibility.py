@@ -23,7 +23,6 @@ _AT_FLANGE = 1.0  # m; what an arm carries is nearer to its flange
 _WHOLE_TURN = 2 * math.pi + 1e-6
 _DEGREES = 4 * math.pi  # no joint's limit is beyond; in degrees nearly all are
 _LARGEST_RANGE = {"force": 1e4, "torque": 1e3}  # [N], [N m]
-_READABLE = 3.0  # deviations of the force that a limit must be above
 
 
 def slips(cell: "Cell") -> Iterator[str]:
@@ -89,20 +88,18 @@ def _limit_slips(cell: "Cell") -> Iterator[str]:
     limits, arm = cell.limits, cell.arm
     for name, value, most, unit in (
             ("hard_force_n", limits.hard_force_n, greatest_force(arm), "N"),
+            ("unexpected_force_n", limits.unexpected_force_n, greatest_force(arm), "N"),
             ("hard_torque_nm", limits.hard_torque_nm, greatest_torque(arm), "N m")):
         if value > most:
             yield (f"limits.{name} is {value:g}, but a {arm.name} may exert at most {most:.3g} "
                    f"{unit}; {value / 1000:g} {unit}?")
-    if limits.unexpected_force_n > limits.hard_force_n:
-        yield (f"limits.unexpected_force_n is {limits.unexpected_force_n:g}, more than "
-               f"hard_force_n ({limits.hard_force_n:g}): it would never stop a motion")
 
 
 def _sensor_slips(sensor: "SensorEntry", hard_force: float, hard_torque: float) -> Iterator[str]:
     for what, unit, hard, spread, span in (
             ("force", "n", hard_force, sensor.force_sigma_n, sensor.force_range_n),
             ("torque", "nm", hard_torque, sensor.torque_sigma_nm, sensor.torque_range_nm)):
-        if hard < _READABLE * spread:
+        if hard < spread:
             yield (f"sensor.{what}_sigma_{unit} is {spread:g}, so that limits.hard_{what}_{unit} "
                    f"({hard:g}) is within its noise; was one of them given in another unit?")
         if span <= hard:
@@ -112,9 +109,9 @@ def _sensor_slips(sensor: "SensorEntry", hard_force: float, hard_torque: float) 
         if span > _LARGEST_RANGE[what]:
             yield (f"sensor.{what}_range_{unit} is {span:g}, which no sensor at a flange has; "
                    f"{span / 1000:g}?")
-    if sensor.drift_n_per_minute > hard_force:
-        yield (f"sensor.drift_n_per_minute is {sensor.drift_n_per_minute:g}, more than the hard "
-               f"force limit ({hard_force:g} N) in a minute")
+    if sensor.drift_n_per_minute > sensor.force_range_n:
+        yield (f"sensor.drift_n_per_minute is {sensor.drift_n_per_minute:g}, more than the "
+               f"sensor's range ({sensor.force_range_n:g} N) in a minute")
 
 
 def _camera_slips(cell: "Cell") -> Iterator[str]:
