@@ -29,12 +29,11 @@ _LINES: dict[str, list[list[str]]] = {
         ["import-pull", "{branch}", "{in}/robot.csv", "--name", "p"]],
     "mesh": [["mesh", "{in}/branch.swc", "-o", "{out}/a.branch", "--unit", "m"]],
     "skeleton": [["skeleton", "{branch}"]],
-    "target": [["target", "{branch}", "fruit", "--at", "0", "0", "0.3", "--mass", "0.1"]],
+    "target": [["target", "{branch}", "fruit", "--at", "-0.056", "-0.033", "0.285", "--mass", "0.1"]],
     "vibration": [["vibration", "{branch}", "{in}/ring.csv"]],
     "export": [["export", "{branch}", "-o", "{out}/b.urdf"],
                ["export", "{branch}", "-o", "{out}/b.swc"]],
     "scene": [["scene", "{branch}", "--data", "{out}/s.npz"]],
-    "suggest-pull": [["suggest-pull", "{branch}"]],
     "others": [["verify", "{branch}"], ["bug-report", "{branch}", "-o", "{out}/b.zip"],
                ["status", "{in}/jobs.toml"], ["batch", "{in}/jobs.toml"],
                ["robot", "check", "{in}/cell.toml"]]}
