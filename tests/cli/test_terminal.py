@@ -39,7 +39,8 @@ def test_lines_of_what_was_found_have_units_and_need_their_values():
               "share": 0.123, "why": None, "best": {"force_n": 1.25}}
     lines = ["{length_m:m} long", "{young_pa[0]:Pa}", "{young_pa[1]:Pa}", "{moved_m:|m} away",
              "{share:share} of it", "{why}", "{nothing}", "{best[force_n]:N}",
-             lambda result: f"{len(result)} values", lambda result: None]
+             lambda result: f"{len(result)} values", lambda result: None,
+             lambda result: result["of an older program"]]
     assert list(found_lines(lines, values)) == [
         "4.2 mm long", "2.5 GPa", "5 m away", "12.3 % of it", "1.25 N", "6 values"]
 

@@ -44,7 +44,8 @@ def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[st
     for line in lines:
         try:
             told = _FILLED.vformat(line, (), values) if isinstance(line, str) else line(values)
-        except _NotThere:
+        except (_NotThere, KeyError):
+            # A result that an older program wrote may lack it.
             continue
         if told:
             yield told
