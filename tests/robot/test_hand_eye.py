@@ -131,4 +131,4 @@ def test_the_command_writes_the_base_and_the_camera(branch_folder, tmp_path, cap
     held = matrices(np.array(cell.base.pose)) @ matrices(STANDING)
     assert np.abs(held - matrices(np.array(cell.camera.pose))).max() < 5e-3
     code, told = run(capfd, *given)
-    assert code == 2 and "Exactly one of --points and --views" in told["error"]
+    assert code == 2 and "Exactly one of --points, --views and --images" in told["error"]

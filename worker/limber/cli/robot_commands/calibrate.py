@@ -1,16 +1,23 @@
 """Find where a robot stands beside a branch: `limber robot calibrate`."""
 
+from __future__ import annotations
+
 import csv
 import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+
+if TYPE_CHECKING:
+    from limber.robot.cell.hand_eye import CameraFit
+
+CameraSide = Literal["stand", "gripper"]
 
 
 @stage_command("calibrate")
@@ -25,17 +32,32 @@ from limber.cli.main import Run, stage_command
               "for each pose of the arm: robot_x_m to robot_rz_rad of the gripper's middle, "
               "seen_x_m, seen_y_m, seen_z_m in the camera's frame, and seen_rx_rad, seen_ry_rad, "
               "seen_rz_rad for a board.")
+@click.option("--images", "images_file", type=click.Path(path_type=Path),
+              help="CSV of the camera's pictures of a board, one line for each pose of the arm: "
+              "image (a file beside the table) and robot_x_m to robot_rz_rad. Needs OpenCV and "
+              "[camera] in the cell file.")
+@click.option("--board", "board_kind", type=click.Choice(["charuco", "apriltag"]),
+              default="charuco", show_default=True, help="With --images: what is printed.")
+@click.option("--squares", type=int, nargs=2, default=(7, 5), show_default=True,
+              help="Squares of the ChArUco board along x and y.")
+@click.option("--square-m", default=0.03, show_default=True,
+              help="Edge length of its squares, or of the AprilTag [m].")
+@click.option("--marker-m", default=0.022, show_default=True,
+              help="Edge length of its markers [m].")
+@click.option("--dictionary", help="Of the markers, as OpenCV names it. Default: DICT_5X5_100 or "
+              "DICT_APRILTAG_36h11.")
 @click.option("--camera-on", type=click.Choice(["stand", "gripper"]), default="stand",
-              show_default=True, help="With --views: what carries the camera. The other one "
-              "carries the board.")
+              show_default=True, help="With --views and --images: what carries the camera. The other "
+              "one carries the board.")
 @click.option("--scan-pose", type=float, nargs=6, metavar="X Y Z RX RY RZ",
               help="With --camera-on gripper: pose of the gripper in the base frame [m, rad] when "
               "the camera scanned the branch. Default: the scan is in the board's frame.")
 @click.option("--largest-residual", default=0.01, show_default=True,
               help="Largest residual of a point or view [m]; a larger one is refused.")
 def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path | None,
-              views_file: Path | None, camera_on: Literal["stand", "gripper"],
-              scan_pose: tuple[float, ...] | None, largest_residual: float) -> dict[str, Any]:
+              views_file: Path | None, images_file: Path | None, camera_on: CameraSide,
+              scan_pose: tuple[float, ...] | None, largest_residual: float,
+              **printed: Any) -> dict[str, Any]:
     """Write the robot's base in the branch's frame into the cell file, from points or views.
 
     Points are touched with the middle of the gripper, the robot guided by hand; the controller's
@@ -49,29 +71,27 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
     from limber.store import Branch
 
     cell, branch = read_cell(cell_file), Branch.read(branch_folder)
-    if (points_file is None) == (views_file is None):
-        raise InputError("Exactly one of --points and --views must be given.",
+    if sum(file is not None for file in (points_file, views_file, images_file)) != 1:
+        raise InputError("Exactly one of --points, --views and --images must be given.",
                          "The base is found from touched points or from a camera's views.",
                          "Give one of them.")
-    if views_file is None:
-        assert points_file is not None
+    if points_file is not None:
         return _by_touching(run, cell_file, cell, branch, points_file, largest_residual)
     if scan_pose is not None and camera_on == "stand":
         raise InputError("--scan-pose was given, but the camera is fixed.",
                          "The position of a fixed camera does not follow from a pose of the arm.",
                          "Omit it, or give --camera-on gripper.")
-    return _by_seeing(run, cell_file, cell, branch, views_file, camera_on, scan_pose,
-                      largest_residual)
+    found = (_views_of(views_file, camera_on, largest_residual) if views_file is not None else
+             _pictures_of(run, cell, images_file, camera_on, largest_residual, **printed))
+    return _by_seeing(run, cell_file, cell, branch, found, camera_on, scan_pose)
 
 
-def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Path,
-               camera_on: Literal["stand", "gripper"], scan_pose: tuple[float, ...] | None,
-               largest_residual: float) -> dict[str, Any]:
+def _views_of(views_file: Path, camera_on: CameraSide, largest_residual: float,
+              ) -> tuple[CameraFit, dict[str, Any]]:
+    """Fit the camera to a table of board poses that another program has found."""
     from limber.core.files.reading import read_columns
-    from limber.core.numerics.rigid import matrices, pose_vectors
     from limber.recordings.recording import POSE_COLUMNS
-    from limber.robot.cell.hand_eye import base_from_camera, fit_camera
-    from limber.store.loading import load_skeleton
+    from limber.robot.cell.hand_eye import fit_camera
 
     robot_columns = [f"robot_{name}" for name in POSE_COLUMNS]
     seen_columns = [f"seen_{name}" for name in POSE_COLUMNS]
@@ -80,7 +100,66 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Pa
     is_board = all(name in table for name in seen_columns)
     robot = np.column_stack([table[name] for name in robot_columns])
     seen = np.column_stack([table[name] for name in seen_columns[:6 if is_board else 3]])
-    fit = fit_camera(robot, seen, camera_on, largest_residual=largest_residual)
+    return fit_camera(robot, seen, camera_on, largest_residual=largest_residual), {}
+
+
+def _pictures_of(run: Run, cell: Any, images_file: Path | None, camera_on: CameraSide,
+                 largest_residual: float, *, board_kind: Literal["charuco", "apriltag"],
+                 squares: tuple[int, int], square_m: float, marker_m: float,
+                 dictionary: str | None) -> tuple[CameraFit, dict[str, Any]]:
+    """Find a board in pictures and fit the camera to them."""
+    from limber.core.errors import InputError
+    from limber.robot.cell.board_images import Board, find_board, fit_pictures
+
+    assert images_file is not None
+    if cell.camera is None:
+        raise InputError("The cell file has no [camera].", "Focal length and size of the pictures "
+                         "are unknown.", "Add [camera] with width, height, focal_px and "
+                         "centre_px.")
+    usual = "DICT_5X5_100" if board_kind == "charuco" else "DICT_APRILTAG_36h11"
+    board = Board(board_kind, squares, square_m, marker_m, dictionary or usual)
+    names, poses = _pictures(images_file)
+    found = [find_board(images_file.parent / name, board, cell.camera) for name in names]
+    for name, view in zip(names, found, strict=True):
+        if view is None:
+            run.progress.warn(f"The board is not seen in {name}, which is omitted.")
+    views = [view for view in found if view is not None]
+    if not views:
+        raise InputError("The board is seen in no picture.", "", "Check --board, --squares and "
+                         "--dictionary against what was printed.")
+    robot = poses[[view is not None for view in found]]
+    fit, pixels = fit_pictures(robot, views, cell.camera, camera_on, largest_residual)
+    return fit, {"residual_px": float(np.sqrt(np.mean(pixels**2))), "pictures": [
+        {"name": view.name, "residual_px": float(off), "corners": len(view.corners)}
+        for view, off in zip(views, pixels, strict=True)]}
+
+
+def _pictures(path: Path) -> tuple[list[str], np.ndarray]:
+    """Names and poses [n, 6] of a table of pictures."""
+    from limber.core.errors import InputError
+    from limber.core.files.reading import read_text
+    from limber.recordings.recording import POSE_COLUMNS
+
+    columns = [f"robot_{name}" for name in POSE_COLUMNS]
+    rows = list(csv.DictReader(read_text(path, "a table of pictures").splitlines()))
+    try:
+        names = [row["image"] for row in rows]
+        poses = np.array([[float(row[name]) for name in columns] for row in rows])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no table of pictures ({error}).",
+                         f"Its columns are image and {', '.join(columns)}.", "Correct the file.",
+                         ) from error
+    return names, poses.reshape(-1, 6)
+
+
+def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any,
+               found: tuple[CameraFit, dict[str, Any]], camera_on: CameraSide,
+               scan_pose: tuple[float, ...] | None) -> dict[str, Any]:
+    from limber.core.numerics.rigid import matrices, pose_vectors
+    from limber.robot.cell.hand_eye import base_from_camera
+    from limber.store.loading import load_skeleton
+
+    fit, told = found
     alignment = branch.manifest.alignment
     scan = np.eye(4)
     scan[:3, :3] = np.array(alignment.rotation)
@@ -102,7 +181,7 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Pa
     return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": pose,
             "residual_m": fit.residual, "position_sigma_m": position_sigma,
             "rotation_sigma_rad": rotation_sigma, "camera_pose": mounted["pose"],
-            "camera_mount": mounted["mount"]}
+            "camera_mount": mounted["mount"]} | told
 
 
 def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
