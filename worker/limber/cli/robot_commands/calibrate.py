@@ -47,8 +47,8 @@ CameraSide = Literal["stand", "gripper"]
 @click.option("--dictionary", help="Of the markers, as OpenCV names it. Default: DICT_5X5_100 or "
               "DICT_APRILTAG_36h11.")
 @click.option("--camera-on", type=click.Choice(["stand", "gripper"]), default="stand",
-              show_default=True, help="With --views and --images: what carries the camera. The other "
-              "one carries the board.")
+              show_default=True, help="With --views and --images: what carries the camera. The "
+              "other one carries the board.")
 @click.option("--scan-pose", type=float, nargs=6, metavar="X Y Z RX RY RZ",
               help="With --camera-on gripper: pose of the gripper in the base frame [m, rad] when "
               "the camera scanned the branch. Default: the scan is in the board's frame.")
