@@ -1,13 +1,19 @@
 """Move a robot through ROS 2 by rosbridge: `limber ros check`, `limber ros follow`."""
 
+from __future__ import annotations
+
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+
+if TYPE_CHECKING:
+    from limber.robot.cell.cell import Cell
+    from limber.robot.motion.trajectory import Trajectory
 
 _SECONDS = 1.0
 _LEGS = ("approach", "path", "return", "leaving")
@@ -68,9 +74,6 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     run the node of scripts/examples/ros2 beside the controller, which also acts on silence.
     """
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.driver.real_time import claim_real_time
-    from limber.robot.ros.bridge import Bridge
-    from limber.robot.ros.guarded import RosRobot, Topics
     from limber.stages.paths.execute import ExecuteSettings, planned_motion
 
     _, cell, _, motion, result = planned_motion(
@@ -85,15 +88,33 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
         raise InputError("Nobody confirmed that the robot may move.", "",
                          f"Give --confirm {name}, with the workspace free and a hand at the "
                          "emergency stop.")
+    began = time.monotonic()
+    event = _followed(run, cell, trajectory, url, is_held=leg in ("path", "return"))
+    result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason"),
+               "followed_s": time.monotonic() - began}
+    if not result["reached"]:
+        raise SafetyStop(f"The robot was stopped: {event['reason']}.", "" if event.get("stands")
+                         else "It did not stand within a second.", "Check the branch and the "
+                         "robot before anything moves.", result=result)
+    return result
+
+
+def _followed(run: Run, cell: Cell, trajectory: Trajectory, url: str, *, is_held: bool,
+              ) -> dict[str, Any]:
+    """Tare, or with the branch held recall the tare, and follow; returns how that ended."""
+    from limber.core.errors import SafetyStop
+    from limber.robot.driver.real_time import claim_real_time
+    from limber.robot.ros.bridge import Bridge
+    from limber.robot.ros.guarded import RosRobot, Topics
+
     bridge = Bridge(url)
     try:
         robot = RosRobot(cell, bridge, Topics())
-        if leg in ("path", "return"):
+        if is_held:
             robot.recall_tare()
         else:
             robot.tare(_SECONDS)
         claim_real_time()
-        began = time.monotonic()
         event = robot.follow(trajectory)
     except ConnectionError as error:
         raise SafetyStop(f"{error}.", "Whether the arm stands is not known.",
@@ -102,13 +123,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
         bridge.close()
     for text in robot.warnings:
         run.progress.warn(text)
-    result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason"),
-               "followed_s": time.monotonic() - began}
-    if not result["reached"]:
-        raise SafetyStop(f"The robot was stopped: {event['reason']}.", "" if event.get("stands")
-                         else "It did not stand within a second.", "Check the branch and the "
-                         "robot before anything moves.", result=result)
-    return result
+    return event
 
 
 for each in (check, follow):

@@ -118,19 +118,10 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     Raises:
         InputError, NoPathError: as :func:`execute`.
     """
-    from limber.robot.cell.cell import read_cell
-    from limber.robot.cell.compatibility import check_branch, check_plan, require_payload
-
-    branch, cell = Branch.open(folder), read_cell(cell_file)
-    if warning := check_branch(cell, branch.uuid, folder):
-        progress.warn(warning)
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
-    told = _told(branch, name)
-    if warning := check_plan(told.get("robot"), cell):
-        progress.warn(warning)
-    settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
+    branch, cell, settings, told = _plan_of_cell(folder, name, cell_file, settings, progress)
     if is_to_move:
+        from limber.robot.cell.compatibility import require_payload
+
         require_payload(cell)
     from limber.robot.motion.execution import robot_motion
     from limber.robot.motion.expected_wrench import Predicted
@@ -155,6 +146,24 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     result = _summary(cell, motion)
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
     return branch, cell, settings, motion, result
+
+
+def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
+                  progress: Progress) -> tuple[Branch, Cell, ExecuteSettings, dict[str, Any]]:
+    """Read branch and cell, and what a plan tells of its robot; refuse what is of another."""
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.cell.compatibility import check_branch, check_plan
+
+    branch, cell = Branch.open(folder), read_cell(cell_file)
+    if warning := check_branch(cell, branch.uuid, folder):
+        progress.warn(warning)
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
+    told = _told(branch, name)
+    if warning := check_plan(told.get("robot"), cell):
+        progress.warn(warning)
+    settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
+    return branch, cell, settings, told
 
 
 def _told(branch: Branch, name: str) -> dict[str, Any]:

@@ -200,14 +200,19 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
         return ended | {"peak_force_n": recorder.peak_force, "sample_count": recorder.count,
                         "warnings": list(link.warnings)}
     finally:
-        for lines in (stream, entry_lines, marker_lines):
-            if lines is not None:
-                lines.close()
-                if not (recorders and recorders[0].count):
-                    # No sample came: there is nothing to take over, and the name stays free.
-                    lines.path.unlink(missing_ok=True)
-        if tracker is not None:
-            tracker.close()
+        _close_lines([stream, entry_lines, marker_lines], recorders, tracker)
+
+
+def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder],
+                 tracker: MarkerStream | None) -> None:
+    for lines in streams:
+        if lines is not None:
+            lines.close()
+            if not (recorders and recorders[0].count):
+                # No sample came: there is nothing to take over, and the name stays free.
+                lines.path.unlink(missing_ok=True)
+    if tracker is not None:
+        tracker.close()
 
 
 def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
