@@ -13,12 +13,13 @@ from mathutils import Vector
 
 from .. import branches, preferences, properties
 from ..bridge import animation, meshes
+from ..frame_rate import FrameRate
 from ..session import HeldFrame, Session
 from ..stages import stages
 from ..worker import WorkerNotFound
 from . import limits, live_loads
 from .live_loads import LiveLoads
-from .needs_result import NeedsBranchInObjectMode
+from .needs_result import NeedsBranchInObjectMode, check_identity
 
 _INTERVAL_SECONDS = 1 / 120
 """Between two looks for a frame: the session makes up to 60 a second, and half of this is how long
@@ -95,9 +96,10 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         branch = branches.branch_of(self._surface)
         folder = Path(bpy.path.abspath(branch[branches.FOLDER_KEY]))
         try:
+            check_identity(context.scene, folder)
             command = [*preferences.worker_command(), "session", "--no-grasp", str(folder)]
             self._session = Session(command, len(self._surface.data.vertices))
-        except (OSError, WorkerNotFound) as error:
+        except (OSError, ValueError, WorkerNotFound) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         self._begin(context)
@@ -125,7 +127,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._tint, self._reached = limits.Tint(self._surface), []
         self._panel_drawn = 0.0
         self._rest = meshes.positions(mesh)
-        self._is_ready = False
+        self._is_ready, self._rate = False, FrameRate()
         self._mouse = self._waiting = None
         motion = self._surface.modifiers.get(animation.MODIFIER)
         self._had_motion = motion is not None and motion.show_viewport
@@ -195,6 +197,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         frame = self._session.frame(self._frame.sequence if self._frame else 0)
         if frame is not None:
             self._frame = frame
+            self._rate.tick()
             meshes.set_positions(self._surface.data, frame.positions)
             self._loads.tell(frame)
             self._show_limits(context, frame)
@@ -223,6 +226,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         """Let the sidebar show the numbers, a few times a second."""
         if time.monotonic() - self._panel_drawn > _PANEL_SECONDS:
             self._panel_drawn = time.monotonic()
+            self._area.header_text_set(f"{self._rate.per_second()} frames/s, "
+                                       f"{_WORDS[self._frame.who]}")
             next(r for r in self._area.regions if r.type == "UI").tag_redraw()
 
     def _take(self, context, mouse: tuple[int, int]) -> None:
@@ -318,6 +323,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         context.window_manager.event_timer_remove(self._timer)
         bpy.types.SpaceView3D.draw_handler_remove(self._drawing, "WINDOW")
         context.workspace.status_text_set(None)
+        self._area.header_text_set(None)
         self._session.close()
         self._session = None
         if self._surface is not None:

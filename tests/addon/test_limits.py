@@ -51,3 +51,12 @@ def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits,
         tint.show(False)
         assert attributes.active_color.name == "strain_energy_color"
         assert "limber_limit" not in attributes
+
+
+def test_the_frame_rate_is_that_of_the_last_second(addon):
+    """Thirty in a second; none a second later."""
+    rate = importlib.import_module("limber_addon.frame_rate").FrameRate()
+    for number in range(60):
+        rate.tick(10.0 + number / 30)
+    assert rate.per_second(10.0 + 59 / 30) == 30
+    assert rate.per_second(14.0) == 0
