@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from .. import branches, legend, studio
+from .. import branches, legend, scale_bar, studio
 from ..branches import SHOWS_KEY, VIEW_KEY, ShownBranch
 from ..scene_data import SceneData
 from .needs_result import NeedsBranchInObjectMode
@@ -19,8 +19,9 @@ _FRONT = (0.0, 1.0, -0.15)
 
 
 class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
-    """Add a camera that sees the whole motion, lights, a ground and a legend, and render colours as
-    the legend has them. Other lights are left out of the picture. Press again after changes"""
+    """Add a camera that sees the whole motion, lights, a ground, a legend and a scale, and render
+    colours as the legend has them. Other lights are left out of the picture. Press again after
+    changes"""
 
     bl_idname = "limber.set_up_picture"
     bl_label = "Set Up Picture"
@@ -35,6 +36,11 @@ class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
         data = SceneData({"view_points": _seen(current, branch), "view_direction": np.array(
             direction)}, branches.info_of(surface))
         camera = studio.set_up_studio(current, data, _HIGH)
+        info, points = data.info, data.arrays["view_points"]
+        middle = (info.get("base") or {}).get("centre_m", points.mean(axis=0))
+        foot = np.array([middle[0], middle[1], info["ground_m"]]) + surface.delta_location
+        scale_bar.add(camera.users_collection[0], camera, foot,
+                      info["size_m"])
         legend.add_legend(current, camera, data, _shown(branch, surface))
         made = set(bpy.data.collections) - before
         for collection in made:

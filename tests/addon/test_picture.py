@@ -49,6 +49,13 @@ def test_the_picture_has_the_whole_motion_and_the_legends_colours(bpy, example):
         assert seen[:, 0].min() > 0.25, "the legend stands on the left"
         heights.append(np.ptp(seen[:, 1]))
     assert min(heights) > 0.4, "the branch fills the picture"
+    bar = scene.objects["Scale bar"]
+    assert bar.dimensions.z == pytest.approx(0.1), "a round length, for 0.5 m"
+    assert scene.objects["Scale bar length"].data.body == "10 cm"
+    ends = [world_to_camera_view(scene, scene.camera, bar.matrix_world @ Vector(corner))
+            for corner in bar.bound_box]
+    assert all(0 < end.x < 1 and 0 < end.y < 1 for end in ends)
+    assert np.ptp([end.y for end in ends]) > 0.1, "more than a hundred pixels high"
     words = [thing.data.body for thing in scene.objects if thing.type == "FONT"]
     assert any("Young" in text or "modulus" in text for text in words), words
 
@@ -69,3 +76,12 @@ def test_a_plan_over_the_strength_is_not_ticked(bpy, example):
     assert steps.step_state(scene, step) is part("steps").StepState.DONE
     assert "The stress exceeds the strength of the wood" not in _draw_step(
         bpy, "plan").names("label")
+
+
+def test_the_scale_bar_has_a_round_length(addon):
+    """A quarter of the branch at most, in the unit that suits."""
+    scale_bar = part("scale_bar")
+    assert [scale_bar.length_for(size) for size in (0.01, 0.3, 4.1, 30.0)] == pytest.approx(
+        [0.002, 0.05, 1.0, 5.0])
+    assert [scale_bar.words_for(length) for length in (0.002, 0.05, 0.5, 1.0, 20.0)] == [
+        "2 mm", "5 cm", "50 cm", "1 m", "20 m"]
