@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import limber
 from limber.batch.jobs.job_file import read_jobs
 from limber.recordings.recording import read_pull
 from limber.stages.pulls.export_pull import export_pull
@@ -31,7 +32,29 @@ def run(*command: object, **environment: str) -> str:
 
 def test_all_are_run_here():
     assert {path.name for path in SCRIPTS.iterdir()} == {
-        "estimate.sh", "render.sh", "bend.py", "night.toml", "scan_to_plan.ipynb"}
+        "estimate.sh", "render.sh", "bend.py", "night.toml", "scan_to_plan.ipynb", "pull"}
+
+
+@pytest.mark.slow
+def test_the_tables_to_copy_are_a_pull(tmp_path):
+    """Those that the guide's page on pulls offers belong to an example branch."""
+    branch = limber.open(shutil.copytree(ROOT / "blend_files" / "mature", tmp_path / "a.branch"))
+    pull = branch.add_pull(SCRIPTS / "pull" / "markers.csv", "copied", quiet=True,
+                           robot=str(SCRIPTS / "pull" / "robot.csv"))
+    assert pull.poses.shape == (24, 6) and pull.markers.shape == (24, 4, 3)
+
+
+@pytest.mark.slow
+def test_the_guides_lines_for_mujoco(tmp_path):
+    """The exported branch loads, and its outermost link is where a branch is."""
+    pytest.importorskip("mujoco", reason="the extra test is not installed")
+    text = (ROOT / "worker/docs/howto/exchange.md").read_text(encoding="utf-8")
+    block, = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    limber.open(shutil.copytree(EXAMPLE, tmp_path / "a.branch")).export(tmp_path / "apple.xml")
+    told = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, check=True,
+                          capture_output=True, text=True).stdout
+    place = [float(part) for part in told.strip("[]\n ").split()]
+    assert len(place) == 3 and 0.05 < np.linalg.norm(place) < 1
 
 
 @pytest.mark.slow

@@ -102,19 +102,6 @@ def test_the_strains_of_species_are_those_of_the_code():
                     if species.rupture_strain is not None}
 
 
-def test_the_example_of_a_pull_is_imported(tmp_path):
-    """The tables that the guide offers to copy are a pull of the example branch."""
-    import shutil
-
-    import limber
-
-    branch = limber.open(shutil.copytree(ROOT / "blend_files" / "mature", tmp_path / "a.branch"))
-    files = ROOT / "scripts" / "examples" / "pull"
-    pull = branch.add_pull(files / "markers.csv", "copied", robot=str(files / "robot.csv"),
-                           quiet=True)
-    assert pull.poses.shape == (24, 6) and pull.markers.shape == (24, 4, 3)
-
-
 def test_tutorials_are_executed_and_pictures_have_scripts():
     """Seven tutorials whose commands run when the guide is built; twelve pictures."""
     tutorials = sorted((GUIDE / "tutorials").glob("*.md"))
