@@ -6,13 +6,14 @@ import os
 import struct
 import time
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from limber.batch.jobs.toml_positions import toml_lines
 from limber.core.errors import InputError, WorkError
-from limber.core.files.atomic import file_digest, require_file
+from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.files.reading import (
     MOST_TOML_BYTES,
     csv_records,
@@ -119,6 +120,21 @@ def test_pipes_and_devices_are_refused(tmp_path):
                      lambda p: read_arrays(p, "arrays"), lambda p: require_file(p, "A scan")):
             with pytest.raises(InputError, match="is a pipe or a device"):
                 read(place)
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    """An error in the middle leaves the old content and no litter; a device stays a device."""
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match="full"), replacing(path) as stream:
+        stream.write(b"half")
+        raise OSError(errno.ENOSPC, "full")
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    with replacing(path) as stream:
+        stream.write(b"new")
+    assert path.read_bytes() == b"new"
+    with pytest.raises(InputError, match="is a pipe or a device"), replacing(Path(os.devnull)):
+        pytest.fail("it was opened")
 
 
 @pytest.mark.parametrize(("code", "kind"), [

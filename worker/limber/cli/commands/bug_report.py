@@ -27,6 +27,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     """
     from limber.cli.commands.doctor import report
     from limber.core.errors import InputError
+    from limber.core.files.atomic import replacing
     from limber.core.files.safe_names import has_other_names, is_link
     from limber.core.json_values import plain
     from limber.store.manifest import MANIFEST
@@ -51,7 +52,8 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     told["not_packed"] = sorted(names[path] for path in kept)
     count = 0
     try:
-        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as archive:
+        with replacing(output) as stream, zipfile.ZipFile(
+                stream, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("report.json", json.dumps(plain(told), indent=1, default=str))
             for path, name in names.items():
                 if path not in kept and (name == MANIFEST or (

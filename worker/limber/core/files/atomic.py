@@ -3,8 +3,10 @@
 import hashlib
 import os
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from limber.core.errors import InputError
 from limber.core.files.temporary_names import owned_name
@@ -15,12 +17,25 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
     The content is on the disk, and so is its name, when this returns.
     """
+    with replacing(path) as stream:
+        stream.write(content.encode("utf-8") if isinstance(content, str) else content)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Open a stream whose content becomes a file when the block ends well, as a whole.
+
+    Otherwise nothing changes.
+
+    Raises:
+        InputError: a device or a pipe is there; it would be replaced by a file.
+    """
+    require_no_pipe(path)
     path = Path(path)
-    data = content.encode("utf-8") if isinstance(content, str) else content
     temporary = path.with_name(owned_name(path.name))
     try:
         with open(temporary, "xb") as stream:
-            stream.write(data)
+            yield stream
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
@@ -80,8 +95,8 @@ def require_no_pipe(path: str | os.PathLike) -> None:
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise InputError(f"{path} is a pipe or a device, not a file.",
-                         "Limber reads its inputs more than once, and a pipe may never end.",
-                         "Write the content to a file, and give that file.")
+                         "Files are read more than once and replaced as a whole; a pipe may never "
+                         "end.", "Give the path of a file.")
 
 
 def require_file(path: Path, what: str) -> Path:

@@ -1,5 +1,6 @@
 """The file that passes a scene to Blender's process: arrays by name, and their meaning."""
 
+import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.core.files.atomic import write_atomically
 from limber.core.json_values import plain
 
 FORMAT = 2
@@ -21,6 +23,14 @@ class SceneData:
     info: dict[str, Any] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
-        """Write one .npz file that ``numpy.load(path, allow_pickle=False)`` reads."""
+        """Write one .npz file that ``numpy.load(path, allow_pickle=False)`` reads.
+
+        A path without the suffix gets it.
+        """
         text = json.dumps(plain(self.info), allow_nan=False)
-        np.savez(path, info=np.array(text), **self.arrays)
+        path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+        # Not into the file itself: an archive that cannot be written complains once more when it
+        # is forgotten.
+        content = io.BytesIO()
+        np.savez(content, info=np.array(text), **self.arrays)
+        write_atomically(path, content.getvalue())
