@@ -54,6 +54,32 @@ def test_a_crown_of_many_pieces_is_joined_in_seconds():
     assert state.label.max() == 0 and len(state.bridges) == 47
 
 
+def test_a_stem_takes_many_twigs_in_a_round():
+    """One twig a round once made rounds as many as twigs, each as dear as all pieces."""
+    state = _joined(8)
+    assert state.label.max() == 0 and len(state.bridges) == 19
+    assert len(state.rounds) < 10
+
+
+def test_trials_without_a_bridge_end(monkeypatch):
+    """However many pieces there are, they go through no more ways than allowed."""
+    tried = []
+    without = joining._without
+
+    def counted(state, pair, *further):
+        tried.append(sum(past.ways for past in state.rounds[joining._start(state, pair):]))
+        return without(state, pair, *further)
+
+    monkeypatch.setattr(joining, "_without", counted)
+    _joined(8)
+    all_tried = sum(tried)
+    assert all_tried
+    tried.clear()
+    monkeypatch.setattr(joining, "_MOST_WAYS", all_tried - 1)
+    _joined(8)
+    assert sum(tried) < all_tried
+
+
 @pytest.mark.slow
 def test_what_is_remembered_changes_nothing(monkeypatch):
     """Rounds taken over and ends known from before give what joining all anew gives."""

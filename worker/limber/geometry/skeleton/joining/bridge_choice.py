@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from limber.geometry.skeleton.joining.bridge_kernels import far_sides
 from limber.geometry.skeleton.joining.bridges import Hypotheses
 from limber.geometry.skeleton.joining.free_ends import UNSURE, Ends
 from limber.geometry.skeleton.joining.pieces import Joined, Rules
@@ -22,6 +23,10 @@ def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rul
            alone: bool) -> tuple[list[int], set[tuple[int, int]]]:
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
 
+    A piece that has a bridge takes another in the same round, if what is joined to it by that lies
+    so far from all bridges of the round that none of them can offer it a cheaper one: otherwise a
+    stem with many twigs would take as many rounds.
+
     Stems are joined before twigs; where two pieces belong together, a price counts more than how
     thick the end is that names it: a knob of the stem that points past a twig is no foot of it.
 
@@ -31,41 +36,72 @@ def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rul
     pairs = np.sort(state.label[np.stack([found.one, found.other])], axis=0)
     own_price = found.price / np.sqrt(found.thick)
     best: dict[int, int] = {}
-    first: list[tuple[int, int, int]] = []
+    made = _Made(state)
     decisive: set[tuple[int, int]] = set()
-    single = np.bincount(state.label) <= UNSURE
-    reaches: dict[tuple[int, int], float] = {}
-
-    def able(place: int, a: int, b: int) -> bool:
-        odd = found.price[place] > _STRAIGHT_ON * found.length[place]
-        return not (alone and odd and (single[a] or single[b])) and _allowed(
-            found, place, state, ends, weight, rules, reaches)
+    allowed = _Allowed(found, state, ends, weight, rules, alone)
 
     def decide(place: int) -> None:
         one, other = sorted(state.piece[[found.one[place], found.other[place]]].tolist())
         decisive.add((one, other))
 
-    for place, a, b in _unsettled(pairs, best, len(weight)):
-        if not able(place, a, b):
+    for place, a, b in _unsettled(pairs, allowed.likely, best, len(weight)):
+        if not allowed.holds(place):
             continue
         decide(place)
-        if a not in best and b not in best:
-            same = np.flatnonzero((pairs[0] == a) & (pairs[1] == b))
+        fresh = [piece for piece in (a, b) if piece not in best]
+        if len(fresh) == 2 or (made.has(a, b) and made.is_clear(found, place, fresh[0])):
+            same = np.flatnonzero((pairs[0] == a) & (pairs[1] == b) & allowed.likely)
             place = next(other for other in same[np.argsort(own_price[same], kind="stable")]
-                         if able(other, a, b))
+                         if allowed.holds(other))
             decide(place)
-            first.append((place, a, b))
+            if len(fresh) == 2 or made.is_clear(found, place, fresh[0]):
+                made.add(found, place, a, b)
         best.setdefault(a, place)
         best.setdefault(b, place)
-    return [place for place, a, b in first if best[a] == best[b] == place], decisive
+    return made.places, decisive
 
 
-def _unsettled(pairs: np.ndarray, best: dict[int, int], count: int,
+class _Made:
+    """The bridges of a round so far."""
+
+    def __init__(self, state: Joined) -> None:
+        self.places: list[int] = []
+        self._state = state
+        self._joined: set[int] = set()
+        self._middles: list[np.ndarray] = []
+        self._halves: list[float] = []
+
+    def add(self, found: Hypotheses, place: int, a: int, b: int) -> None:
+        """Take a hypothesis between pieces ``a`` and ``b``."""
+        self.places.append(int(place))
+        self._joined |= {a, b}
+        nodes = self._state.nodes[[found.one[place], found.other[place]]]
+        self._middles.append(nodes.mean(axis=0))
+        self._halves.append(float(found.length[place]) / 2)
+
+    def has(self, a: int, b: int) -> bool:
+        """Whether one of two pieces has a bridge."""
+        return a in self._joined or b in self._joined
+
+    def is_clear(self, found: Hypotheses, place: int, piece: int) -> bool:
+        """Whether all bridges lie farther from a piece than its hypothesis costs.
+
+        No way to what they fill in is cheaper then. A blind way is compared with blind ones.
+        """
+        own = self._state.nodes[self._state.label == piece]
+        apart = np.linalg.norm(own[:, None] - np.array(self._middles), axis=2).min(axis=0)
+        blind = found.turn[place] == np.pi
+        cost = found.length[place] if blind else found.price[place]
+        return bool((apart - np.array(self._halves) > cost).all())
+
+
+def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], count: int,
                ) -> Iterator[tuple[int, int, int]]:
     """Hypotheses, in their order, for pairs of pieces not both of which have a ``best`` by then.
 
     Args:
         pairs: The pieces of each, shape [2, h].
+        likely: Which of them are looked at, shape [h].
         best: Grows in between.
         count: Number of pieces.
     """
@@ -75,38 +111,47 @@ def _unsettled(pairs: np.ndarray, best: dict[int, int], count: int,
             return
         has[list(best)] = True
         part = pairs[:, start:start + _AT_ONCE]
-        places = np.flatnonzero(~has[part].all(axis=0))
+        places = np.flatnonzero(likely[start:start + _AT_ONCE] & ~has[part].all(axis=0))
         for place, a, b in zip((start + places).tolist(), *part[:, places].tolist(), strict=True):
             if a not in best or b not in best:
                 yield place, a, b
 
 
-def _allowed(found: Hypotheses, place: int, state: Joined, ends: Ends, weight: np.ndarray,
-             rules: Rules, reaches: dict[tuple[int, int], float]) -> bool:
-    """Whether the smaller piece is large enough for the bridge, and no plant of its own.
+class _Allowed:
+    """Whether the smaller piece of a bridge is large enough for it, and no plant of its own.
 
-    ``reaches`` keeps how far a piece reaches from an end, for all hypotheses of a round.
+    Attributes:
+        likely: What may hold, as far as lengths and prices of all hypotheses tell, shape [h].
     """
-    pair = int(found.one[place]), int(found.other[place])
-    length, price = float(found.length[place]), float(found.price[place])
-    a, b = state.label[list(pair)]
-    small, end = (a, pair[0]) if weight[a] <= weight[b] else (b, pair[1])
-    if (small, end) not in reaches:
-        own = state.label == small
-        reaches[small, end] = float((
-            np.linalg.norm(state.nodes[own] - state.nodes[end], axis=1)
-            + np.maximum(state.spread, state.thickness)[own]).max())
-    reach = reaches[small, end]
-    # An end may go far straight on to what is left of its tip; that itself points anywhere.
-    straight = price < _STRAIGHT_ON * length and a != small
-    farthest = max((_REACH_STRAIGHT if straight else _REACH) * reach, _SHORT * rules.bridge_limit)
-    if length > farthest and not (
-            straight and found.turn[place] < _AHEAD
-            and length <= min(_straight_behind(state, ends, pair[0]), rules.bridge_limit)):
-        return False
-    large = min(weight[a], weight[b]) > PLANT_SHARE * state.support.sum()
-    return not (large and length > rules.gap and not rules.join_plants
-                and are_plants(state.nodes, state.thickness, state.label, pair, rules.up))
+
+    def __init__(self, found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray,
+                 rules: Rules, alone: bool) -> None:
+        self._found, self._state, self._ends = found, state, ends
+        self._rules = rules
+        a, b = state.label[found.one], state.label[found.other]
+        of_one = weight[a] <= weight[b]
+        reach = far_sides(state.nodes, np.maximum(state.spread, state.thickness), state.label,
+                          np.where(of_one, found.one, found.other))
+        # An end may go far straight on to what is left of its tip; that itself points anywhere.
+        odd = found.price > _STRAIGHT_ON * found.length
+        straight = (found.price < _STRAIGHT_ON * found.length) & ~of_one
+        self._near = found.length <= np.maximum(
+            np.where(straight, _REACH_STRAIGHT, _REACH) * reach, _SHORT * rules.bridge_limit)
+        ahead = straight & (found.turn < _AHEAD) & (found.length <= rules.bridge_limit)
+        single = np.bincount(state.label) <= UNSURE
+        self.likely = (self._near | ahead) & ~(alone & odd & (single[a] | single[b]))
+        self._large = (np.minimum(weight[a], weight[b]) > PLANT_SHARE * state.support.sum()) & (
+            found.length > rules.gap) & (not rules.join_plants)
+
+    def holds(self, place: int) -> bool:
+        """Whether a hypothesis that is likely is allowed."""
+        pair = int(self._found.one[place]), int(self._found.other[place])
+        state = self._state
+        if not self._near[place] and self._found.length[place] > _straight_behind(
+                state, self._ends, pair[0]):
+            return False
+        return not (self._large[place] and are_plants(state.nodes, state.thickness, state.label,
+                                                      pair, self._rules.up))
 
 
 def _straight_behind(state: Joined, ends: Ends, end: int) -> float:

@@ -110,21 +110,56 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
     """
     near = np.full((len(own), count), -1)
     distance = np.full((len(own), count), limit)
+    order = np.argsort(nodes[:, 0], kind="mergesort")
+    rank = np.empty(len(nodes), np.int64)
+    rank[order] = np.arange(len(nodes))
     for place in range(len(own)):
         node = own[place]
-        farthest = limit * limit
-        for other in range(len(nodes)):
-            x, y, z = (nodes[other, 0] - nodes[node, 0], nodes[other, 1] - nodes[node, 1],
-                       nodes[other, 2] - nodes[node, 2])
-            square = x * x + y * y + z * z
-            if square >= farthest or label[other] == label[node]:
-                continue
-            far, at = math.sqrt(square), count - 1
-            if far >= distance[place, at]:
-                continue
-            while at > 0 and distance[place, at - 1] > far:
-                distance[place, at], near[place, at] = distance[place, at - 1], near[place, at - 1]
-                at -= 1
-            distance[place, at], near[place, at] = far, other
-            farthest = distance[place, count - 1]**2
+        for step in (-1, 1):
+            # To both sides, as far as a node can still be nearer.
+            at = rank[node] + step
+            while 0 <= at < len(nodes):
+                other = order[at]
+                at += step
+                x, y, z = (nodes[other, 0] - nodes[node, 0], nodes[other, 1] - nodes[node, 1],
+                           nodes[other, 2] - nodes[node, 2])
+                if abs(x) >= distance[place, count - 1]:
+                    break
+                if label[other] == label[node]:
+                    continue
+                far, worse = math.sqrt(x * x + y * y + z * z), count - 1
+                if far >= distance[place, worse]:
+                    continue
+                while worse > 0 and distance[place, worse - 1] > far:
+                    distance[place, worse] = distance[place, worse - 1]
+                    near[place, worse] = near[place, worse - 1]
+                    worse -= 1
+                distance[place, worse], near[place, worse] = far, other
     return near, distance
+
+
+@njit(cache=True)
+def far_sides(nodes: np.ndarray, spread: np.ndarray, label: np.ndarray, own: np.ndarray,
+              ) -> np.ndarray:
+    """How far the points of a node's piece reach from it [m], for each of ``own``, shape [m].
+
+    Args:
+        nodes: Positions [m], shape [n, 3].
+        spread: How far its points reach from each node [m], shape [n].
+        label: Which piece each node belongs to, shape [n].
+        own: The nodes that ask, in any order, also repeatedly, shape [m].
+    """
+    order = np.argsort(label, kind="mergesort")
+    start = np.searchsorted(label[order], np.arange(label.max() + 2))
+    known = np.full(len(nodes), -1.0)
+    far = np.empty(len(own))
+    for place in range(len(own)):
+        node = own[place]
+        if known[node] < 0:
+            for at in range(start[label[node]], start[label[node] + 1]):
+                other = order[at]
+                x, y, z = (nodes[other, 0] - nodes[node, 0], nodes[other, 1] - nodes[node, 1],
+                           nodes[other, 2] - nodes[node, 2])
+                known[node] = max(known[node], math.sqrt(x * x + y * y + z * z) + spread[other])
+        far[place] = known[node]
+    return far

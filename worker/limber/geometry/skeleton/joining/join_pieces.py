@@ -12,6 +12,7 @@ from limber.geometry.skeleton.joining.plants import plants_apart
 _ODD = 1.9  # price of a bridge over its length, from which those around it are tried without
 _AROUND = 2.0  # lengths of such a bridge
 _CLEARLY = 0.98  # of what all bridges cost, under which others are better
+_MOST_WAYS = 300_000_000  # between ends and nodes, that all trials go through: some seconds
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
@@ -63,7 +64,8 @@ def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = f
                                       weight, rules.bridge_limit, ends, state.known),
                            state.piece, refused)
         chosen, decisive = mutual(found, state, ends, weight, rules, alone)
-        state.rounds.append(Round(state.copy([]), alone, decisive))
+        state.rounds.append(Round(state.copy([]), alone, decisive,
+                                  len(ends.node) * len(state.nodes)))
         if not chosen and alone:
             alone = False
             continue
@@ -81,47 +83,72 @@ def _without(state: Joined, pair: tuple[int, int], rules: Rules,
 
     All is the same up to the first round that such a bridge mattered in.
     """
-    at = next(k for k, past in enumerate(state.rounds) if pair in past.decisive)
+    at = _start(state, pair)
     past = state.rounds[at]
     start = past.before.copy(state.rounds[:at])
     return _joined(start, rules, refused | {pair}, dearest, past.alone)
+
+
+def _start(state: Joined, pair: tuple[int, int]) -> int:
+    """The first round that bridges between a ``pair`` of pieces mattered in."""
+    return next(k for k, past in enumerate(state.rounds) if pair in past.decisive)
 
 
 def _reconsidered(state: Joined, rules: Rules) -> Joined:
     """The bridges without one that left an odd one to others, if all together then cost less.
 
     A stem's end takes the foot of a twig that happens to be nearer than the stem's next patch;
-    that patch is then left to come to the twig from aside.
+    that patch is then left to come to the twig from aside. What was tried in vain is tried again
+    only once bridges of its pieces have changed.
     """
     refused: frozenset[tuple[int, int]] = frozenset()
+    vain: set[tuple[int, int]] = set()
+    gone_through = 0
     while True:
         best, without = state, refused
         for pair in _doubted(state, rules.gap):
+            # As many as there were with that bridge.
+            ways = sum(past.ways for past in state.rounds[_start(state, pair):])
+            if pair in vain or gone_through + ways > _MOST_WAYS:
+                continue
+            gone_through += ways
             dearest = _CLEARLY * best.cost()
             other = _without(state, pair, rules, refused, dearest)
-            if other.label.max() <= best.label.max() and other.cost() < dearest:
+            parts = other.label.max() > state.label.max()
+            if other.cost() < dearest and not parts:
                 best, without = other, refused | {pair}
+            elif parts if other.cost() < dearest else other.cost() >= _CLEARLY * state.cost():
+                vain.add(pair)
         if without == refused:
             return state
+        changed = {piece for pair in _bridged(state) ^ _bridged(best) for piece in pair}
+        vain = {pair for pair in vain if not changed & set(pair)}
         state, refused = best, without
 
 
+def _bridged(state: Joined) -> set[tuple[int, int]]:
+    """The pairs of given pieces that bridges join."""
+    return set(map(tuple, np.sort(state.piece[state.bridges], axis=1).tolist()))
+
+
 def _doubted(state: Joined, gap: float) -> list[tuple[int, int]]:
-    """Pairs of pieces whose bridge ends near an odd one."""
+    """Pairs of pieces whose bridge ends near an odd one, those near the dearest first."""
     ends, length = state.nodes[state.bridges], state.lengths()
-    doubted = set()
-    for odd in np.flatnonzero((state.prices > _ODD) & (length > gap)):
-        apart = np.linalg.norm(ends[:, :, None] - ends[odd], axis=3).min(axis=(1, 2))
-        near = np.flatnonzero((apart <= _AROUND * length[odd]) & (length > gap))
+    doubted: dict[tuple[int, int], None] = {}
+    odd = np.flatnonzero((state.prices > _ODD) & (length > gap))
+    for place in odd[np.argsort(-(state.prices * length)[odd], kind="stable")]:
+        apart = np.linalg.norm(ends[:, :, None] - ends[place], axis=3).min(axis=(1, 2))
+        near = np.flatnonzero((apart <= _AROUND * length[place]) & (length > gap))
         pairs = np.sort(state.piece[state.bridges[near]], axis=1)
-        doubted |= set(map(tuple, pairs[pairs[:, 0] >= 0].tolist()))
-    return sorted(doubted)
+        doubted |= dict.fromkeys(map(tuple, pairs[pairs[:, 0] >= 0].tolist()))
+    return list(doubted)
 
 
 def _unrefused(found: Hypotheses, piece: np.ndarray, refused: frozenset[tuple[int, int]],
                ) -> Hypotheses:
     if not refused:
         return found
-    pairs = np.sort(np.stack([piece[found.one], piece[found.other]], axis=1), axis=1)
-    able = ~(pairs[:, None] == np.array(sorted(refused))).all(axis=2).any(axis=1)
+    count = int(piece.max()) + 2  # nodes along bridges are of piece -1
+    low, high = np.sort(np.stack([piece[found.one], piece[found.other]]) + 1, axis=0)
+    able = ~np.isin(low * count + high, [(a + 1) * count + b + 1 for a, b in refused])
     return Hypotheses(*(getattr(found, column.name)[able] for column in fields(Hypotheses)))

@@ -96,11 +96,13 @@ class Round:
         alone: Whether pieces that tell no direction had to wait.
         decisive: The pairs of given pieces between which a hypothesis mattered. Without those of
             any other pair the round is the same.
+        ways: Between ends and nodes, all that could have been hypotheses.
     """
 
     before: Joined
     alone: bool
     decisive: set[tuple[int, int]]
+    ways: int
 
 
 @dataclass(frozen=True)
