@@ -344,8 +344,8 @@ def test_figures_draw(planned_branch, tmp_path):
 
 def test_a_planner_that_found_its_first_path_late_is_drawn():
     """Grids without a path yet have no cost: the curve begins where there is one."""
-    found = searched({"baseline": [], "plan": [
+    histories = {"baseline": [], "plan": [
         {"iteration": 1, "cost": None}, {"iteration": 2, "cost": 2.0},
-        {"iteration": 3, "cost": 1.0}]})
-    (line,) = convergence(found).axes[0].lines
+        {"iteration": 3, "cost": 1.0}]}
+    (line,) = convergence(searched(histories)).axes[0].lines
     assert line.get_xdata().tolist() == [2, 3] and line.get_ydata().tolist() == [2.0, 1.0]
