@@ -36,13 +36,15 @@ def test_table_is_aligned():
 def test_lines_of_what_was_found_have_units_and_need_their_values():
     """A line whose value is not there is left out; a vector is told by its length."""
     values = {"length_m": 0.0042, "young_pa": [2.5e9, None], "moved_m": [3.0, 0.0, 4.0],
-              "share": 0.123, "why": None, "best": {"force_n": 1.25}}
+              "share": 0.123, "why": None, "one": 1, "two": 2000, "best": {"force_n": 1.25}}
     lines = ["{length_m:m} long", "{young_pa[0]:Pa}", "{young_pa[1]:Pa}", "{moved_m:|m} away",
-             "{share:share} of it", "{why}", "{nothing}", "{best[force_n]:N}",
+             "{share:share} of it", "{one:#branch/branches}, {two:#branch/branches}", "{why}",
+             "{nothing}", "{best[force_n]:N}",
              lambda result: f"{len(result)} values", lambda result: None,
              lambda result: result["of an older program"]]
     assert list(found_lines(lines, values)) == [
-        "4.2 mm long", "2.5 GPa", "5 m away", "12.3 % of it", "1.25 N", "6 values"]
+        "4.2 mm long", "2.5 GPa", "5 m away", "12.3 % of it",
+        "1 branch, 2,000 branches", "1.25 N", "8 values"]
 
 
 def test_the_end_says_what_where_and_what_next():
@@ -66,7 +68,7 @@ def test_every_stage_says_what_it_found_and_proposes_commands_that_exist(name):
     for line in (line for line in stage.found if isinstance(line, str)):
         for _text, field, spec, _conversion in string.Formatter().parse(line):
             if field is not None and spec:
-                assert spec.lstrip("|") in UNITS or spec[0] == ".", (line, spec)
+                assert spec.lstrip("|") in UNITS or spec[0] in ".#", (line, spec)
     if stage.then:
         program, command, *_rest = stage.then.rpartition(":if}")[2].split()
         assert program == "limber" and command in stage_summaries()

@@ -81,7 +81,8 @@ UNITS: dict[str, Callable[[float], str]] = {
     "Hz": lambda value: f"{value:.3g} Hz", "s": lambda value: f"{value:.3g} s",
     "MB": lambda value: f"{value / 1e6:,.1f} MB", "count": lambda value: f"{value:,.0f}",
     "share": lambda value: f"{100 * value:.3g} %", "%": lambda value: f"{value:.3g} %"}
-"""How a value in SI units is written for a person; ``|m`` is the length of a vector."""
+"""How a value in SI units is written for a person; ``|m`` is the length of a vector, and
+``#branch/branches`` a number of them."""
 
 
 class _NotThere(Exception):
@@ -103,6 +104,9 @@ class _Filled(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         if format_spec.startswith("|"):
             value, format_spec = math.hypot(*value), format_spec[1:]
+        if format_spec.startswith("#"):
+            one, many = format_spec[1:].split("/")
+            return f"{value:,} {one if value == 1 else many}"
         if format_spec in UNITS:
             return UNITS[format_spec](value)
         return format(value, format_spec) if format_spec else _text(value)

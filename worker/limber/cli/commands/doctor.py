@@ -62,7 +62,7 @@ def command(run: Run, warm: bool) -> dict[str, Any]:
     costs = {module: cost for module, _distribution, cost in PARTS}
     run.close(f"Python {result['python']}, {result['cores']} cores, {result['system']}.",
               f"{len(PARTS) - len(result['missing'])} of {len(PARTS)} packages are installed.",
-              *(f"Without {module}: {costs[module] or 'nothing works'}."
+              *(f"Missing {module}: {costs[module] or 'nothing works'}."
                 for module in result["missing"]),
               f"Blender: {result['blender']}")
     return result

@@ -112,7 +112,7 @@ def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Fi
     cost[~field.region.contains(view.points)] = np.nan
     known = cost[np.isfinite(cost)]
     top = float(known.max(initial=0.0))
-    if top <= _FLAT * plan.summary["certificate"]["upper_bound"]:
+    if top <= _FLAT * (plan.summary["certificate"].get("upper_bound") or 0.0):
         return None
     figure, axis = view.figure()
     view.fill(figure, axis, cost, top, "lower bound on the cost to the goal", "cividis", lines=True)

@@ -252,8 +252,8 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
 
 def _doubtful_line(result: Mapping[str, Any]) -> str:
     count = len(result["doubtful"])
-    return (f"{count} doubtful parts. Edits of them (a JSON list) are applied with --edits."
-            if count else "No part of it is doubtful.")
+    return (f"{count} doubtful {'part' if count == 1 else 'parts'}. Edits (a JSON list) are "
+            "applied with --edits." if count else "No part of it is doubtful.")
 
 
 STAGE = StageDescription(
@@ -263,6 +263,7 @@ STAGE = StageDescription(
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", EDITS),
     tables=tables,
-    found=("{node_count:count} nodes in {branch_count} branches, {length_m:m}; the mesh is {mesh}.",
+    found=("{node_count:count} nodes in {branch_count:#branch/branches}, {length_m:m}; the mesh is "
+           "{mesh}.",
            _doubtful_line),
     then="limber virtual-pull {branch_folder}", step="skeleton", label="Review and Edit")

@@ -85,6 +85,6 @@ def run(inputs: GenerateInputs, settings: GenerateSettings, _options: NoOptions,
 
 STAGE = StageDescription(
     "generate", 10, run, GenerateInputs, GenerateSettings, NoOptions,
-    found=("A branch with known truth: {length_m:m} in {branch_count} branches, scanned as "
+    found=("A branch with known truth: {length_m:m} in {branch_count:#branch/branches}, scanned as "
            "{point_count:count} points.",),
     then="limber reconstruct {cloud} -o {folder}.branch")

@@ -103,7 +103,7 @@ STAGE = StageDescription(
     "mesh", 30, by_name(mesh_surface, path="surface", folder="output"), MeshInputs,
     MeshSurfaceSettings, RunOptions, key="mesh",
     writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"),
-    found=("{length_m:m} of centreline in {branch_count} branches, radius {radius_min_m:m} to "
-           "{radius_max_m:m}.",
+    found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
+           "{radius_min_m:m} to {radius_max_m:m}.",
            "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}."),
     then="limber virtual-pull {output}", step="mesh", label="Mesh a Closed Surface")

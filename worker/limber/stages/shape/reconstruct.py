@@ -321,8 +321,8 @@ STAGE = StageDescription(
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH, EDITS,
             "truth/"),
-    found=("{length_m:m} of centreline in {branch_count} branches, radius {radius_min_m:m} to "
-           "{radius_max_m:m}.",
+    found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
+           "{radius_min_m:m} to {radius_max_m:m}.",
            "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}.",
            "{done_count} scans reconstructed, {failed_count} failed."),
     then="{tet_count:if}limber skeleton {output}", step="skeleton", label="Reconstruct")
