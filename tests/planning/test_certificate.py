@@ -10,6 +10,7 @@ from limber.core.progress import Progress
 from limber.planning.certificate import lower_bound
 from limber.planning.certificate.grid import first_grid, refined
 from limber.planning.certificate.lower_bound import certify
+from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import knowing
 from limber.planning.field.trust import TrustRegion
@@ -291,7 +292,8 @@ def test_a_path_far_over_a_limit_is_given_up_soon(ridge_field, monkeypatch):
 def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
     """Analytic gradients agree with central differences, limits broken and goal missed; also with
     multipliers."""
-    problem = replace(problem_on(ridge_field, max_energy=0.02, max_force=0.5), longest=0.1)
+    problem = replace(problem_on(ridge_field), longest=0.1, limits=Limits(
+        energy=0.02, force=0.5).within(ridge_field, 1.0))
     path = next(bulges(problem, 1))[::4] * 1.6
     path[-1] += 0.05
     direction = np.random.default_rng(0).normal(size=path.shape)

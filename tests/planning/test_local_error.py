@@ -12,6 +12,7 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.local_error import LocalError
+from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
 from limber.planning.plan_file import read_plan
@@ -117,6 +118,26 @@ def test_a_proof_that_is_not_borne_out_is_none():
     assert not said.is_proven and "force 4 N" in said.seen and "104 % of a limit" in said.why
     assert "easiest" not in not_confirmed(Limits(force=4.0), None).why
     assert NoWayError("No path exists.", "Proven.", "").is_proven
+
+
+def test_a_plan_keeps_off_a_limit_by_the_error_of_the_place(half_rough):
+    """What compiled loops allow is the field below its limit less the share of the error there; of
+    an old field, whose error is not known, less the most that margins are."""
+    limits, chart = Limits(strain=2.2), half_rough.region.chart.plain
+    points = half_rough.region.draw(800, np.random.default_rng(3))
+    strain = np.abs(half_rough.load(points, "strain"))
+    places, inner = chart.map(half_rough.samples.positions), ~half_rough.region.is_face()
+    error = LocalError.of(places[inner], -limits.above(half_rough)["strain"][inner], 0.95,
+                          0.3 * 2.2).at(chart.map(points))
+    assert np.ptp(error) > 0.1
+    for share in (0.0, 0.5, 1.0):
+        allowed = allowed_points(points, limits.within(half_rough, share))
+        assert np.array_equal(allowed, strain <= 2.2 - share * error)
+    old = replace(half_rough, missed=np.full_like(half_rough.missed, np.nan))
+    assert np.array_equal(allowed_points(points, limits.within(old, 1.0)), strain <= 0.7 * 2.2)
+    force = Limits(force=1.0, energy=0.05).within(half_rough, 1.0)
+    kept = points[allowed_points(points, force)]
+    assert len(kept) and np.linalg.norm(half_rough.force(kept), axis=1).max() < 1.0
 
 
 def test_a_proof_tells_where_the_way_is_closed(half_rough):

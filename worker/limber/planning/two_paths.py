@@ -92,17 +92,18 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
     # A start near its limit leaves room for a part of the margins only.
-    parts = [{name: share * value for name, value in margins.items()} for share in _SHARES]
-    parts = [part for part in parts if allowed_points(start[None], limits.on(field, part))[0]]
-    if any(margins.values()) and parts:
+    shares = [share for share in _SHARES if any(margins.values())
+              and allowed_points(start[None], limits.within(field, share))[0]]
+    if shares:
+        part = {name: shares[0] * value for name, value in margins.items()}
         try:
-            found = plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
+            found = plan_pair(field, start, goal, settings, limits.within(field, shares[0]),
                               beyond=surely, errors=errors, before=before,
                               progress=progress.part(0.0, 0.5))
-            return replace(found, margins=parts[0])
+            return replace(found, margins=part)
         except NoPathError:
             progress.warn("No path keeps the limits with margins for the energy field's error "
-                          f"({_told(parts[0])}). The path is planned without margins. The full "
+                          f"({_told(part)}). The path is planned without margins. The full "
                           "model decides whether it is allowed.")
     try:
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,

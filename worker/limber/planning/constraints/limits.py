@@ -16,7 +16,7 @@ from limber.planning.constraints.constraint import Broken, Constraint
 from limber.planning.constraints.obstacles import Obstacle, Obstacles
 from limber.planning.field.energy_field import EnergyField, FieldArrays, GraspSamples
 from limber.planning.field.limited_quantities import UNITS
-from limber.planning.field.local_error import LocalError
+from limber.planning.field.local_error import LocalError, slack_of
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 
@@ -191,10 +191,29 @@ class Limits:
     def errors(self, known: EnergyField) -> dict[str, LocalError]:
         """Return by how much the field may say too much, as a function of the place in the plain
         chart, by limit: at no sample left out it was more; nowhere more than :meth:`doubts`."""
+        doubts = self.doubts(known)
+        return self._local(known, 1.0, 1.0, {name: doubts[name] for name in self.asked()
+                                             if np.isfinite(doubts[name])})
+
+    def within(self, known: EnergyField, share: float) -> FieldArrays:
+        """Return the field with these limits, tighter at each place by a ``share`` of what the
+        field may say too little there, which 95 % of the samples left out keep."""
+        errors = self._local(known, -1.0, _COVERED, {name: _MOST * limit for name, limit
+                                                     in self.asked().items()})
+        names = ("energy", "force", *known.load_names)
+        limits = self.asked()
+        return known.limited(limits.pop("energy", np.inf), limits.pop("force", np.inf),
+                             low=self.low, high=self.high,
+                             slack=slack_of(names, errors, share), **limits)
+
+    def _local(self, known: EnergyField, side: float, covered: float, most: dict[str, float],
+               ) -> dict[str, LocalError]:
+        """Return the errors of the limits of ``most``; on the ``side`` of too much, 1, or too
+        little, -1."""
         inner, above = ~known.region.is_face(), self.above(known)
-        places, doubts = known.region.chart.plain.map(known.samples.positions), self.doubts(known)
-        return {name: LocalError.of(places[inner], above[name][inner], 1.0, doubts[name])
-                for name in self.asked() if np.isfinite(doubts[name])}
+        places = known.region.chart.plain.map(known.samples.positions)[inner]
+        return {name: LocalError.of(places, side * above[name][inner], covered, limit)
+                for name, limit in most.items()}
 
     def beyond(self, known: EnergyField) -> FieldArrays:
         """Return the field with limits that it exceeds only where the branch exceeds these."""

@@ -19,6 +19,7 @@ from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
+from limber.planning.field.local_error import Slack, slack_at, slack_of
 from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.field.trust import TrustRegion, trusted_at
 
@@ -170,6 +171,7 @@ class FieldArrays(NamedTuple):
     max_loads: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    slack: Slack
 
 
 @dataclass(frozen=True)
@@ -273,15 +275,17 @@ class EnergyField:
 
     def limited(self, max_energy: float = np.inf, max_force: float = np.inf, *,
                 low: np.ndarray | None = None, high: np.ndarray | None = None,
-                **max_loads: float) -> FieldArrays:
+                slack: Slack | None = None, **max_loads: float) -> FieldArrays:
         """Return the arrays for compiled loops, with limits on energy [J], force [N], the box from
-        ``low`` to ``high`` [m] that the grasp stays in, and on loads by name (magnitudes)."""
+        ``low`` to ``high`` [m] that the grasp stays in, and on loads by name (magnitudes); by
+        ``slack`` they are tighter at places, energy, force and the loads in turn."""
         return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.region.arrays,
                            (self.shape_chart.arrays, self.load_fit.arrays),
                            float(max_energy), float(max_force),
                            np.array([max_loads.get(name, np.inf) for name in self.load_names]),
                            np.full(3, -np.inf) if low is None else np.asarray(low, float),
-                           np.full(3, np.inf) if high is None else np.asarray(high, float))
+                           np.full(3, np.inf) if high is None else np.asarray(high, float),
+                           slack or slack_of(("energy", "force", *self.load_names), {}, 0.0))
 
     def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
         """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; nothing pickled."""
@@ -586,7 +590,8 @@ def energy_at(point, field):
 @compiled
 def allowed_at(point, energy, field):
     """Return whether ``point``, whose energy is known, is trusted and within the limits."""
-    if energy > field.max_energy:
+    # The slack's chart is the plain one, which is the region's.
+    if energy > field.max_energy or energy > field.max_energy - _slack(point, 0, field):
         return False
     for k in range(3):
         if not field.low[k] <= point[k] <= field.high[k]:
@@ -596,10 +601,20 @@ def allowed_at(point, energy, field):
     chart, fit = field.loads
     for k in range(len(field.max_loads)):
         if field.max_loads[k] < np.inf and (
-                np.abs(value_at(mapped(point, *chart), k, *fit)) > field.max_loads[k]):
+                np.abs(value_at(mapped(point, *chart), k, *fit))
+                > field.max_loads[k] - _slack(point, 2 + k, field)):
             return False
     if field.max_force == np.inf:
         return True
     slope = np.empty(len(point))
     gradient_at(mapped(point, *field.chart), 0, *field.energy, slope)
-    return pulled_back_size(point, slope, *field.chart) <= field.max_force
+    return pulled_back_size(point, slope, *field.chart) <= (
+        field.max_force - _slack(point, 1, field))
+
+
+@compiled
+def _slack(point, row, field):
+    """Return by how much a limit is tighter at ``point`` [3]."""
+    if field.slack.factors[row] == 0.0:
+        return 0.0
+    return slack_at(mapped(point, *field.region[0]), row, field.slack)

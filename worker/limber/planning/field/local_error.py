@@ -8,7 +8,9 @@ for (split conformal prediction: Vovk et al. 2005; with a local scale: Lei et al
 the full model along plans join the samples, and with them what is said here.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,6 +71,65 @@ class LocalError:
         places = np.ascontiguousarray(places, float)
         means = _means(places, self.places, self.squares, self.near, False)
         return np.minimum(self.factor * np.sqrt(means), self.most)
+
+
+class Slack(NamedTuple):
+    """By how much limits are tighter at a place, for compiled loops; see :func:`slack_at`.
+
+    Attributes:
+        places: Of samples in the plain chart, shape [m, 3].
+        squares: Of their misses, a row a limit, shape [limits, m].
+        factors, most: As of :class:`LocalError`, shape [limits]; a factor of 0: no tighter.
+        near: As of :class:`LocalError`.
+    """
+
+    places: np.ndarray
+    squares: np.ndarray
+    factors: np.ndarray
+    most: np.ndarray
+    near: float
+
+
+def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: float) -> Slack:
+    """Return a ``share`` of ``errors`` as slack of the limits ``names``; none for the others."""
+    known = {name: error for name, error in errors.items() if np.isfinite(error.factor)}
+    first = next(iter(known.values()), None)
+    places = np.empty((0, 3)) if first is None else first.places
+    squares = np.zeros((len(names), len(places)))
+    factors, most = np.zeros(len(names)), np.zeros(len(names))
+    for row, name in enumerate(names):
+        if name in errors:
+            factors[row], most[row] = np.inf, share * errors[name].most
+        if name in known and len(known[name].places) == len(places):
+            squares[row], factors[row] = known[name].squares, share * known[name].factor
+    return Slack(np.ascontiguousarray(places), squares, factors, most,
+                 1.0 if first is None else first.near)
+
+
+@compiled
+def slack_at(place: np.ndarray, row: int, slack: Slack) -> float:
+    """Return by how much the limit of a ``row`` is tighter at ``place`` [3] of the chart."""
+    factor = slack.factors[row]
+    if factor == 0.0 or factor == np.inf:
+        return slack.most[row] if factor > 0.0 else 0.0
+    total, weights = 0.0, 0.0
+    for i in range(len(slack.places)):
+        apart = slack.near
+        for k in range(3):
+            apart += (place[k] - slack.places[i, k]) ** 2
+        weight = 1.0 / (apart * apart * apart)
+        total += weight * slack.squares[row, i]
+        weights += weight
+    return min(factor * np.sqrt(total / weights), slack.most[row])
+
+
+@compiled
+def slacks_at(places: np.ndarray, row: int, slack: Slack) -> np.ndarray:
+    """Return the same at ``places`` [n, 3], shape [n]."""
+    out = np.empty(len(places))
+    for n in range(len(places)):
+        out[n] = slack_at(places[n], row, slack)
+    return out
 
 
 def _spacing(places: np.ndarray) -> float:

@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 
 from limber.planning.cost import resample
+from limber.planning.field.local_error import slacks_at
 from limber.planning.field.trust import nearest_of
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.smoothing import smooth_cost
@@ -222,21 +223,23 @@ class Limited:
         """Yield the excess of energy, loads and force at each point."""
         known, limits, reserve = self.problem.energy_field, self.problem.limits, self.reserve
 
-        def excess(values: np.ndarray, limit: float,
+        def excess(values: np.ndarray, limit: float, row: int,
                    slope: Callable[[np.ndarray], np.ndarray]) -> _Excess:
             """Ask the slopes [k, 3] at those points alone at which the limit pushes."""
             def pull(push: np.ndarray) -> np.ndarray:
                 out, active = np.zeros_like(points), np.flatnonzero(push)
-                out[active] = push[active, None] * slope(active) / limit
+                rise = slope(active) + self._slack_slope(points[active], row)
+                out[active] = push[active, None] * rise / limit
                 return out
-            return _Excess(values / limit - 1.0 + reserve, pull, _WEIGHTS[1])
+            return _Excess((values + self._slack(points, row)) / limit - 1.0 + reserve, pull,
+                           _WEIGHTS[1])
         if limits.max_energy < np.inf:
-            yield excess(known.energy(points), limits.max_energy,
+            yield excess(known.energy(points), limits.max_energy, 0,
                          lambda active: known.energy_gradient(points[active]))
-        for name, limit in zip(known.load_names, limits.max_loads, strict=True):
+        for row, (name, limit) in enumerate(zip(known.load_names, limits.max_loads, strict=True)):
             if limit < np.inf:
                 load = known.load(points, name)
-                yield excess(np.abs(load), limit, lambda active, load=load, name=name:
+                yield excess(np.abs(load), limit, 2 + row, lambda active, load=load, name=name:
                              np.sign(load[active])[:, None]
                              * known.load_gradient(points[active], name))
         if limits.max_force < np.inf:
@@ -248,7 +251,21 @@ class Limited:
                 step = _STEP * force[active] / np.maximum(size[active], 1e-12)[:, None]
                 return (known.force(points[active] + step) - known.force(points[active] - step)) / (
                     2.0 * _STEP)
-            yield excess(size, limits.max_force, stiffness)
+            yield excess(size, limits.max_force, 1, stiffness)
+
+    def _slack(self, points: np.ndarray, row: int) -> np.ndarray:
+        """Return by how much a limit is tighter at ``points`` [n, 3], shape [n]."""
+        slack = self.problem.limits.slack
+        if slack.factors[row] == 0.0:
+            return np.zeros(len(points))
+        return slacks_at(self.problem.energy_field.region.chart.plain.map(points), row, slack)
+
+    def _slack_slope(self, points: np.ndarray, row: int) -> np.ndarray:
+        if self.problem.limits.slack.factors[row] == 0.0:
+            return np.zeros((len(points), 3))
+        shifts = _STEP * np.eye(3)
+        return np.stack([self._slack(points + shift, row) - self._slack(points - shift, row)
+                         for shift in shifts], axis=1) / (2.0 * _STEP)
 
     def _at_end(self, points: np.ndarray, push: np.ndarray) -> np.ndarray:
         shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
