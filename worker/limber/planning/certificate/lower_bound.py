@@ -43,9 +43,9 @@ from limber.planning.path_problem import (
 )
 from limber.planning.search_files import CostToGo
 
-_MOST_CELLS = 800_000  # of any grid's tube; the next refinement is left away
+_MOST_CELLS = 450_000  # of any grid's tube; the next refinement is left away
 _LEVELS = 6
-_RESERVE = 0.85  # of the edge that would do
+_RESERVE = 0.8  # of the edge that would do
 ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
 COST, ENERGY = "cost", "energy_integral_jm"
