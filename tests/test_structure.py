@@ -88,9 +88,9 @@ def test_addon_computes_nothing():
     assert not {str(path) for path, names in modules.items() if names & numerical}
 
 
-def test_addon_reads_tables_as_the_worker_does():
-    """Its copy of the file that reads them is the worker's (scripts/make_addon_schema)."""
-    name = "text_columns.py"
+@pytest.mark.parametrize("name", ["column_titles.py", "text_columns.py"])
+def test_addon_reads_tables_as_the_worker_does(name):
+    """Its copies of the files that read them are the worker's (scripts/make_addon_schema)."""
     assert (ROOT / "addon" / name).read_bytes() == (
         CORE / "core" / "files" / name).read_bytes()
 

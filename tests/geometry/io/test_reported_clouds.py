@@ -1,5 +1,6 @@
 """Clouds as reports and other programs have them: each kind with its right points and unit."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.geometry.io.clouds import read_cloud, read_points, unit_of
+from limber.geometry.settings import ReconstructSettings
 
 REPORTS = Path(__file__).parents[4] / "shared" / "data" / "reports"
 POINTS = np.array([[1.5, 2.0, 3.25], [4.0, 5.0, 6.5], [-7.0, 8.0, 9.75]])
@@ -96,6 +98,15 @@ def test_units_in_comments_of_other_formats(tmp_path, head):
     # A class beside the coordinates, R's word for what is missing, a preamble.
     table("x,y,z,label", more=("wood",)), table("x,y,z,intensity", more=("NA",)),
     "Exported by Scene 7\nDate: 2024-05-01\n" + table("X,Y,Z"),
+    # R's write.table with row names of words; a spreadsheet's letters; brackets between blanks.
+    '"x" "y" "z"\n' + "".join(f'"p{k}" {x} {y} {z}\n' for k, (x, y, z) in enumerate(POINTS)),
+    '"";"x";"y";"z"\n' + "".join(f'"{k}";{x};{y};{z}\n' for k, (x, y, z) in enumerate(POINTS)
+                                  ).replace(".", ","),
+    table("Rechtswert;Hochwert;H\u00f6he", ";", comma=True).encode("cp1252"),
+    table("X (m) Y (m) Z (m)", " "),
+    # COLMAP's points without its comments.
+    "".join(f"{7 * k} {x} {y} {z} 9 8 7 0.3 {'1 2 ' * (k + 1)}\n"
+            for k, (x, y, z) in enumerate(POINTS)),
     table("z,y,x", order=(2, 1, 0)), table("Y-Koordinate;X-Koordinate;Z-Koordinate", ";",
                                            order=(1, 0, 2), comma=True),
     table("Points_0,Points_1,Points_2"), table("#z y x", " ", order=(2, 1, 0)),
@@ -103,7 +114,7 @@ def test_units_in_comments_of_other_formats(tmp_path, head):
 def test_titles_of_other_programs(tmp_path, text):
     """Coordinates are found by their names, wherever they stand."""
     path = tmp_path / "a.csv"
-    path.write_text(text, encoding="utf-8")
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     np.testing.assert_array_equal(read_points(path).points, POINTS)
 
 
@@ -113,9 +124,43 @@ def test_a_column_of_words_is_named(tmp_path):
     assert "'label' holds words" in cloud.notes[0] and cloud.attributes["i"].tolist() == [7, 7, 7]
 
 
-@pytest.mark.parametrize("titles", ["rot;gr\u00fcn;blau", "R;G;B", "Red;Green;Blue",
+@pytest.mark.parametrize("titles", ["rot;gr\u00fcn;blau", "R;G;B", "Red;Green;Blue", "Rf;Gf;Bf",
                                     "color_r;color_g;color_b"])
 def test_names_of_colours(tmp_path, titles):
     (tmp_path / "a.csv").write_text(table(f"x;y;z;{titles}", ";", more=("9", "8", "7")))
     np.testing.assert_array_equal(read_points(tmp_path / "a.csv").attributes["color"][0],
                                   [9, 8, 7])
+
+
+@pytest.mark.parametrize("cut", [0, 1, 30])
+def test_points_of_colmap_as_it_keeps_them(tmp_path, cut):
+    """points3D.bin: each point with the images that saw it."""
+    raw = struct.pack("<Q", 3) + b"".join(
+        struct.pack("<Q3d3BdQ", 7 * k, *point, 9, 8, 7, 0.3, k) + bytes(8 * k)
+        for k, point in enumerate(POINTS))
+    (tmp_path / "points3D.bin").write_bytes(raw[:len(raw) - cut])
+    if cut:
+        with pytest.raises(InputError, match="cut short"):
+            read_points(tmp_path / "points3D.bin")
+        return
+    cloud = read_points(tmp_path / "points3D.bin")
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert cloud.attributes["color"].tolist() == [[9, 8, 7]] * 3
+
+
+def test_the_unit_of_the_file_is_that_of_the_branch(tmp_path, monkeypatch):
+    """Skeleton, surface and manifest have it, not the default."""
+    from limber.stages.shape.reconstruct import reconstruct
+
+    used = []
+
+    def stop(_raw, settings, **_more):
+        used.append(settings.unit)
+        raise InputError("that is enough")
+
+    monkeypatch.setattr("limber.geometry.reconstruction.reconstruct_cloud", stop)
+    (tmp_path / "a.csv").write_text(table("x_mm,y_mm,z_mm"))
+    for settings in (None, ReconstructSettings(), ReconstructSettings(unit="cm")):
+        with pytest.raises(InputError, match="enough"):
+            reconstruct(tmp_path / "a.csv", tmp_path / "a.branch", settings)
+    assert used == ["mm", "mm", "cm"]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
 from limber.geometry.io.clouds import read_points
-from limber.geometry.io.e57 import checksums
+from limber.geometry.io.scanners.e57 import checksums
 
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform(-2, 2, (50, 3)).round(4)

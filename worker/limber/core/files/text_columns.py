@@ -6,47 +6,19 @@ alike. ``scripts/make_addon_schema`` makes the copy; a test compares the two.
 
 import codecs
 import re
-import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-LENGTHS = {**{unit: unit for unit in ("m", "cm", "mm", "um", "in")},
-           **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
-           **dict.fromkeys(("centimeter", "centimeters", "centimetre", "centimetres"), "cm"),
-           **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
-           **dict.fromkeys(("micron", "microns", "micrometer", "micrometers", "micrometre",
-                            "micrometres"), "um"), **dict.fromkeys(("inch", "inches"), "in")}
-"""Units of length, by what files call them in small letters."""
-_UNKNOWN_LENGTHS = ("ft", "feet", "foot", "usft", "yd", "km", "dm", "nm", "px", "pixel", "voxel")
-_FORMS = ("{}", "{}coordinate", "{}coord", "coordinate{}", "coord{}", "{}koordinate",
-          "koordinate{}", "{}pos", "{}position", "pos{}", "position{}", "p{}", "point{}",
-          "points{}", "scan{}", "world{}", "local{}")
-_PLANES = (("easting", "northing"), ("east", "north"), ("e", "n"), ("rechtswert", "hochwert"),
-           ("ostwert", "nordwert"), ("ost", "nord"))
-_HEIGHTS = ("height", "elevation", "altitude", "z", "h", "hohe", "hoehe", "alt", "up", "elev")
-ROLES = {
-    "position": (*(tuple(form.format(axis) for axis in "xyz") for form in _FORMS),
-                 *(tuple(f"{word}{k}" for k in range(3)) for word in ("points", "point",
-                                                                     "position", "pos", "xyz")),
-                 *((*plane, height) for plane in _PLANES for height in _HEIGHTS)),
-    "normal": (*(tuple(form.format(axis) for axis in "xyz") for form in ("n{}", "normal{}",
-                                                                        "{}normal", "norm{}")),
-               *(tuple(f"{word}{k}" for k in range(3)) for word in ("normals", "normal"))),
-    "color": (*(tuple(form.format(name) for name in ("red", "green", "blue"))
-                for form in ("{}", "color{}", "colour{}", "diffuse{}")),
-              *(tuple(form.format(name) for name in "rgb") for form in ("{}", "color{}", "col{}")),
-              ("rot", "grun", "blau"), ("rot", "gruen", "blau"), ("rgb0", "rgb1", "rgb2"))}
-"""What three columns of one meaning are called, in :func:`plain` letters; the first that are
-there count."""
+# Relative, since the add-on has copies of both files.
+from .column_titles import LENGTHS, OTHER_LENGTHS, plain, split_title, stated_unit, three_of
+
 _COUNTERS = ("id", "index", "idx", "nr", "no", "number", "row", "point", "pointid", "pointnumber")
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 _COLMAP, _HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-_STATED = re.compile(r"\b(?:units?|einheit(?:en)?)\b\W{0,3}(?:(?:are|is|in|sind|ist)\b\W{1,2})?"
-                     r"([^\W\d_]+)", re.IGNORECASE)
 _LINES = 20_000
 """Lines that are read at a stretch: numpy holds the interpreter meanwhile."""
 _MOST_HEAD = 60
@@ -80,56 +52,16 @@ class Columns:
     notes: tuple[str, ...] = ()
 
 
-def plain(name: str) -> str:
-    """Return the small letters and digits of a name, without accents."""
-    letters = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
-    return re.sub(r"[^a-z0-9]", "", letters)
-
-
-def split_title(title: str, units: Iterable[str]) -> tuple[str, str | None]:
-    """Take the unit off a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``.
-
-    Args:
-        title: Of a column.
-        units: Those that need no brackets at the end, in small letters.
-    """
-    text = title.strip().replace("\u00b5", "u").replace("\u03bc", "u")
-    bracket = re.search(r"[(\[]\s*([^)\]]*?)\s*[)\]]", text)
-    if bracket and bracket.end() == len(text):
-        return text[:bracket.start()].strip(" _"), bracket.group(1) or None
-    if bracket and bracket.group(1).lower() in units:
-        return f"{text[:bracket.start()].strip()} {text[bracket.end():].strip()}", bracket.group(1)
-    end = re.fullmatch(r"(.+?)\s*(?:_|,|(?<!^)/|\s+in\s)\s*([A-Za-z]+)", text, re.DOTALL) or (
-        re.fullmatch(r"(.+)\s([A-Za-z]{2,})", text, re.DOTALL))
-    if end and end.group(2).lower() in units and not text.startswith("/"):
-        return end.group(1).strip(), end.group(2)
-    head, _, tail = text.rpartition("_")
-    return (head, tail) if head and tail.lower() in units else (text, None)
-
-
-def three_of(role: str, names: Sequence[str]) -> tuple[int, int, int] | None:
-    """Return which columns have a role of :data:`ROLES`; None if not all three are there."""
-    for spelt in ([name.lower().lstrip("/#").strip() for name in names],
-                  [plain(name) for name in names]):
-        for one, two, three in ROLES[role]:
-            if one in spelt and two in spelt and three in spelt:
-                return spelt.index(one), spelt.index(two), spelt.index(three)
-    return None
-
-
-def stated_unit(text: str) -> str | None:
-    """Return the unit of length that a comment or a preamble states, if any."""
-    return next((LENGTHS[word.lower()] for word in _STATED.findall(text)
-                 if word.lower() in LENGTHS), None)
-
-
 def decoded(raw: bytes) -> str:
-    """Return the text of a file in UTF-8 or UTF-16; other letters become question marks."""
+    """Return the text of a file in UTF-8, UTF-16 or, as spreadsheets write it, Windows' letters."""
     for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
                          (codecs.BOM_UTF16_BE, "utf-16")):
         if raw.startswith(mark):
             return raw.decode(coding, errors="replace")
-    return raw.decode("utf-8", errors="replace")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
 
 
 def read_columns(path: Path) -> Columns:
@@ -144,7 +76,7 @@ def read_columns(path: Path) -> Columns:
             line that does not fit, which is named.
     """
     text = decoded(path.read_bytes()).replace('"', "")
-    if _COLMAP in text[:_HEAD]:
+    if _COLMAP in text[:_HEAD] or _has_tracks(text):
         return _colmap(path, text)
     every = [line for line in text.splitlines() if line.strip()]
     lines = [line for line in every if not _is_comment(line)]
@@ -165,7 +97,8 @@ def read_columns(path: Path) -> Columns:
     if values.shape[1] < 3:
         raise ColumnsError(f"{path} has {values.shape[1]} columns.",
                            "Coordinates need three columns.", "Export it again.")
-    if len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0]):
+    if (len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0])) or (
+            0 not in used and len(titles) == max(used)):
         # R's write.table gives no title to its row names.
         titles = ["", *titles]
     titles = [titles[k] for k in used] if len(titles) > max(used) else []
@@ -191,6 +124,15 @@ def _colmap(path: Path, text: str) -> Columns:
                            f"A point of COLMAP has at least {len(names)}: {', '.join(names)}.",
                            "Export it again.")
     return Columns(names, names, values)
+
+
+def _has_tracks(text: str) -> bool:
+    """Whether these are COLMAP's points without its comments: rows end with pairs of numbers."""
+    rows = [line.split() for line in text[:_HEAD].splitlines()[:-1]]
+    widths = {len(row) for row in rows}
+    return len(widths) > 1 and min(widths) >= 8 and not any(width % 2 for width in widths) and all(
+        row[0].isdigit() and all(part.isdigit() and int(part) < 256 for part in row[4:7])
+        for row in rows)
 
 
 def _without_counts(lines: list[str]) -> list[str]:
@@ -226,6 +168,9 @@ def _separator(line: str) -> str | None:
 
 
 def _parts(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        # A unit in brackets belongs to the title before it.
+        line = re.sub(r"\s+(?=[\[(])", "", line)
     parts = [part.strip() for part in line.split(separator)]
     # Some programs end each line with a separator.
     return parts[:-1] if len(parts) > 3 and parts[-1] == "" else parts
@@ -291,7 +236,7 @@ def _bare(titles: Iterable[str]) -> list[str]:
     found = []
     for title in titles:
         name, unit = split_title(title.lower().lstrip("/#").strip(), LENGTHS)
-        is_length = unit is not None and unit in (*LENGTHS, *_UNKNOWN_LENGTHS)
+        is_length = unit is not None and unit in (*LENGTHS, *OTHER_LENGTHS)
         found.append(name if is_length else title.lower().lstrip("/#").strip())
     return found
 
@@ -343,6 +288,8 @@ def _with_words(path: Path, lines: list[str], separator: str | None, text: str,
     width = len(_parts(lines[0], separator))
     rows = [[_number(part, separator != ",") for part in _parts(line, separator)]
             for line in lines]
+    if len(titles) == width - 1:
+        titles = ["", *titles]
     sample = [row for row in rows[:_MOST_HEAD] if len(row) == width]
     axes = three_of("position", _bare(titles)) if len(titles) == width else None
     words = [k for k in range(width) if axes is not None and k not in axes

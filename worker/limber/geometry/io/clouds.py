@@ -11,18 +11,20 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
+from limber.core.files.column_titles import stated_unit
 from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
 from limber.core.files.reading import read_arrays
-from limber.core.files.text_columns import ColumnsError, read_columns, stated_unit
+from limber.core.files.text_columns import ColumnsError, read_columns
 from limber.geometry.cloud.cloud import POINTS, Cloud
 from limber.geometry.cloud.columns import property_names
-from limber.geometry.io.e57 import read_e57
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.las import is_packed, las_columns
 from limber.geometry.io.mesh_as_cloud import mesh_notes
 from limber.geometry.io.pcd import read_pcd
 from limber.geometry.io.ply import read_ply
-from limber.geometry.io.ptx import read_ptx
+from limber.geometry.io.scanners.colmap import read_points3d
+from limber.geometry.io.scanners.e57 import read_e57
+from limber.geometry.io.scanners.ptx import read_ptx
 
 _FARTHEST = 1e15
 """No coordinate lies beyond, whatever its unit."""
@@ -136,7 +138,8 @@ def _read_arrays(path: Path) -> Cloud:
     if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:
         raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
                          "Points must have shape [n, 3].", "Save them in this shape.")
-    renamed = {"normals": "normal", "colors": "color"}
+    renamed = {"normals": "normal", **dict.fromkeys(("colors", "colours", "colour", "rgb"),
+                                                    "color")}
     return Cloud(points[:, :3], {renamed.get(k, k): v for k, v in arrays.items()})
 
 
@@ -152,6 +155,7 @@ CLOUDS = Registry("point cloud", "limber.clouds", [
     Format("text", (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzrgb", ".tsv"), _read_text),
     Format("PTX", (".ptx",), read_ptx),
     Format("E57", (".e57",), read_e57, recognises=starts_with(b"ASTM-E57")),
+    Format("COLMAP", (".bin",), read_points3d),
     Format("LAS", (".las", ".laz"), las_columns, check=check_las, isolated=is_packed,
            recognises=starts_with(b"LASF")),
     Format("vertices of a mesh", (".obj", ".stl", ".off"), _read_vertices),

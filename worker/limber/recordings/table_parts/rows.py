@@ -1,5 +1,6 @@
 """The lines of a table as text, cut into fields, and where its numbers begin."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,8 @@ def separator_of(lines: list[str]) -> str | None:
 
 def fields_of(line: str, separator: str | None) -> list[str]:
     """Return the fields of a line without quotes."""
-    parts = line.split(separator) if separator else line.split()
+    # A unit in brackets belongs to the title before it.
+    parts = line.split(separator) if separator else re.sub(r"\s+(?=[\[(])", "", line).split()
     return [part.strip().strip('"').strip() for part in parts]
 
 

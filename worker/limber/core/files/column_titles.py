@@ -1,0 +1,85 @@
+"""Titles of columns: names without their units, units of length, and what three columns mean.
+
+Nothing of Limber: ``addon/column_titles.py`` is a copy, so that worker and add-on read alike.
+``scripts/make_addon_schema`` makes the copy; a test compares the two.
+"""
+
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+
+LENGTHS = {**{unit: unit for unit in ("m", "cm", "mm", "um", "in")},
+           **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+           **dict.fromkeys(("centimeter", "centimeters", "centimetre", "centimetres"), "cm"),
+           **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
+           **dict.fromkeys(("micron", "microns", "micrometer", "micrometers", "micrometre",
+                            "micrometres"), "um"), **dict.fromkeys(("inch", "inches"), "in")}
+"""Units of length, by what files call them in small letters."""
+OTHER_LENGTHS = ("ft", "feet", "foot", "usft", "yd", "km", "dm", "nm", "px", "pixel", "voxel")
+"""Units of lengths that are not read, but told from other words in brackets."""
+_FORMS = ("{}", "{}coordinate", "{}coord", "coordinate{}", "coord{}", "{}koordinate",
+          "koordinate{}", "{}pos", "{}position", "pos{}", "position{}", "p{}", "point{}",
+          "points{}", "scan{}", "world{}", "local{}")
+_PLANES = (("easting", "northing"), ("east", "north"), ("e", "n"), ("rechtswert", "hochwert"),
+           ("ostwert", "nordwert"), ("ost", "nord"))
+_HEIGHTS = ("height", "elevation", "altitude", "z", "h", "hohe", "hoehe", "alt", "up", "elev")
+ROLES = {
+    "position": (*(tuple(form.format(axis) for axis in "xyz") for form in _FORMS),
+                 *(tuple(f"{word}{k}" for k in range(3)) for word in ("points", "point",
+                                                                     "position", "pos", "xyz")),
+                 *((*plane, height) for plane in _PLANES for height in _HEIGHTS)),
+    "normal": (*(tuple(form.format(axis) for axis in "xyz") for form in ("n{}", "normal{}",
+                                                                        "{}normal", "norm{}")),
+               *(tuple(f"{word}{k}" for k in range(3)) for word in ("normals", "normal"))),
+    "color": (*(tuple(form.format(name) for name in ("red", "green", "blue"))
+                for form in ("{}", "color{}", "colour{}", "diffuse{}")),
+              *(tuple(form.format(name) for name in "rgb")
+                for form in ("{}", "color{}", "col{}", "{}f")),
+              ("rot", "grun", "blau"), ("rot", "gruen", "blau"), ("rgb0", "rgb1", "rgb2"))}
+"""What three columns of one meaning are called, in :func:`plain` letters; the first that are
+there count."""
+_STATED = re.compile(r"\b(?:units?|einheit(?:en)?)\b\W{0,3}(?:(?:are|is|in|sind|ist)\b\W{1,2})?"
+                     r"([^\W\d_]+)", re.IGNORECASE)
+
+
+def plain(name: str) -> str:
+    """Return the small letters and digits of a name, without accents."""
+    letters = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]", "", letters)
+
+
+def split_title(title: str, units: Iterable[str]) -> tuple[str, str | None]:
+    """Take the unit off a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``.
+
+    Args:
+        title: Of a column.
+        units: Those that need no brackets at the end, in small letters.
+    """
+    text = title.strip().replace("\u00b5", "u").replace("\u03bc", "u")
+    bracket = re.search(r"[(\[]\s*([^)\]]*?)\s*[)\]]", text)
+    if bracket and bracket.end() == len(text):
+        return text[:bracket.start()].strip(" _"), bracket.group(1) or None
+    if bracket and bracket.group(1).lower() in units:
+        return f"{text[:bracket.start()].strip()} {text[bracket.end():].strip()}", bracket.group(1)
+    end = re.fullmatch(r"(.+?)\s*(?:_|,|(?<!^)/|\s+in\s)\s*([A-Za-z]+)", text, re.DOTALL) or (
+        re.fullmatch(r"(.+)\s([A-Za-z]{2,})", text, re.DOTALL))
+    if end and end.group(2).lower() in units and not text.startswith("/"):
+        return end.group(1).strip(), end.group(2)
+    head, _, tail = text.rpartition("_")
+    return (head, tail) if head and tail.lower() in units else (text, None)
+
+
+def three_of(role: str, names: Sequence[str]) -> tuple[int, int, int] | None:
+    """Return which columns have a role of :data:`ROLES`; None if not all three are there."""
+    for spelt in ([name.lower().lstrip("/#").strip() for name in names],
+                  [plain(name) for name in names]):
+        for one, two, three in ROLES[role]:
+            if one in spelt and two in spelt and three in spelt:
+                return spelt.index(one), spelt.index(two), spelt.index(three)
+    return None
+
+
+def stated_unit(text: str) -> str | None:
+    """Return the unit of length that a comment or a preamble states, if any."""
+    return next((LENGTHS[word.lower()] for word in _STATED.findall(text)
+                 if word.lower() in LENGTHS), None)
