@@ -187,3 +187,13 @@ def test_a_wrench_of_a_topic_makes_a_robots_log(tmp_path):
               *(f"/ft/wrench/force/{a}" for a in "xyz")]
     assert is_robot_table([split_title(title) for title in titles])
     assert not is_robot_table([split_title(f"tip_position_{a}") for a in "xyz"])
+
+
+@pytest.mark.parametrize("position", ["x y z", "pos_x pos_y pos_z", "tcp_x tcp_y tcp_z"])
+def test_torques_beside_a_quaternion_stay_torques(tmp_path, position):
+    """Only where nothing else is a position is tx TUM's translation."""
+    (tmp_path / "a.txt").write_text(f"t_s {position} qx qy qz qw fx fy fz tx ty tz\n" + "".join(
+        f"{0.01 * k} 0.1 0.2 0.3 0 0 0 1 1 2 3 4 5 6\n" for k in range(9)))
+    stream = robot_stream(tmp_path / "a.txt")
+    found = dict(zip(stream.columns, stream.values[0], strict=True))
+    assert found["x_m"] == 0.1 and found["tx_nm"] == 4.0 and found["fx_n"] == 1.0

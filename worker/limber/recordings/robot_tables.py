@@ -84,7 +84,8 @@ def is_robot_table(titles: list[Title]) -> bool:
 def _known(titles: list[Title]) -> list[Title]:
     """Titles of ROS topics and of TUM's trajectories by our names."""
     plain = [title.plain for title in titles]
-    if {"tx", "ty", "tz", "qx", "qy", "qz", "qw"} <= set(plain) and not {"x", "px"} & set(plain):
+    if {"tx", "ty", "tz", "qx", "qy", "qz", "qw"} <= set(plain) and not (
+            set(_ALIASES["x_m"]) & set(plain)):
         # TUM's translation; with no quaternion it is a torque.
         places = {f"t{a}": f"p{a}" for a in "xyz"}
         return [Title(places.get(title.plain, title.name), title.unit) for title in titles]
