@@ -67,12 +67,14 @@ class RobotLink:
         self._write_lock = threading.Lock()
         self._closing = threading.Event()
         self._write(cell.model_dump_json())
-        threading.Thread(target=self._read, name="robot samples", daemon=True).start()
+        self._reader = threading.Thread(target=self._read, name="robot samples", daemon=True)
+        self._reader.start()
         try:
             self.facts = self.wait("connected", seconds=_CONNECT_SECONDS)
         except BaseException as error:
+            was_slow = not self._has_started
             self.close()
-            if isinstance(error, WorkError) and not self._has_started:
+            if isinstance(error, WorkError) and was_slow:
                 raise WorkError(f"The robot's driver did not start within {_CONNECT_SECONDS:.0f} "
                                 "s; the robot was not asked yet.", "This computer is too busy, or "
                                 "its disk is slow: loading the driver takes about two seconds.",
@@ -228,8 +230,8 @@ class RobotLink:
         self._closing.set()
         with self._write_lock:
             end_by_closing(self.process)
+        self._reader.join(_LAST_WORDS_SECONDS)
         with self._news:
-            self._news.wait_for(lambda: self._ended, _LAST_WORDS_SECONDS)
             self.warnings += [event["text"] for event in self._events
                               if event["event"] == "warning"]
 
