@@ -32,6 +32,8 @@ PARTS = [
     ("pypcd4", "pypcd4", "PCD scans"),
     ("ezc3d", "ezc3d", "C3D motion capture"),
     ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
+    ("websockets", "websockets", "robots behind ROS 2 (pip install 'limber[ros]')"),
+    ("cv2", "opencv-python-headless", "calibration by pictures (pip install 'limber[camera]')"),
     ("fsspec", "fsspec", "addresses such as s3:// in job files (pip install 'limber[remote]')"),
     ("h5py", "h5py", "MAT files of version 7.3 (pip install 'limber[matlab]')"),
     ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags (pip install 'limber[bags]')"),
