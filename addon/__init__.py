@@ -26,6 +26,7 @@ MODULES = (
     "operators.material",
     "operators.start",
     "operators.grab",
+    "operators.grab_tool",
     "operators.skeleton",
     "operators.sharing",
     "operators.cancel_job",
