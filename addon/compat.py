@@ -52,3 +52,10 @@ def flush_native_output() -> None:
     """Write out what Blender's C code has printed so far, lest it come after later output."""
     if os.name == "posix":
         ctypes.CDLL(None).fflush(None)
+
+
+def placeholder(text: str) -> dict[str, str]:
+    """Return the argument of ``UILayout.prop`` that shows a text while a field is empty; none where
+    a Blender does not have it."""
+    known = bpy.types.UILayout.bl_rna.functions["prop"].parameters
+    return {"placeholder": text} if "placeholder" in known else {}

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches, preferences, properties, warming
+from .. import branches, compat, preferences, properties, warming
 from ..operators import live_loads, seeing
 from ..overlays import graph as viewport_graph
 from .comparing import draw_branches
@@ -37,8 +37,8 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
                 text=f"Next: {following.label}", icon="FORWARD")
             button.branch_uuid = branches.current_uuid(context.scene)
         if surface is not None:
-            self.layout.prop(settings.scene, "plan", placeholder="the newest")
-            self.layout.prop(settings.scene, "motion", placeholder="of the plan")
+            self.layout.prop(settings.scene, "plan", **compat.placeholder("the newest"))
+            self.layout.prop(settings.scene, "motion", **compat.placeholder("of the plan"))
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
         self.layout.prop(settings, "show_expert")
         if not preferences.has_worker():
