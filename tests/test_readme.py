@@ -41,13 +41,15 @@ def test_a_shown_command_is_understood(line):
     command.make_context(name, words)
 
 
-def test_the_readmes_figures_are_the_benches(monkeypatch):
-    """Run scripts/make_readme_figures where a table in worker/docs/data is new."""
+def test_the_readmes_figures_are_those_of_runs(monkeypatch):
+    """Run scripts/make_readme_figures where the example or a table in worker/docs/data is new."""
     monkeypatch.syspath_prepend(ROOT / "worker" / "docs")
     import readme_figures
 
-    _, _, rest = README.read_text(encoding="utf-8").partition(f"{readme_figures.BEGIN}\n")
-    assert rest.partition(f"\n{readme_figures.END}")[0] == readme_figures.table()
+    text = README.read_text(encoding="utf-8")
+    for begin, part in readme_figures.PARTS.items():
+        _, _, rest = text.partition(f"{begin}\n")
+        assert rest.partition(f"\n{readme_figures.END}")[0] == part()
 
 
 def test_the_readmes_picture_moves_and_is_small():

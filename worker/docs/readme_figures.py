@@ -1,7 +1,7 @@
-"""The table of the README: what Limber does, how well by the benches, and what shows it.
+"""The figures of the README: what commands say of an example, and how well each part does.
 
-``scripts/make_readme_figures`` puts it between the README's marks; a test holds it there. A figure
-is a part of what a bench's row says, as `accuracy_page` keeps it.
+``scripts/make_readme_figures`` puts both between the README's marks; a test holds them there. A
+figure of the table is a part of what a bench's row says, as `accuracy_page` keeps it.
 """
 
 import re
@@ -12,7 +12,8 @@ from typing import NamedTuple
 from accuracy_page import record
 
 README = Path(__file__).parents[2] / "README.md"
-BEGIN, END = "<!-- Figures: scripts/make_readme_figures writes this table. -->", "<!-- End. -->"
+EXAMPLE = README.parent / "blend_files" / "bending_branch"
+_SAID, END = "scripts/make_readme_figures writes this. -->", "<!-- End. -->"
 
 
 class Figure(NamedTuple):
@@ -96,12 +97,40 @@ def _filled(how: str) -> str:
     return how.format(**{name: text for name, (text, _) in found.items()}) + f" ({trials})"
 
 
+def outcome() -> str:
+    """Return what the commands have found on the example branch, a line each."""
+    import limber
+
+    found = limber.open(EXAMPLE).results
+    made, field, plan = found["reconstruct"].values, found["energy"], found["plan:to-goal"]
+    estimate = found["estimate"]
+    moduli = ", ".join(f"{young:.2g} ({low:.2g} to {high:.2g})" for young, (low, high) in
+                       zip(1e-6 * estimate.young, 1e-6 * estimate.interval, strict=True))
+    lines = {
+        "reconstruct": f"{made['branch_count']} branches, {made['length_m']:.2f} m, radii "
+                       f"{1e3 * made['radius_min_m']:.1f} to {1e3 * made['radius_max_m']:.1f} mm, "
+                       f"{made['tet_count']} tetrahedra",
+        "estimate": f"E = {moduli} MPa, base to tip",
+        "energy": f"{len(field.positions)} poses; the field is off by "
+                  f"{100 * field.energy_error:.1f} % in energy, {100 * field.force_error:.1f} % in "
+                  "force",
+        "plan": f"{1e3 * plan.values['plan']['length_m']:.0f} mm, {plan.energy_saved:.0f} % less "
+                f"energy than the shortest path, at most {plan.gap:.1f} % off the least cost",
+    }
+    return "\n".join(["```text", *(f"{name:12} {text}" for name, text in lines.items()), "```"])
+
+
+PARTS = {f"<!-- Outcome: {_SAID}": outcome, f"<!-- Figures: {_SAID}": table}
+"""What is written, by the mark that it follows."""
+
+
 def write() -> None:
-    """Put the table between the README's marks."""
+    """Put the parts behind the README's marks."""
     text = README.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    README.write_text(f"{before}{BEGIN}\n{table()}\n{END}{rest.partition(END)[2]}",
-                      encoding="utf-8")
+    for begin, part in PARTS.items():
+        before, _, rest = text.partition(begin)
+        text = f"{before}{begin}\n{part()}\n{END}{rest.partition(END)[2]}"
+    README.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
