@@ -74,12 +74,11 @@ class Run(Directive):
         folder.mkdir(parents=True, exist_ok=True)
         word, *words = shlex.split(line)
         program = {"limber": [sys.executable, "-m", "limber"], "python": [sys.executable]}[word]
-        for _ in range(2):
-            done = subprocess.run(
-                [*program, *words], cwd=folder, capture_output=True, text=True, check=False,
-                timeout=SECONDS, env={**os.environ, "COLUMNS": "96", "NO_COLOR": "1"})
-            if done.returncode != STOPPED_FOR_SAFETY:
-                break
+        try:
+            done = _tried([*program, *words], folder)
+        except subprocess.TimeoutExpired:
+            LOG.warning("`%s` takes over %d s", line, SECONDS, location=(env.docname, self.lineno))
+            return ""
         text = (done.stdout + done.stderr).replace(f"{folder}{os.sep}", "").rstrip()
         if done.returncode != self.options.get("exit", 0):
             LOG.warning("`%s` ended with exit code %d:\n%s", line, done.returncode, text[-1500:],
@@ -87,6 +86,17 @@ class Run(Directive):
         lines = text.splitlines()
         kept = self.options.get("lines", 14)
         return "\n".join(lines if len(lines) <= kept else ["...", *lines[-kept:]])
+
+
+def _tried(command: list[str], folder: Path) -> subprocess.CompletedProcess:
+    """Run a command; once more where a robot was stopped."""
+    for _ in range(2):
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False,
+                              timeout=SECONDS,
+                              env={**os.environ, "COLUMNS": "96", "NO_COLOR": "1"})
+        if done.returncode != STOPPED_FOR_SAFETY:
+            break
+    return done
 
 
 class File(Directive):
