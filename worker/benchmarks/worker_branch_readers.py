@@ -162,6 +162,7 @@ _TARGETS = {"format_version": 1, "targets": [
 def _search_file(template: Path, folder: Path) -> list[Path]:
     """What a search of the template's cloud would have come to, with a bit of everything."""
     from limber.geometry.io.clouds import read_points
+    from limber.geometry.cloud.leaves import Leaf
     from limber.geometry.io.skeletons import read_skeleton
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
     from limber.geometry.skeleton.search_result import given_skeleton
@@ -174,7 +175,7 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
         {"points": 3, "distance": 0.1, "at": place}], unlikely=[
         {"length": 0.01, "at": place, "probability": 0.2}])
     path = folder / "scan_skeleton.npz"
-    FoundSkeleton(found, leaves_cut=False).write(path)
+    FoundSkeleton(found, [Leaf(np.arange(3), 1e-3)]).write(path)
     return [path]
 
 

@@ -140,7 +140,7 @@ def _tree_of(path: Path, table: np.ndarray, scale: float | None,
     roots = np.flatnonzero(parent < 0)
     # Several may grow from the ground of the first one.
     first_start = table[roots[:1], 2:5]
-    if len(roots) != 1 and not (np.abs(table[roots, 2:5] - first_start) < 1e-9).all():
+    if not len(roots) or not (np.abs(table[roots, 2:5] - first_start) < 1e-9).all():
         raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
                          "A branch has exactly one root.", "Keep only one tree in the file.")
     root = roots[0]
