@@ -51,8 +51,8 @@ def test_the_unit_of_a_model_is_asked_about(tmp_path):
 
 def test_a_model_without_a_root_is_refused(tmp_path):
     """The first cylinder hangs on itself."""
-    export(EXAMPLE, tmp_path / "tree.csv", ExportSettings())
-    text = (tmp_path / "tree.csv").read_text()
+    text = (EXAMPLE / "skeleton.csv").read_text()
+    assert "\n0,-1," in text
     (tmp_path / "tree.csv").write_text(text.replace("\n0,-1,", "\n0,0,", 1))
     with pytest.raises(InputError, match="has 0 cylinders without a parent"):
         read_skeleton(tmp_path / "tree.csv")

@@ -161,8 +161,8 @@ _TARGETS = {"format_version": 1, "targets": [
 
 def _search_file(template: Path, folder: Path) -> list[Path]:
     """What a search of the template's cloud would have come to, with a bit of everything."""
-    from limber.geometry.io.clouds import read_points
     from limber.geometry.cloud.leaves import Leaf
+    from limber.geometry.io.clouds import read_points
     from limber.geometry.io.skeletons import read_skeleton
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
     from limber.geometry.skeleton.search_result import given_skeleton
