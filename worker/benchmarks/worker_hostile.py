@@ -23,6 +23,7 @@ from pathlib import Path
 
 from benchmarks.hostile_folders import LAYOUTS, SECRET
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.worker_readers import addon_module
 from limber.cli.main import call
 from limber.core.errors import LimberError
 from limber.store import Branch
@@ -120,7 +121,10 @@ def _waited(_signal: int, _frame: object) -> None:
 
 
 def _written(folder: Path) -> int:
-    """Open, run a stage, append to a stream, as a Python program does; and what the add-on does."""
+    """Open, run a stage and append to a stream, as a Python program does, once the add-on has read
+    what its panels show."""
+    addon_module("branch_folder").read_record(folder)
+    addon_module("live_force").read(folder)
     try:
         branch = Branch.create(folder)
         with branch.stream("pulls/p/robot.csv") as stream:

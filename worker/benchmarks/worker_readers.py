@@ -357,22 +357,22 @@ def _read(registry: Registry, _template: Path, path: Path) -> Any:
 
 
 @cache
-def _addon(name: str) -> Any:
-    """A module of the add-on that needs no Blender; its package's own file would need it."""
+def addon_module(name: str) -> Any:
+    """A module of the add-on that needs no Blender."""
     import importlib
     import sys
     import types
 
-    if "addon_files" not in sys.modules:
-        sys.modules["addon_files"] = package = types.ModuleType("addon_files")
-        package.__path__ = [str(Path(__file__).parents[2] / "addon")]
+    # Its package file does.
+    package = sys.modules.setdefault("addon_files", types.ModuleType("addon_files"))
+    package.__path__ = [str(Path(__file__).parents[2] / "addon")]
     return importlib.import_module(f"addon_files.{name}")
 
 
 def _addon_read(module: str, function: str, _template: Path, path: Path) -> Any:
     """What the add-on reads; its own word for a refusal is ValueError."""
     try:
-        return getattr(_addon(module), function)(path)
+        return getattr(addon_module(module), function)(path)
     except ValueError as error:
         if type(error) is not ValueError and not type(error).__name__.endswith("DataError"):
             raise
