@@ -12,6 +12,8 @@ from limber.geometry.cloud.columns import PARTS, ply_columns, valid_columns
 
 POINTS = "\0points"
 """Name of the coordinates [n, 3] among columns of any name."""
+LEFT_OUT = "\0left_out"
+"""Name of the number of points that a reader left out, likewise."""
 _LONGEST_TITLE = 1000  # characters of a title that a file's header repeats
 
 
@@ -27,6 +29,8 @@ class Cloud:
         titles: What the file calls an attribute, where its name is another.
         unit: Of the points, if the file states it: m, cm, mm, um or in.
         notes: What the user should know of the file.
+        left_out: Number of points that were left out while it was read, since there are others
+            beside them.
     """
 
     points: np.ndarray
@@ -35,6 +39,7 @@ class Cloud:
     titles: dict[str, str] = field(default_factory=dict)
     unit: str | None = None
     notes: tuple[str, ...] = ()
+    left_out: int = 0
 
     @classmethod
     def from_columns(cls, columns: dict[str, np.ndarray], titles: dict[str, str] | None = None,

@@ -57,9 +57,12 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         InputError: too few points, or all of them at one position.
     """
     settings = settings or PreparationSettings()
-    counts = {"read": len(cloud), "not_finite": cloud.not_finite}
+    counts = {"read": len(cloud) + cloud.left_out, "not_finite": cloud.not_finite}
+    if cloud.left_out:
+        counts["thinned_on_reading"] = cloud.left_out
+    counts["cropped"] = len(cloud)
     cloud = _cropped(cloud, settings)
-    counts["cropped"] = counts["read"] - len(cloud)
+    counts["cropped"] -= len(cloud)
     _enough(cloud, "The cloud")
     cloud, view = _without_flying(cloud, scale, settings, eye, counts)
     # Subtracted in float64 before anything else: map coordinates leave no digits to a float32.
@@ -267,6 +270,11 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     if counts.get("not_finite"):
         texts.append("Points with coordinates that are not finite (NaN or infinity) were "
                      f"discarded: {counts['not_finite']}.")
+    if counts.get("thinned_on_reading"):
+        texts.append(f"The scan has {counts['read']} points. One point in each cell of a grid was "
+                     f"kept, {counts['read'] - counts['thinned_on_reading']} in all: more do not "
+                     "make the axes better. Crop the scan before the export if finer twigs are "
+                     "missing.")
     if counts.get("sheets"):
         texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
                      "wall or the ground?) and were removed (--keep-sheets keeps them).")

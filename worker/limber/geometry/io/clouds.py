@@ -15,7 +15,7 @@ from limber.core.files.column_titles import stated_unit
 from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
 from limber.core.files.reading import read_arrays
 from limber.core.files.text_columns import ColumnsError, read_columns
-from limber.geometry.cloud.cloud import POINTS, Cloud
+from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
 from limber.geometry.cloud.columns import property_names
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.las import is_packed, las_columns
@@ -145,7 +145,9 @@ def _read_arrays(path: Path) -> Cloud:
 
 def _of_columns(_path: Path, columns: dict[str, np.ndarray]) -> Cloud:
     points = columns.pop(POINTS, None)
-    return Cloud.from_columns(columns) if points is None else Cloud(points, columns)
+    left_out = int(columns.pop(LEFT_OUT, 0))
+    cloud = Cloud.from_columns(columns) if points is None else Cloud(points, columns)
+    return replace(cloud, left_out=left_out)
 
 
 CLOUDS = Registry("point cloud", "limber.clouds", [

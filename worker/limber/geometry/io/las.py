@@ -1,10 +1,12 @@
 """Clouds as LAS and LAZ files."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from limber.geometry.cloud.cloud import POINTS
+from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
+from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
 
 
 def is_packed(path: Path) -> bool:
@@ -15,17 +17,32 @@ def is_packed(path: Path) -> bool:
 
 def las_columns(path: Path) -> dict[str, np.ndarray]:
     """Return coordinates, ``color`` and the other dimensions of a LAS or LAZ file."""
+    cloud = gathered(_pieces(path))
+    attributes = {name: values for name, values in cloud.attributes.items()
+                  if name == "color" or values.any()}
+    if "color" in attributes and attributes["color"].max(initial=0) > 255:
+        # 16 bits a channel by the standard, though many programs write 8.
+        attributes["color"] = attributes["color"] // 257
+    return {**attributes, POINTS: cloud.points, LEFT_OUT: np.array(cloud.left_out)}
+
+
+def _pieces(path: Path) -> Iterator[Cloud]:
     import laspy
 
-    content = laspy.read(path)
-    attributes = {}
-    names = set(content.point_format.dimension_names)
-    if {"red", "green", "blue"} <= names:
-        color = np.stack([np.asarray(content[c]) for c in ("red", "green", "blue")], axis=1)
-        # 16 bits a channel by the standard, though many programs write 8.
-        attributes["color"] = color // 257 if color.max(initial=0) > 255 else color
-    for name in sorted(names - {"X", "Y", "Z", "red", "green", "blue"}):
-        values = np.asarray(content[name])
-        if values.ndim == 1 and values.any():
-            attributes[name] = values
-    return {**attributes, POINTS: np.asarray(content.xyz, np.float64)}
+    with laspy.open(path) as reader:
+        dimensions = reader.header.point_format
+        names = set(dimensions.dimension_names)
+        has_color = {"red", "green", "blue"} <= names
+        others = sorted(names - {"X", "Y", "Z", "red", "green", "blue"})
+        if reader.header.point_count == 0:
+            yield Cloud(np.empty((0, 3)))
+        for part in reader.chunk_iterator(PIECE_POINTS):
+            attributes = {}
+            if has_color:
+                attributes["color"] = np.stack(
+                    [np.asarray(part[c]) for c in ("red", "green", "blue")], axis=1)
+            attributes |= {name: values for name in others
+                           if (values := np.asarray(part[name])).ndim == 1}
+            points = np.stack([np.asarray(getattr(part, axis), np.float64) for axis in "xyz"],
+                              axis=1)
+            yield Cloud(points, attributes)

@@ -13,6 +13,7 @@ from limber.core.files.column_titles import stated_unit
 from limber.core.files.declared_sizes import header_bytes
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
+from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
 from limber.geometry.io.mesh_as_cloud import mesh_notes
 
 
@@ -23,12 +24,15 @@ def read_ply(path: Path) -> Cloud:
         raise InputError(f"{path} has no vertices.", "A PLY point cloud has an element `vertex`.",
                          "Export it again.")
     table = content["vertex"].data
-    names = list(table.dtype.names)
-    cloud = Cloud.from_columns({name: np.asarray(table[name]) for name in names
-                                if table.dtype[name].kind in "iuf"}, titles)
+    names = [name for name in table.dtype.names if table.dtype[name].kind in "iuf"]
+    # Binary tables stay in the file until a piece is asked for.
+    cloud = gathered(Cloud.from_columns({name: np.array(part[name]) for name in names}, titles)
+                     for start in range(0, max(len(table), 1), PIECE_POINTS)
+                     for part in [table[start:start + PIECE_POINTS]])
+    # Faces count the file's vertices.
+    notes = () if cloud.left_out else tuple(mesh_notes(path, cloud.points, _triangles(content)))
     comments = "\n".join([*content.comments, *content.obj_info])
-    return replace(cloud, unit=stated_unit(comments),
-                   notes=tuple(mesh_notes(path, cloud.points, _triangles(content))))
+    return replace(cloud, unit=stated_unit(comments), notes=notes)
 
 
 def _triangles(content: Any) -> np.ndarray:

@@ -1,0 +1,97 @@
+"""Scans of more points than are kept, read piece by piece."""
+
+import numpy as np
+import pytest
+
+from limber.geometry.cloud import gathering
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.gathering import gathered
+from limber.geometry.cloud.preparation import prepare
+from limber.geometry.io import las, ply
+from limber.geometry.io.clouds import read_points
+
+
+def _tube(count):
+    rng = np.random.default_rng(0)
+    angle, along = 2 * np.pi * rng.random(count), rng.random(count)
+    return np.stack([0.02 * np.cos(angle), 0.02 * np.sin(angle), along], axis=1)
+
+
+def _pieces(points, count):
+    numbers = np.arange(len(points))
+    return [Cloud(part, {"number": number}) for part, number in zip(
+        np.array_split(points, count), np.array_split(numbers, count), strict=True)]
+
+
+def test_few_points_stay_as_they_are():
+    points = _tube(500)
+    whole = gathered(_pieces(points, 7), most=500)
+    np.testing.assert_array_equal(whole.points, points)
+    np.testing.assert_array_equal(whole.attributes["number"], np.arange(500))
+    assert whole.left_out == 0
+
+
+def test_of_many_points_an_even_part_stays():
+    """Whichever piece they come in: of the first as many as of the last."""
+    points = _tube(40_000)
+    points = points[np.argsort(points[:, 2])]
+    some = gathered(_pieces(points, 40), most=3000)
+    np.testing.assert_array_equal(some.points, gathered(_pieces(points, 1), most=3000).points)
+    assert 700 < len(some) <= 3000 and some.left_out == 40_000 - len(some)
+    np.testing.assert_array_equal(some.points, points[some.attributes["number"]])
+    shares = np.histogram(some.points[:, 2], 10, (0, 1))[0] / len(some)
+    assert shares.min() > 0.08 and shares.max() < 0.12
+
+
+def test_what_is_held_is_bounded():
+    """No more than twice what is kept, and a piece, lies in memory together."""
+    points, held, most = _tube(40_000), [], 3000
+    kept = gathering._together
+
+    def together(pieces):
+        held.append(sum(map(len, pieces)))
+        return kept(pieces)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gathering, "_together", together)
+        gathered(_pieces(points, 40), most)
+    assert max(held) <= 2 * most + 1000
+
+
+def test_points_that_are_not_finite_make_no_cells():
+    points = _tube(9000)
+    points[::10] = np.nan
+    some = gathered(_pieces(points, 9), most=2000)
+    assert np.isfinite(some.points).all()
+    assert some.not_finite == 900 and some.left_out + len(some) == 8100
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".las"])
+def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
+    """As a whole, and thinned, with their attributes; the user is told."""
+    points, path = _tube(5000), tmp_path / f"a{suffix}"
+    intensity = np.arange(5000, dtype=np.uint16)
+    if suffix == ".ply":
+        Cloud(points, {"intensity": intensity}).write_ply(path)
+    else:
+        laspy = pytest.importorskip("laspy")
+        header = laspy.LasHeader(point_format=3, version="1.2")
+        header.scales = [1e-6] * 3
+        content = laspy.LasData(header)
+        content.x, content.y, content.z = points.T
+        content.intensity = intensity
+        content.write(path)
+    for module in (ply, las):
+        monkeypatch.setattr(module, "PIECE_POINTS", 700)
+    whole = read_points(path)
+    np.testing.assert_allclose(whole.points, points, atol=1e-6)
+    np.testing.assert_array_equal(whole.attributes["intensity"], intensity)
+    for module in (ply, las):
+        monkeypatch.setattr(module, "gathered", lambda pieces: gathered(pieces, 1000))
+    some = read_points(path)
+    assert len(some) <= 1000 and some.left_out == 5000 - len(some)
+    np.testing.assert_array_equal(some.points, whole.points[some.attributes["intensity"]])
+    prepared = prepare(some, 1.0)
+    assert prepared.counts["read"] == 5000
+    assert prepared.counts["thinned_on_reading"] == some.left_out
+    assert any("5000 points" in text for text in prepared.warnings)
