@@ -25,6 +25,7 @@ from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_hostile import HOSTILE_ROWS, hostile
 from benchmarks.worker_kernel_cache import KERNELS_ROW, kernels
 from benchmarks.worker_kills import KILLS_ROW, killed
+from benchmarks.worker_large import LARGE_ROWS, large
 from benchmarks.worker_readers import READERS
 from benchmarks.worker_readme import README_ROW, run_readme
 from benchmarks.worker_reports import REPORT_ROWS, reported
@@ -106,6 +107,7 @@ PARTS = {
     "demo": Part(run_demo, 90, DEMO_ROWS),
     "readme": Part(run_readme, 60, (README_ROW,), grows=True),
     "memory": Part(_memory, 30, (MEMORY_ROW,), grows=True),
+    "large": Part(large, 60, LARGE_ROWS, grows=True),
     "kills": Part(killed, 90, (KILLS_ROW,), grows=True),
     "dask": Part(on_dask, 120, DASK_ROWS, grows=True),
     "two-cores": Part(speed_up, 120, (SPEED_UP_ROW,), grows=True)}
