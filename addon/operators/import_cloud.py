@@ -11,7 +11,7 @@ from ..bridge import meshes
 from ..overlays.cloud import COLOUR
 from .viewing import clear_view, look_at
 
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
 _INTERVAL_SECONDS = 0.05
 _LONGEST_PLANT_M = 300.0
 """No plant is so large: a file with larger numbers is not in metres."""

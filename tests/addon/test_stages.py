@@ -65,7 +65,7 @@ def test_limits_and_units_are_the_workers(bpy, registered):
     assert group.poisson == 0.5
     group.mesh_sides = 1
     assert group.mesh_sides == 4
-    assert {item.identifier for item in about["unit"].enum_items} == {"m", "cm", "mm", "in"}
+    assert {item.identifier for item in about["unit"].enum_items} == {"m", "cm", "mm", "in", "um"}
 
 
 def test_a_text_that_is_no_list_is_refused(stages):

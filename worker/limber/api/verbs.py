@@ -76,7 +76,7 @@ def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: Path
             ``unit``.
         folder: The branch folder to make or renew.
         quiet: Show no progress.
-        settings: ``unit`` ("m", "cm", "mm", "in"), ``root`` [3], ``mesh_spacing`` in radii,
+        settings: ``unit`` ("m", "cm", "mm", "in", "um"), ``root`` [3], ``mesh_spacing`` in radii,
             ``young`` [Pa], ``skeleton`` (a file of your own) and those that
             ``limber.settings("reconstruct")`` lists.
 

@@ -121,7 +121,8 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     }
     common = ("unit", "up", "root", "leaves")
 
-    unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
+    unit: Literal["m", "cm", "mm", "in", "um"] = Field(
+        "m", description="Unit of the file, if it does not state one.")
     up: Direction = Field(
         (0.0, 0.0, 1.0), description="The up direction in the file's axes.")
     root: tuple[float, float, float] | None = Field(
