@@ -98,6 +98,9 @@ def test_large_goals_are_aimed_at_from_the_near_side(field, small_model):
     assert np.allclose(goal.distance(field, near), goal.tolerance, atol=1e-6)
     away = np.linalg.norm(points - start, axis=1)
     assert away[len(drawn):].min() < away[:len(drawn)].min()
+    everywhere = field.region.draw(4000, np.random.default_rng(2))
+    inside = everywhere[goal.distance(field, everywhere) <= goal.tolerance]
+    assert away.min() <= 1.02 * np.linalg.norm(inside - start, axis=1).min()
 
 
 def test_walking_into_a_large_region_stays_among_the_samples(field):
@@ -162,4 +165,5 @@ def test_a_target_is_brought_where_it_can_be_taken_or_seen(planned_branch, tmp_p
     assert place.region.distance(end[None])[0] <= 1e-4
     assert 0.5 * AWAY < np.linalg.norm(end - tip) < 8.0 * AWAY
     assert plan.summary["plan"]["length_m"] > 0.01
-    assert plan.summary["baseline"]["length_m"] <= 1.05 * plan.summary["plan"]["length_m"]
+    # RRT* of 300 iterations.
+    assert plan.summary["baseline"]["length_m"] <= 1.2 * plan.summary["plan"]["length_m"]

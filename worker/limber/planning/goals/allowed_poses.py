@@ -11,6 +11,8 @@ from limber.planning.goals.goal import Goal
 _MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
 
 _HALVINGS = 20  # of a way into the goal
+_NEARER, _NEAREST = 3, 10  # rounds in which ways are tried about those of the last that are nearest
+_ASIDE, _DEEPER = 0.2, 1.15  # of the distance: how far aside ways go, and behind the border
 
 
 class GoalOverLimitsError(NoPathError):
@@ -43,14 +45,36 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
 def with_near_side(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField,
                    limits: FieldArrays) -> np.ndarray:
     """Return ``points`` [n, 3] of the goal, and where the straight ways to them from ``start`` [3]
-    enter it: in a large goal the near side is where short and gentle paths end."""
+    enter it: in a large goal the near side is where short and gentle paths end. More ways are
+    tried about those that are nearest."""
+    generator, found = np.random.default_rng(0), [points]
+    aims = points
+    for _ in range(_NEARER):
+        near = _entered(aims, start, goal, field)
+        near = near[allowed_points(near, limits)]
+        found.append(near)
+        away = np.linalg.norm(near - start, axis=1)
+        best = near[np.argsort(away)[:_NEAREST]]
+        if not len(best):
+            break
+        aims = np.repeat(best, len(points) // len(best) + 1, axis=0)
+        aims = aims + _ASIDE * away.min() * generator.normal(size=aims.shape)
+        aims = start + _DEEPER * (aims - start)
+        aims = aims[goal.distance(field, aims) <= goal.tolerance]
+        if not len(aims):
+            break
+    return np.concatenate(found)
+
+
+def _entered(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField) -> np.ndarray:
+    """Return where the straight ways from ``start`` [3] to ``points`` [n, 3] of the goal enter it.
+    """
     low, high = np.zeros(len(points)), np.ones(len(points))
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         inside = goal.distance(field, start + middle[:, None] * (points - start)) <= goal.tolerance
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    near = np.ascontiguousarray(start + high[:, None] * (points - start))
-    return np.concatenate([points, near[allowed_points(near, limits)]])
+    return np.ascontiguousarray(start + high[:, None] * (points - start))
 
 
 def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
