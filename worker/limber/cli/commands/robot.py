@@ -7,6 +7,7 @@ from limber.cli.robot_commands.check import check
 from limber.cli.robot_commands.moves import goto_start, home, open_gripper, release, retreat
 from limber.cli.robot_commands.new_cell import new_cell
 from limber.cli.robot_commands.scan import scan
+from limber.cli.robot_commands.weigh import weigh
 
 
 @click.group("robot")
@@ -14,5 +15,6 @@ def command() -> None:
     """Check a robot, calibrate where it stands, and move it by itself."""
 
 
-for each in (new_cell, check, calibrate, scan, home, goto_start, retreat, release, open_gripper):
+for each in (new_cell, check, weigh, calibrate, scan, home, goto_start, retreat, release,
+             open_gripper):
     command.add_command(each)

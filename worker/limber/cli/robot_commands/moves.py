@@ -26,7 +26,7 @@ _OBSERVED_SECONDS = 0.1
 _TARE_SECONDS = 0.5
 
 
-def _move_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
+def move_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
     """Make a command ``function(run, cell_file, armed, **options)`` of an arm's own motion."""
     def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
         function = click.option(
@@ -39,7 +39,7 @@ def _move_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
     return wrap
 
 
-@_move_command("home")
+@move_command("home")
 @click.option("--branch", "folder", type=click.Path(path_type=Path),
               help="Branch folder, to keep away from the branch as well.")
 def home(run: Run, cell_file: Path, confirm: str | None, armed: bool, folder: Path | None,
@@ -51,7 +51,7 @@ def home(run: Run, cell_file: Path, confirm: str | None, armed: bool, folder: Pa
     return _to(run, cell_file, cell, folder, np.array(cell.arm.home), "home", armed, confirm)
 
 
-@_move_command("goto-start")
+@move_command("goto-start")
 @click.argument("branch_folder", type=click.Path(path_type=Path))
 @click.option("--name", default="path", show_default=True, help="Name of the plan.")
 @click.option("--speed", default=0.03, show_default=True,
@@ -72,7 +72,7 @@ def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, bran
     return _to(run, cell_file, cell, branch_folder, goal, "goto-start", armed, confirm)
 
 
-@_move_command("retreat")
+@move_command("retreat")
 def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
     """Go back along the way that was followed last, while the force falls; else open the gripper.
 
@@ -92,7 +92,7 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
         raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
                          "known.", "It has followed none from this account, or the cell has "
                          "changed since.", "Free the branch: limber robot release.")
-    sample, pose = _stands(cell)
+    sample, pose = stands(cell)
     back = WayBack(cell.arm.joint_names, way).from_here(
         _with_pose(sample, pose), cell.limits.acceleration_m_s2)
     result = {"way_began": datetime.fromtimestamp(way.at, UTC).isoformat(timespec="seconds"),
@@ -106,7 +106,7 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
         link.wait_for_samples()
         told = retreat_if_chosen(cell, link, "retreat", run.progress)
     result |= told
-    _log(cell_file, "retreat", result)
+    log_move(cell_file, "retreat", result)
     force = told["force_n"]
     if not (told["retreated"] or told["gripper_opened"]) or (
             force is not None and force > cell.limits.soft_force_n):
@@ -115,7 +115,7 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     return result
 
 
-@_move_command("release")
+@move_command("release")
 def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
     """Open the gripper, and back away from the branch the way the gripper came to it."""
     from limber.robot.cell.cell import read_cell
@@ -124,7 +124,7 @@ def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     from limber.stages.paths.arm_moves import away_from_branch
 
     cell = read_cell(cell_file)
-    sample, pose = _stands(cell)
+    sample, pose = stands(cell)
     motion = away_from_branch(cell, sample.joints, pose)
     result = _told(motion) | {"armed": armed}
     if not armed:
@@ -136,7 +136,7 @@ def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
         return _followed(run, cell_file, "release", link, motion, result)
 
 
-@_move_command("open")
+@move_command("open")
 def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
     """Open the gripper where the arm stands; the arm does not move.
 
@@ -162,7 +162,7 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
     kept = WayFile(cell)
     kept.gripped(False)
     kept.close()
-    _log(cell_file, "open", result)
+    log_move(cell_file, "open", result)
     return result
 
 
@@ -177,13 +177,13 @@ def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.nda
     from limber.store import Branch
     from limber.store.loading import load_skeleton
 
-    _require_empty(cell, run)
+    require_empty(cell, run)
     skeleton = None if folder is None else load_skeleton(Branch.read(folder))
     if skeleton is None:
         run.progress.warn("No branch was given, so the arm keeps away from the cell's obstacles "
                           "alone (--branch).")
     around = ArmSurroundings(cell, cell_obstacles(cell, cell_file.parent), skeleton)
-    sample, _ = _stands(cell)
+    sample, _ = stands(cell)
     motion = to_joints(cell, sample.joints, goal, around)
     assert motion.joints is not None
     result = _told(motion) | {"armed": armed, "clearance_m": float(
@@ -209,7 +209,7 @@ def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Tra
         link.stop()
         raise
     result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason")}
-    _log(cell_file, word, result)
+    log_move(cell_file, word, result)
     if not result["reached"]:
         raise SafetyStop(f"The robot was stopped: {event['reason']}.", "The arm holds where it "
                          "stopped.", "Check what it met, then `limber robot retreat`.",
@@ -217,7 +217,7 @@ def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Tra
     return result
 
 
-def _stands(cell: Cell) -> tuple[Sample, np.ndarray]:
+def stands(cell: Cell) -> tuple[Sample, np.ndarray]:
     """Where the arm stands: a sample, and the pose of the gripper's middle [6]."""
     from limber.robot.cell.base_calibration import gripper_pose
     from limber.robot.observed import observe
@@ -232,7 +232,7 @@ def _with_pose(sample: Sample, pose: np.ndarray) -> Sample:
     return replace(sample, pose=pose)
 
 
-def _require_empty(cell: Cell, run: Run) -> None:
+def require_empty(cell: Cell, run: Run) -> None:
     """Refuse a way of the arm alone while the gripper holds the branch, as far as that is known."""
     from limber.core.errors import SafetyStop
     from limber.robot.motion.way_file import read_way
@@ -253,7 +253,7 @@ def _told(motion: Trajectory) -> dict[str, Any]:
             "greatest_speed_m_s": float(motion.greatest_speeds[0])}
 
 
-def _log(cell_file: Path, word: str, result: dict[str, Any]) -> None:
+def log_move(cell_file: Path, word: str, result: dict[str, Any]) -> None:
     """Add a line to the log of this user's robots."""
     import json
 

@@ -1,0 +1,114 @@
+"""A force sensor tested by the weight of the gripper: sign, unit, axes and stated mass.
+
+The gripper is tilted a little about two axes. What its weight changes by is known from the stated
+mass; a sensor of another sign, unit or other axes shows another change.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.core.errors import InputError
+
+GRAVITY = 9.81
+_LEAST_TILT = 0.03  # of the direction of gravity: sine of an angle
+_MOST_TILT = 0.5  # rad
+_CHANGE_N = 2.0  # of the weight; the guard stops at limits.unexpected_force_n, 3 N by default
+_SECOND_TILT = 0.4  # of the first, about the second axis
+_ALIKE = 0.8  # cosine of the angle between what changed and what should
+_UNITS = {0.1019: "kilograms-force", 0.2248: "pounds-force", 0.001: "kilonewtons",
+          1000.0: "millinewtons"}
+_NEAR = 0.15  # relative
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """What a sensor made of a tilted gripper.
+
+    Attributes:
+        mass: That explains the changes [kg], as the sensor has it.
+        sigma: Its standard error [kg].
+        faults: What is wrong with the sensor or the stated mass, in words.
+    """
+
+    mass: float
+    sigma: float
+    faults: tuple[str, ...]
+
+
+def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
+    """Return joint angles [6, n] from ``joints`` [n] and back, tilted by the two middle wrists.
+
+    So little that the weight of ``mass`` [kg] changes by no more than the guard lets pass.
+    """
+    tilt = min(_MOST_TILT, float(np.arcsin(min(1.0, _CHANGE_N / max(GRAVITY * mass, 1e-9)))))
+    offs = np.zeros((6, len(joints)))
+    offs[[1, 2], 3] = tilt, -tilt
+    offs[[3, 4], 4] = tilt, -tilt
+    return joints + offs
+
+
+def require_tilts(downs: np.ndarray, stated: float) -> np.ndarray:
+    """Return the axes [3, 3] along which directions of gravity [n, 3] differ, most first.
+
+    Raises:
+        InputError: too few, about one axis alone, or no mass [kg] is stated.
+    """
+    if not stated > 0.0:
+        raise InputError("The cell file states no tool.mass_kg above 0.", "Without a weight there "
+                         "is nothing to compare the sensor with.", "State the gripper's mass.")
+    _, sizes, axes = np.linalg.svd(downs - downs[0], full_matrices=False)
+    if len(downs) < 6 or sizes[1] < max(_LEAST_TILT, _SECOND_TILT * sizes[0]):
+        raise InputError("The gripper is not tilted about two axes.", "A wrong axis of the sensor "
+                         "would not show.", "Turn the wrist so that its joints 4 and 5 tilt the "
+                         "gripper against the vertical.")
+    return axes
+
+
+def weigh(downs: np.ndarray, forces: np.ndarray, times: np.ndarray, stated: float) -> Weighing:
+    """Compare readings at some tilts with the weight of the stated mass.
+
+    Bias and a drift that is linear in time are fitted with them.
+
+    Args:
+        downs: Direction of gravity in the flange's axes at each tilt, shape [n, 3].
+        forces: Mean readings there, of the surroundings on the tool, flange axes [N], shape
+            [n, 3], not corrected for any payload.
+        times: When [s], shape [n].
+        stated: Mass in the cell file [kg].
+
+    Raises:
+        InputError: too few tilts, or about one axis alone; or no mass is stated.
+    """
+    axes = require_tilts(downs, stated)
+    away = downs - downs[0]
+    # Along gravity itself a bias and a weight look nearly alike: only the two tilts tell.
+    tilts = away @ axes[:2].T
+    columns = np.column_stack([away @ axes.T, np.ones(len(downs)), times - times.mean()])
+    found, *_ = np.linalg.lstsq(columns, forces, rcond=None)
+    left = forces - columns @ found
+    free = max(left.size - found.size, 1)
+    spread = float(np.sqrt((left**2).sum() / free))
+    changes, wanted = found[:2] / GRAVITY, axes[:2]
+    along = float((changes * wanted).sum() / 2)
+    size = float(np.sqrt((changes**2).sum() / 2))
+    sigma = spread / GRAVITY / np.sqrt((tilts**2).sum())
+    return Weighing(along, sigma, tuple(_faults(along, size, sigma, stated)))
+
+
+def _faults(along: float, size: float, sigma: float, stated: float) -> list[str]:
+    told = f"the sensor shows {along:.3f} kg for {stated:.3f} kg"
+    if size < 4 * sigma or size < 0.02 * stated:
+        return [f"the sensor does not notice the gripper's weight ({told})"]
+    if along < -_ALIKE * size:
+        return [f"the sensor's sign is wrong ({told})"]
+    if along < _ALIKE * size:
+        return ["the sensor's axes are wrong: the weight changes it in another direction. Check "
+                f"sensor.pose ({told})"]
+    factor = along / stated
+    for unit, name in _UNITS.items():
+        if abs(factor / unit - 1.0) < _NEAR:
+            return [f"the sensor's unit seems to be {name} ({told})"]
+    if abs(along - stated) > max(0.05, 0.1 * stated, 4 * sigma):
+        return [f"tool.mass_kg or the sensor's scale is wrong ({told})"]
+    return []
