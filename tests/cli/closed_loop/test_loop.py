@@ -118,7 +118,7 @@ class Beside:
 
 
 def told(branch, place, speed=0.0, flower=0.0):
-    return {"branch": branch, "pose": [place, 0, 0, 0, 0, 0], "tool_speed": [speed] + [0] * 5,
+    return {"branch": branch, "flange": [place, 0, 0], "tool_speed": [speed] + [0] * 5,
             "points": [[0, 0, 0], [flower, 0, 0.4]], "extrapolation_error_n": 0.1 * flower}
 
 

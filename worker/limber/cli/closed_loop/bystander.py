@@ -73,8 +73,8 @@ class Watch:
         still = [state for state in held if _speed(state) < STILL_M_S]
         if not still:
             return None
-        places = np.array([state["pose"][:3] for state in still])
-        away = np.linalg.norm(places - held[0]["pose"][:3], axis=1)
+        places = np.array([state["flange"] for state in still])
+        away = np.linalg.norm(places - held[0]["flange"], axis=1)
         there = np.linalg.norm(places - places[away.argmax()], axis=1) < _AT_END_M
         return np.mean([state["points"] for state, is_there in zip(still, there, strict=True)
                         if is_there], axis=0)
@@ -84,7 +84,8 @@ class Watch:
         while not self._ended.wait(_EVERY_SECONDS):
             state = self.robot.state
             self.states.append(state)
-            place = np.array(state["pose"][:3])
+            # The flange's: the tool that poses are of is set for a motion, and put back.
+            place = np.array(state["flange"])
             if state["branch"] != "held":
                 start = None
                 continue
@@ -100,7 +101,7 @@ class Watch:
         while not self._ended.wait(_CLOSELY_SECONDS):
             state = self.robot.state
             if _speed(state) < STILL_M_S:
-                way = np.subtract(state["pose"][:3], before["pose"][:3])
+                way = np.subtract(state["flange"], before["flange"])
                 self.overloaded = Overload(time.monotonic() - began, float(np.linalg.norm(way)))
                 return
 

@@ -195,6 +195,7 @@ def state_of(server: Server) -> dict[str, Any]:
     controller = server.controller
     return {"clock": controller.clock, "joints": controller.joints.tolist(),
             "speeds": controller.speeds.tolist(), "pose": controller.pose.tolist(),
+            "flange": controller.flange[:3, 3].tolist(),
             "tool_speed": controller.tool_speed.tolist(), "safety": controller.safety_mode.name,
             "mode": controller.robot_mode.name, "program": controller.runtime_state.name,
             "remote": controller.remote, "slider": controller.slider,
