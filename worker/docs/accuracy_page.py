@@ -37,8 +37,8 @@ CHAPTERS = {
     "robot": ("The robot", (
         "The real client library against the controller in software. No real robot was used.")),
     "worker": ("What a newcomer meets", (
-        "`limber demo` on its generated branch, set-up aside: how long it takes on two shared "
-        "cores, and what it finds.")),
+        "`limber demo` on its generated branch, set-up aside: how long it takes, and what it "
+        "finds. Where other work runs beside it, the clock says more than the processor time.")),
 }
 """What each bench is about, in the page's order."""
 
