@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.files.reading import read_json
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
+from limber.core.settings import Groups, Settings, possible_force
 from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from limber.mechanics.loads.outdoor import Bent
     from limber.mechanics.model import BranchModel
 
+_FASTEST_WIND = 150.0  # m/s; more than tornadoes have
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
 
@@ -71,6 +74,20 @@ class LoadSettings(Settings):
     name: str | None = Field(
         None, pattern=r"^[\w-]+$", max_length=60, description="Keep the result in the branch "
         "folder under this name, for report and scene.")
+
+    @field_validator("wind")
+    @classmethod
+    def _possible_wind(cls, given: _Place | None) -> _Place | None:
+        if given is not None and (speed := math.hypot(*given)) > _FASTEST_WIND:
+            raise ValueError(f"no wind has {speed:g} m/s; {speed / 3.6:g} m/s would be {speed:g} "
+                             "km/h")
+        return given
+
+    @field_validator("fruit")
+    @classmethod
+    def _possible_fruit(cls, given: tuple[_Fruit, ...]) -> tuple[_Fruit, ...]:
+        possible_force(tuple(fruit[3] * STANDARD_GRAVITY for fruit in given))
+        return given
 
 
 def load(folder: Path, settings: LoadSettings, *, force: bool = False,
