@@ -12,7 +12,7 @@ from limber.geometry.skeleton.joining.plants import plants_apart
 _ODD = 1.9  # price of a bridge over its length, from which those around it are tried without
 _AROUND = 2.0  # lengths of such a bridge
 _CLEARLY = 0.98  # of what all bridges cost, under which others are better
-_MOST_WAYS = 300_000_000  # between ends and nodes, that all trials go through: some seconds
+_MOST_WAYS = 150_000_000  # between ends and nodes, that all trials go through: some seconds
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
