@@ -153,6 +153,7 @@ def test_results_become_tables_and_pictures(example, key, columns):
     import matplotlib.pyplot as plt
 
     result, before = example.results[key], plt.get_backend()
+    plt.close("all")
     table = result.table()
     assert len(table) == columns and len({len(column) for column in table.values()}) == 1
     assert all(column.ndim == 1 and column.dtype == float for column in table.values())

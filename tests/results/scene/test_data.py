@@ -122,18 +122,19 @@ def test_paths_are_called_as_in_the_report(tmp_path, mesh):
     plan = _plan({}, [[0.0, 0.0, 0.3], [0.1, 0.0, 0.3]])
     summary = json.loads(plan["plans/p.json"]) | {"length_added_percent": 0.0}
     plan |= {"plans/p-baseline.csv": plan["plans/p.csv"]}
-    wood = {"name": None, "breaking_strain": 0.006, "is_assumed": True, "paths_over": ["baseline"]}
+    strength = {"median_strain": 0.006, "source": "green wood, assumed"}
     for saved, note in ((3.0, "energy -3 %, length +0 % against the shortest path"),
                         (0.0, "no shorter path was found")):
-        told = json.dumps(summary | {"energy_saved_percent": saved, "wood": wood} | {
-            key: {"length_m": 0.1, "peak_strain": 0.007} for key in ("plan", "baseline")})
+        told = json.dumps(summary | {"energy_saved_percent": saved, "strength": strength} | {
+            key: {"length_m": 0.1, "peak_strain": strain}
+            for key, strain in (("plan", 0.005), ("baseline", 0.007))})
         info = scene_data(_branch(tmp_path / str(saved), mesh,
                                   plan__p=plan | {"plans/p.json": told})).info
         assert {key: about["title"] for key, about in info["paths"].items()} == {
             "plan": "gentle", "baseline": "shortest"}
         assert note in info["notes"]
-        assert "strain, shortest: over the 0.6 % at which green wood breaks (assumed)" in (
-            info["notes"])
+        assert ("strain, shortest: over the 0.6 % at which half of such branches break (green "
+                "wood, assumed)") in info["notes"]
 
 
 def test_search_trees(tmp_path, mesh):

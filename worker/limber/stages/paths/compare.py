@@ -20,7 +20,7 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from limber.planning.experiments.compared_planners import ComparedTrial
 
@@ -141,8 +141,18 @@ def _spread(row: dict[str, Any], key: str, form: str) -> str:
     return f"{mean:{form}}" if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
 
 
+def _saving(values: Mapping[str, Any]) -> str | None:
+    """Say what each planner saves against RRT*."""
+    from limber.planning.experiments.compared_planners import BASELINE, COMPARED
+
+    return "Energy saved against RRT*: " + ", ".join(
+        f"{COMPARED[path]} {row['saved_percent']:.1f} %"
+        for path, row in values["planners"].items() if path != BASELINE) + "."
+
+
 STAGE = StageDescription(
     "compare", 105, by_name(compare, folder="branch_folder"), CompareInputs, CompareSettings,
     ParallelOptions, key="compare:{name}", reads=("energy.npz",),
-    writes=("comparisons/{name}.csv", "comparisons/{name}.png"), tables=_tables, step="plan",
-    label="Compare Planners")
+    writes=("comparisons/{name}.csv", "comparisons/{name}.png"), tables=_tables,
+    found=("{planned_count} of {trial_count} random starts were planned.", _saving),
+    then="limber report {branch_folder}", step="plan", label="Compare Planners")
