@@ -141,11 +141,11 @@ class Run:
                                 for row in batch["samples"]] for batch in self._batches])
 
     def follow(self, order: dict[str, Any], *, seconds: float = 20.0, after: float = 0.3,
-               at_pause: Callable[[], None] | None = None) -> dict[str, Any]:
+               at_pause: Callable[[], str] | None = None) -> dict[str, Any]:
         """Tare, follow, and run on ``after`` [s] of the robot's time; returns how it ended.
 
         Args:
-            at_pause: Called at a pause, which is resumed then; else a pause ends it.
+            at_pause: Called at a pause; returns the order that follows. Else a pause ends it.
         """
         ends = ("reached", "stopped", "refused") + (() if at_pause else ("paused",))
         begin = self.control.controller.clock
@@ -158,11 +158,11 @@ class Run:
             if "tared" in kinds and not state["followed"]:
                 state["followed"] = True
                 self.orders.put(order)
-            if at_pause and "paused" in kinds and "resumed" not in kinds:
+            if at_pause and "paused" in kinds and "chosen" not in state:
                 state["paused_at"] = state.get("paused_at") or sample.clock
                 if sample.clock - state["paused_at"] > after:
-                    at_pause()
-                    self.orders.put({"order": "resume"})
+                    state["chosen"] = at_pause()
+                    self.orders.put({"order": state["chosen"]})
             if state["ended_at"] is None and any(kind in ends for kind in kinds):
                 state["ended_at"] = sample.clock
             over = sample.clock - begin > seconds

@@ -79,10 +79,19 @@ def test_after_a_pause_it_goes_on_from_where_it_braked(monkeypatch):
     run, wall, order = facing_a_wall(monkeypatch, 0.05, 2e4, predicted=False)
     stood = []
 
-    def take_away() -> None:
+    def take_away() -> str:
         wall.stiffness = 0.0
         stood.append(run.control.controller.pose[:3].copy())
+        return "resume"
     assert run.follow(order, at_pause=take_away)["event"] == "reached"
     places = run.rows[:, 1:4]
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.05 * 0.002 * 1.5
     assert np.linalg.norm(places[-1] - stood[0]) > 0.02
+
+
+def test_from_a_pause_at_something_stiff_it_goes_back_until_no_force_is_left(monkeypatch):
+    run, wall, order = facing_a_wall(monkeypatch, 0.05, 2e4, predicted=False)
+    event = run.follow(order, at_pause=lambda: "retreat")
+    assert event["event"] == "reached", event
+    assert wall.peak > CELL.limits.soft_force_n and wall.now == 0.0
+    assert run.control.controller.pose[:3] == pytest.approx(order["poses"][0, :3], abs=1e-3)
