@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 from limber.core.errors import InputError, MissingDependencyError
+from limber.geometry.io import cylinder_models
 from limber.geometry.io.cylinder_models import (
     TREEQSM_FIELDS,
     mat_v73_fields,
@@ -107,3 +109,15 @@ def test_what_is_wrong_is_said(tmp_path, monkeypatch):
                         lambda name, *more: None if name == "h5py" else found(name, *more))
     with pytest.raises(MissingDependencyError, match=r"-v7 avoids this\).*limber\[matlab\]"):
         read_treeqsm(tmp_path / "whole.mat")
+
+
+def test_an_older_version_is_read_in_a_process_of_its_own(tmp_path, monkeypatch):
+    """scipy's compiled reader crashed on a damaged file, and Limber with it."""
+    asked = []
+    monkeypatch.setattr(cylinder_models, "read_apart",
+                        lambda reader, path: asked.append(reader) or {})
+    path = tmp_path / "old.mat"
+    scipy.io.savemat(path, {"a": 1.0})
+    with pytest.raises(InputError, match="no struct with the fields"):
+        read_treeqsm(path)
+    assert asked == [cylinder_models.mat_fields]

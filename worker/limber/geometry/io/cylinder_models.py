@@ -75,7 +75,7 @@ def _fields(path: Path) -> dict[str, Any]:
                       f"The MAT file {path} of version 7.3 (saving it in Matlab with -v7 avoids "
                       "this)")
         return read_apart(mat_v73_fields, path)
-    return _older_fields(path)
+    return read_apart(mat_fields, path)
 
 
 def mat_v73_fields(path: Path) -> dict[str, np.ndarray]:
@@ -83,22 +83,24 @@ def mat_v73_fields(path: Path) -> dict[str, np.ndarray]:
     return struct_arrays(path, TREEQSM_FIELDS, (_THICK,))
 
 
-def _older_fields(path: Path) -> dict[str, Any]:
+def mat_fields(path: Path) -> dict[str, np.ndarray]:
+    """Return the fields of the cylinders and ``creator`` of a MAT file of an older version.
+
+    Empty without cylinders. scipy's compiled reader can crash on a damaged file.
+    """
     from scipy.io import loadmat
 
-    try:
-        content = loadmat(path, squeeze_me=True, struct_as_record=False)
-    except MemoryError:
-        raise
-    except Exception as error:  # scipy's reader raises whatever its parser raises
-        raise InputError(f"{path} cannot be read as a MAT file ({error}).",
-                         "A TreeQSM model was expected.", "Save it again.") from error
+    content = loadmat(path, squeeze_me=True, struct_as_record=False)
     cylinder = _cylinder_struct(content)
     if cylinder is None:
         return {}
     creator = getattr(getattr(content.get("QSM"), "rundata", None), "creator", "")
-    return {name: getattr(cylinder, name) for name in (*TREEQSM_FIELDS, _THICK)
-            if hasattr(cylinder, name)} | {"creator": creator}
+    fields = {name: np.asarray(getattr(cylinder, name)) for name in (*TREEQSM_FIELDS, _THICK)
+              if hasattr(cylinder, name)}
+    for name, values in fields.items():
+        if values.dtype.kind == "O":
+            raise ValueError(f"{name} has values that are no numbers")
+    return fields | {"creator": np.asarray(str(creator))}
 
 
 def _thick_ends(found: dict[str, Any], radius: np.ndarray) -> np.ndarray:
