@@ -9,7 +9,6 @@ from limber.planning.certificate.lower_bound import COST
 from limber.planning.constraints.full_model_check import field_error
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.field.local_error import LocalError
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.goal_kinds import asked_kinds
 from limber.planning.path_on_full_model import ResolvedPath
@@ -17,7 +16,6 @@ from limber.planning.planners.trees import chosen_engine
 from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import PathPair
 
-_PLACES = 2000  # at which the field's error is asked for
 _CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
 _STILL = 1e-9  # [m] a path that is no longer has no length
 _WIDE_GAP = 5.0  # percent, above which a warning says so
@@ -59,37 +57,26 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
 def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMeasures,
                    ) -> dict[str, Any]:
     """Return what the bound says of every branch whose energy is nowhere farther below the field's
-    than its error at the place, which 95 % of the samples kept, each left out in turn; and how far
-    above that the plan is.
+    than 95 % of the samples were, each left out in turn, and how far above that the plan is.
 
-    With c = w E + l and E less an error e, but not below 0, c is nowhere less than the least of
-    (w max(E - e, 0) + l) / c of what it was, and so is the bound. That least is taken over places
-    where a gentle path may run. An integral of energy over at most a length is less by at most the
-    error times that. Of a goal for a target nothing is said: where the target is the field does
-    not know well enough.
+    With c = w E + l and E less an error e, but not below 0, c is nowhere less than l / (l + w e) of
+    what it was, and so is the bound; an integral of energy over at most a length is less by at most
+    e times that. Of a goal for a target it says nothing: where the target is the field does not
+    know well enough.
     """
     weights, detour = pair.cost.weights, pair.detour
-    points = field.region.draw(_PLACES, np.random.default_rng(0))
-    points = np.concatenate([points, pair.plan.points])
-    energies = field.energy(points)
-    near = energies <= 1.5 * max(found.peak_energy_j, 1e-12)
-    inner = ~field.region.is_face()
-    chart = field.region.chart.plain
-    error = LocalError.of(chart.map(field.samples.positions)[inner], field.missed[inner, 0], 0.95)
-    errors, energies = error.at(chart.map(points[near])), energies[near]
-    most = float(errors.max(initial=0.0))
+    cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
+    missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])
+    error = float(np.quantile(missed, 0.95)) if len(missed) else float(
+        np.abs(field.missed[:, 0]).max())
     cost = found.energy_integral_jm if detour else (
         weights.energy * found.energy_integral_jm + weights.length * found.length_m)
-    if not np.isfinite(most) or goal.uncertainty(field) > 0.0:
-        return {"field_error_j": most if np.isfinite(most) else None, "lower_bound": None,
+    if not np.isfinite(error) or goal.uncertainty(field) > 0.0:
+        return {"field_error_j": error if np.isfinite(error) else None, "lower_bound": None,
                 "cost": cost, "gap_percent": None}
-    if detour:
-        lower = pair.certificate.lower - most * detour.longest
-    else:
-        left = weights.energy * np.maximum(energies - errors, 0.0) + weights.length
-        share = left / (weights.energy * energies + weights.length)
-        lower = pair.certificate.lower * float(share.min(initial=1.0))
-    return {"field_error_j": most, "lower_bound": max(lower, 0.0), "cost": cost,
+    lower = pair.certificate.lower - error * detour.longest if detour else (
+        pair.certificate.lower * weights.length / (weights.length + weights.energy * error))
+    return {"field_error_j": error, "lower_bound": max(lower, 0.0), "cost": cost,
             "gap_percent": 100.0 * (cost / lower - 1.0) if lower > 0.0 else None}
 
 
