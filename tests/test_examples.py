@@ -32,7 +32,8 @@ def run(*command: object, **environment: str) -> str:
 
 def test_all_are_run_here():
     assert {path.name for path in SCRIPTS.iterdir()} == {
-        "estimate.sh", "render.sh", "bend.py", "night.toml", "scan_to_plan.ipynb", "pull"}
+        "estimate.sh", "render.sh", "bend.py", "night.toml", "scan_to_plan.ipynb", "pull",
+        "ros2"}
 
 
 @pytest.mark.slow

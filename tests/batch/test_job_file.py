@@ -102,7 +102,7 @@ def test_a_sweep_is_every_combination(write):
     (SCANS + "prune = [1, 2]", 6, "should be a valid number"),
     (SCANS + 'density = "8 mm"', 6, "It must be in kg/m^3"),
     (SCANS + 'prune = "8 mm"', 6, "This value has no unit"),
-    (SCANS + 'unit = "yd"', 6, "should be 'm', 'cm', 'mm' or 'in'"),
+    (SCANS + 'unit = "yd"', 6, "should be 'm', 'cm', 'mm', 'in' or 'um'"),
     (SCANS + 'output = "x"', 6, "The batch sets"),
     (SCANS + '[[job.stage]]\nrun = "reconstuct"', 7, "Did you mean reconstruct?"),
     (SCANS + '[[job.stage]]\nrun = ["mesh"]', 7, "this stage does not exist"),

@@ -27,11 +27,11 @@ class Board:
     """A printed board or tag.
 
     Attributes:
-        kind: What is printed.
-        squares: Of a ChArUco board, along x and y.
+        kind: Kind of print.
+        squares: Number of squares of the ChArUco board along x and y.
         square_m: Edge length of its squares, or of the tag [m].
         marker_m: Edge length of its markers [m].
-        dictionary: Of the markers, as OpenCV names it.
+        dictionary: Marker dictionary by its OpenCV name.
     """
 
     kind: Literal["charuco", "apriltag"]
@@ -46,10 +46,10 @@ class View:
     """A board in one picture.
 
     Attributes:
-        name: Of the picture.
-        corners: On the board [m], its frame, shape [k, 3].
-        pixels: Where the picture has them, shape [k, 2].
-        pose: Of the board in the camera's frame by this picture alone [m, rad], shape [6].
+        name: Name of the picture.
+        corners: Corners on the board [m], its frame, shape [k, 3].
+        pixels: Their positions in the picture, shape [k, 2].
+        pose: Pose of the board in the camera's frame from this picture alone [m, rad], shape [6].
     """
 
     name: str
@@ -59,7 +59,7 @@ class View:
 
 
 def find_board(path: Path, board: Board, camera: CameraEntry) -> View | None:
-    """Return the board in a picture; None where it is not seen, or too little of it.
+    """Return the board in a picture; None if too little of it is seen.
 
     Raises:
         InputError: the picture cannot be read, or has another size than the camera's.
@@ -79,7 +79,7 @@ def find_board(path: Path, board: Board, camera: CameraEntry) -> View | None:
     corners, pixels = _corners(cv2, picture, board)
     if len(corners) < _FEWEST_CORNERS:
         return None
-    found, turn, place = cv2.solvePnP(corners, pixels, _matrix(camera), None)
+    found, turn, place = cv2.solvePnP(corners, pixels, _matrix(camera), np.zeros(5))
     if not found:
         return None
     return View(path.name, corners, pixels, np.r_[place.ravel(), turn.ravel()])
@@ -122,7 +122,7 @@ def fit_pictures(robot: np.ndarray, views: list[View], camera: CameraEntry, came
 
     Args:
         robot: Poses of the gripper's middle [m, rad], shape [n, 6].
-        views: One for each.
+        views: One per pose.
         camera_on: What carries the camera.
 
     Returns:
@@ -153,7 +153,7 @@ def fit_pictures(robot: np.ndarray, views: list[View], camera: CameraEntry, came
 
 def _pixels_off(values: np.ndarray, moves: np.ndarray, views: list[View], lens: np.ndarray,
                 ) -> np.ndarray:
-    """Distances of all corners from where they should be seen [px], flat."""
+    """Distances of all corners from their expected positions [px], flat."""
     seen = inverted(matrices(values[:6])) @ moves @ matrices(values[6:])
     parts = []
     for frame, view in zip(seen, views, strict=True):
