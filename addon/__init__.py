@@ -1,12 +1,12 @@
 """The Blender extension Limber: shows branches and starts the worker that computes them.
 
-Nothing is computed here. ``bridge`` is the one door between arrays and Blender's data, each file
-of ``operators`` one action, each file of ``panels`` one step of the work.
+The add-on computes nothing. ``bridge`` is the only interface between arrays and Blender's data,
+each file of ``operators`` one action, each file of ``panels`` one step of the work.
 """
 
 import importlib
 
-# In the order of registration: what a class refers to comes before it.
+# In the order of registration: a class comes after those that it refers to.
 MODULES = (
     "preferences",
     "properties",
@@ -53,7 +53,7 @@ _registered = []
 
 
 def register() -> None:
-    """Register every module; if one fails, those before it are taken back."""
+    """Register every module; if one fails, those before it are unregistered."""
     try:
         for name in MODULES:
             module = importlib.import_module(f".{name}", __package__)
@@ -65,6 +65,6 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take back what :func:`register` did, in reverse order."""
+    """Unregister everything that :func:`register` registered, in reverse order."""
     while _registered:
         _registered.pop().unregister()

@@ -1,5 +1,5 @@
-"""Draws additional data of a branch: rods with values, the half ball of grasps, and the points that
-were measured in a pull.
+"""Draws additional data of a branch: rods with values, the hemisphere of grasps, and points
+measured in a pull.
 
 All but the measured points are hidden at first. The panel's "Show" makes each of them visible.
 """
@@ -14,9 +14,9 @@ from .scene_data import SceneData
 
 _HALF_BALL = (0.35, 0.45, 0.55)
 MEASURED = (0.0, 0.376, 0.509)
-"""Linear colour of what was measured."""
+"""Linear colour of measured data."""
 _SHARE = 0.011
-"""Radius of a measured point in sizes of the branch."""
+"""Radius of a measured point as a fraction of the branch's size."""
 
 
 def add_rods(shown: ShownBranch, data: SceneData) -> None:
@@ -33,7 +33,7 @@ def add_rods(shown: ShownBranch, data: SceneData) -> None:
 
 
 def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
-    """Add the half ball in which the grasp may be taken, as lines."""
+    """Add the hemisphere of possible grasps, as lines."""
     about = data.info.get("hemisphere")
     if not about:
         return
@@ -46,8 +46,9 @@ def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
 
 
 def add_measured(shown: ShownBranch, data: SceneData, speed: float) -> None:
-    """Add the points that were observed in the shown pull, at their positions in each frame; hidden
-    in frames in which they were not observed."""
+    """Add the points observed in the shown pull, at their positions in each frame; hidden in frames
+    without an observation.
+    """
     if "observation_motion" not in data.arrays:
         return
     ball = meshes.new_sphere("Measured", 1.0)

@@ -19,7 +19,7 @@ MANIFEST = "branch.json"
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What a branch folder records about a stage that has run."""
+    """A branch folder's record of a stage that has run."""
 
     settings: dict[str, Any]
     reads: dict[str, str]
@@ -29,7 +29,7 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class BranchRecord:
-    """What a branch folder contains: stages by key, the sha256 of its scan, and its own identity.
+    """A branch folder's contents: stages by key, the sha256 of its scan, and its own identity.
 
     ``files`` has, by name, each file's sha256 and the key of the stage that wrote it.
     """
@@ -41,10 +41,10 @@ class BranchRecord:
     uuid: str = ""
 
     def of(self, stage: Stage, values: Mapping[str, Any]) -> StageRecord | None:
-        """Return what is known of a stage that would be run with these values."""
+        """Return the record of a stage if it were run with these values."""
         key = stage.key.format_map({"name": values.get("name", "")}) if stage.key else ""
         record = self.stages.get(key)
-        # Two stages may make the same thing (a pull): the settings tell which one did.
+        # Two stages may make the same file (a pull): the settings show which one did.
         return record if record and set(record.settings) <= set(stage.fields) else None
 
     def has(self, patterns: Iterable[str]) -> bool:
@@ -53,7 +53,7 @@ class BranchRecord:
         return all(any(name.startswith(start) for name in self.files) for start in starts)
 
     def names(self, pattern: str) -> list[str]:
-        """Return the names of what the folder has, sorted.
+        """Return the names of the folder's entries, sorted.
 
         Args:
             pattern: A file with ``{name}`` in it, such as ``plans/{name}.csv``; or, ending with a
@@ -76,7 +76,7 @@ class BranchRecord:
             if name in record.reads:
                 if record.reads[name] != digest:
                     return True
-            # It read a part of the file: then the time has to tell.
+            # It read a part of the file: then the time has to decide.
             elif (made := self.stages.get(maker)) and made is not record and (
                     made.finished > record.finished):
                 return True
@@ -91,7 +91,7 @@ def read_record(folder: Path) -> BranchRecord | None:
     except OSError:
         return None
     if not stat.S_ISREG(about.st_mode):
-        # Blender would wait for whoever writes to a pipe.
+        # Blender would wait for the writer of a pipe.
         return None
     return _read(path, about.st_mtime_ns, about.st_size)
 

@@ -18,24 +18,24 @@ NAME_KEY = "limber_name"
 INFO_KEY = "limber_info"
 ENERGY_KEY = "limber_energy_j"
 GRASP_KEY = "limber_grasp_m"
-"""Of the marked grasp: its place on the branch as it was scanned, and its radius."""
+"""Key of the marked grasp: its position on the branch as scanned, and its radius."""
 UUID_KEY = "limber_uuid"
-"""Of a branch's collection: which branch it is, wherever its folder is and whatever its name."""
+"""Key of a branch's collection: its identity, regardless of its folder and name."""
 SHOWS_KEY = "limber_shows"
-"""Of each object of a branch: what it shows, a key of :attr:`ShownBranch.objects`."""
+"""Key of each object of a branch: what it shows, a key of :attr:`ShownBranch.objects`."""
 SCALE_KEY = "limber_scale"
-"""Of a coloured object beside the branch: its scale, as JSON."""
+"""Key of a coloured object beside the branch: its scale, as JSON."""
 VIEW_KEY = "limber_view"
-"""Of a surface: the direction in which the worker would look at the branch."""
+"""Key of a surface: the direction from which the worker would view the branch."""
 FRAME_SCALAR_KEY = "limber_frame_scalar"
-"""Of a surface: which value its colours show in each frame; missing where none."""
+"""Key of a surface: the value that its colours show in each frame; missing if none."""
 OFFSET_KEY = "limber_map_offset"
 """The branch's origin in the scan's coordinates, in double precision: a viewport has single."""
 
 
 @dataclass
 class ShownBranch:
-    """What :func:`show_branch` made: the objects by what they show."""
+    """Result of :func:`show_branch`: the objects by what they show."""
 
     collection: bpy.types.Collection
     surface: bpy.types.Object
@@ -50,7 +50,7 @@ def branches(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
 
 
 def branch_of(thing: bpy.types.Object) -> bpy.types.Collection | None:
-    """Return the collection of the branch that an object, or what carries it, belongs to."""
+    """Return the collection of the branch to which an object, or its parent, belongs."""
     while thing is not None:
         for collection in bpy.data.collections:
             if FOLDER_KEY in collection and collection.all_objects.get(thing.name) == thing:
@@ -60,7 +60,7 @@ def branch_of(thing: bpy.types.Object) -> bpy.types.Collection | None:
 
 
 def surface_of(branch: bpy.types.Collection) -> bpy.types.Object | None:
-    """Return the surface of a branch; None where the user has removed it."""
+    """Return the surface of a branch; None if the user has removed it."""
     return next((thing for thing in branch.objects if INFO_KEY in thing), None)
 
 
@@ -71,20 +71,20 @@ def info_of(surface: bpy.types.Object) -> dict[str, Any]:
 
 @lru_cache(maxsize=8)
 def _parsed(text: str) -> dict[str, Any]:
-    """Read once: panels and frames ask again and again."""
+    """Read once: panels and frames ask repeatedly."""
     return json.loads(text)
 
 
 def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the surface of the current branch; None where that branch is not shown."""
+    """Return the surface of the current branch; None if that branch is not shown."""
     branch, _ = _current(scene)
     return None if branch is None else surface_of(branch)
 
 
 def current_folder(scene: bpy.types.Scene) -> Path | None:
-    """Return the folder of the current branch, absolute; None where the scene has none.
+    """Return the folder of the current branch, absolute; None if the scene has none.
 
-    Whatever works on a branch asks here, or :func:`find_surface`, which one. It is that of the
+    Every function for a branch asks here, or :func:`find_surface`, which one. It is that of the
     active object: a part of a branch, or a scan. Else it is the one last used, which may not be
     shown yet; else the one opened last.
     """
@@ -93,13 +93,13 @@ def current_folder(scene: bpy.types.Scene) -> Path | None:
 
 
 def current_uuid(scene: bpy.types.Scene) -> str:
-    """Return which branch is the current one, as it was opened; nothing where it is not shown."""
+    """Return the identity of the current branch when it was opened; empty if it is not shown."""
     branch, _ = _current(scene)
     return "" if branch is None else branch.get(UUID_KEY, "")
 
 
 def current_name(scene: bpy.types.Scene) -> str:
-    """Return what the user reads of the current branch: its collection, or its folder; or nothing.
+    """Return the current branch's displayed name: that of its collection or folder; or empty.
     """
     branch, path = _current(scene)
     return Path(bpy.path.abspath(path)).stem if branch is None and path else (
@@ -107,12 +107,12 @@ def current_name(scene: bpy.types.Scene) -> str:
 
 
 def shown_from(scene: bpy.types.Scene, folder: Path) -> bpy.types.Collection | None:
-    """Return the branch that is shown from a folder, with its surface; None without."""
+    """Return the branch shown from a folder, with its surface; None without."""
     return _shown_from(scene, str(folder))
 
 
 def shown_with(scene: bpy.types.Scene, uuid: str) -> list[bpy.types.Collection]:
-    """Return the shown branches with a UUID: several where a folder was copied."""
+    """Return the shown branches with a UUID: several if a folder was copied."""
     return [branch for branch in branches(scene) if branch.get(UUID_KEY) == uuid]
 
 
@@ -122,9 +122,9 @@ def current_path(scene: bpy.types.Scene) -> str:
 
 
 def use_folder(scene: bpy.types.Scene, path: str) -> None:
-    """Make ``path`` the folder of the current branch; none where it is empty.
+    """Make ``path`` the folder of the current branch; none if it is empty.
 
-    The branch of that folder becomes active. Where it is not shown, no other branch stays active.
+    The branch of that folder becomes active. If it is not shown, no other branch stays active.
     """
     scene[FOLDER_KEY] = path
     branch = _shown_from(scene, path)
@@ -135,13 +135,13 @@ def use_folder(scene: bpy.types.Scene, path: str) -> None:
 
 
 def choose(scene: bpy.types.Scene, branch: bpy.types.Collection) -> None:
-    """Make a branch that is shown the current one."""
+    """Make a shown branch the current one."""
     use_folder(scene, branch[FOLDER_KEY])
     activate(scene, surface_of(branch))
 
 
 def activate(scene: bpy.types.Scene, thing: bpy.types.Object | None) -> None:
-    """Make ``thing`` the active object, and the only one selected; in Object Mode."""
+    """Make ``thing`` the active object and the only selected one; in Object Mode."""
     layer = layer_of(scene)
     before = layer.objects.active
     if thing == before:
@@ -150,29 +150,29 @@ def activate(scene: bpy.types.Scene, thing: bpy.types.Object | None) -> None:
         bpy.ops.object.mode_set(mode="OBJECT")
     for other in layer.objects:
         other.select_set(other == thing)
-    # In a collection that is left out of the view layer it cannot be active.
+    # In a collection excluded from the view layer it cannot be active.
     layer.objects.active = thing if thing is None or thing.name in layer.objects else None
 
 
 def remember(scene: bpy.types.Scene) -> None:
-    """Keep the folder of the active object: it stays the current one when a lamp is chosen."""
+    """Keep the folder of the active object: it stays the current one when a lamp is selected."""
     path = _path_of_active(scene)
     if path and scene.get(FOLDER_KEY) != path:
         scene[FOLDER_KEY] = path
 
 
 def _current(scene: bpy.types.Scene) -> tuple[bpy.types.Collection | None, str]:
-    """Return the collection of the current branch, None where it is not shown, and its folder."""
+    """Return the collection of the current branch, None if it is not shown, and its folder."""
     path = _path_of_active(scene) or scene.get(FOLDER_KEY)
     if path is not None:
         return _shown_from(scene, path), path
-    # No branch was used here yet: a file that `limber scene` made, or appended branches.
+    # No branch was used here yet: a file made by `limber scene`, or appended branches.
     branch = next((one for one in reversed(branches(scene)) if surface_of(one) is not None), None)
     return branch, "" if branch is None else branch[FOLDER_KEY]
 
 
 def _path_of_active(scene: bpy.types.Scene) -> str:
-    """Return the branch folder that the active object stands for, or nothing."""
+    """Return the branch folder of the active object, or an empty text."""
     active = layer_of(scene).objects.active
     if active is None:
         return ""
@@ -202,7 +202,7 @@ def layer_of(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
 def in_branch(scene: bpy.types.Scene, place: Vector) -> Vector:
     """Return a position of the world in the frame of the current branch [m].
 
-    They differ where branches stand side by side; without a branch they are one.
+    They differ if branches are side by side; without a branch they are the same.
     """
     surface = find_surface(scene)
     return Vector(place) if surface is None else surface.matrix_world.inverted() @ Vector(place)
@@ -214,7 +214,7 @@ def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 
 def skeleton_from(scene: bpy.types.Scene, folder: Path) -> bpy.types.Object | None:
-    """Return the skeleton of the branch that is shown from a folder, whichever is current."""
+    """Return the skeleton of the branch shown from a folder, whichever branch is current."""
     return _skeleton_in(shown_from(scene, folder))
 
 

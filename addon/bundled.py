@@ -1,10 +1,10 @@
-"""Runs the worker that Blender's own Python has, mostly by the extension's wheels.
+"""Runs the worker of Blender's own Python, mostly from the extension's wheels.
 
     python bundled.py FOLDER ARGUMENTS...
 
-FOLDER is where it is: where Blender has unpacked the wheels. What the worker starts finds them too.
-Where Blender's numpy may be too old for them, they bring another one, in a folder that Blender
-itself does not search.
+FOLDER is where Blender has unpacked the wheels. The worker's child processes find them too. If
+Blender's numpy may be too old for them, they bring another one, in a folder that Blender itself
+does not search.
 """
 
 import json
@@ -13,7 +13,7 @@ import sys
 
 
 def not_loaded(error: ImportError) -> int:
-    """Say that the worker does not load, as it says what fails; return the exit code."""
+    """Report that the worker does not load, in its own format; return the exit code."""
     python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
     told = (f"Limber's worker does not load ({error}). Its wheels are incomplete, or are for "
             f"another Blender. Install the extension's zip for this system and {python} again.")

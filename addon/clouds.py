@@ -13,16 +13,16 @@ _PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int":
               "float64": "f8"}
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _FARTHEST = 1e15
-"""No coordinate lies beyond, whatever its unit; the worker's."""
+"""Greatest coordinate in any unit; the same as the worker's."""
 _LINES = 20_000
-"""Lines of text that are read at a stretch: numpy holds the interpreter meanwhile."""
+"""Lines of text that are read at once: numpy holds the interpreter meanwhile."""
 
 
 def read_points(path: Path) -> tuple[np.ndarray, str | None]:
     """Return the points of a PLY or text file in its own unit, shape [n, 3], and that unit if the
     file states it.
 
-    Points that are not finite are left out, as the worker does.
+    Points that are not finite are omitted, as in the worker.
 
     Raises:
         ValueError: the file is not readable as points; states what to do.
@@ -61,7 +61,7 @@ def _read_text(path: Path) -> tuple[np.ndarray, str | None]:
 
 
 def _rows(lines, **how) -> np.ndarray:
-    """Return numbers of lines of text, a part at a time, shape [n, columns]."""
+    """Return the numbers in lines of text, in batches, shape [n, columns]."""
     parts = []
     lines = iter(lines)
     while part := list(itertools.islice(lines, _LINES)):
@@ -90,7 +90,7 @@ def _read_ply(path: Path) -> tuple[np.ndarray, str | None]:
 
 
 def _binary_rows(path: Path) -> np.ndarray | None:
-    """Return the vertices of a binary PLY file as a table; None of one in ASCII."""
+    """Return the vertices of a binary PLY file as a table; None for an ASCII file."""
     with open(path, "rb") as stream:
         order, count, columns = _read_ply_header(stream)
         if order == "=":

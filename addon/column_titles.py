@@ -1,6 +1,6 @@
-"""Titles of columns: names without their units, units of length, and what three columns mean.
+"""Titles of columns: names without units, units of length, and the roles of three columns.
 
-Nothing of Limber: ``addon/column_titles.py`` is a copy, so that worker and add-on read alike.
+Does not import Limber: ``addon/column_titles.py`` is a copy, so that worker and add-on read alike.
 ``scripts/make_addon_schema`` makes the copy; a test compares the two.
 """
 
@@ -14,9 +14,9 @@ LENGTHS = {**{unit: unit for unit in ("m", "cm", "mm", "um", "in")},
            **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
            **dict.fromkeys(("micron", "microns", "micrometer", "micrometers", "micrometre",
                             "micrometres"), "um"), **dict.fromkeys(("inch", "inches"), "in")}
-"""Units of length, by what files call them in small letters."""
+"""Units of length by their names in files, in lower case."""
 OTHER_LENGTHS = ("ft", "feet", "foot", "usft", "yd", "km", "dm", "nm", "px", "pixel", "voxel")
-"""Units of lengths that are not read, but told from other words in brackets."""
+"""Units of length that are not supported but are recognised in brackets."""
 _FORMS = ("{}", "{}coordinate", "{}coord", "coordinate{}", "coord{}", "{}koordinate",
           "koordinate{}", "{}pos", "{}position", "pos{}", "position{}", "p{}", "point{}",
           "points{}", "scan{}", "world{}", "local{}")
@@ -36,24 +36,24 @@ ROLES = {
               *(tuple(form.format(name) for name in "rgb")
                 for form in ("{}", "color{}", "col{}", "{}f")),
               ("rot", "grun", "blau"), ("rot", "gruen", "blau"), ("rgb0", "rgb1", "rgb2"))}
-"""What three columns of one meaning are called, in :func:`plain` letters; the first that are
-there count."""
+"""Names of three columns with one role, in :func:`plain` letters; the first names found are used.
+"""
 _STATED = re.compile(r"\b(?:units?|einheit(?:en)?)\b\W{0,3}(?:(?:are|is|in|sind|ist)\b\W{1,2})?"
                      r"([^\W\d_]+)", re.IGNORECASE)
 
 
 def plain(name: str) -> str:
-    """Return the small letters and digits of a name, without accents."""
+    """Return the letters and digits of a name in lower case, without accents."""
     letters = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
     return re.sub(r"[^a-z0-9]", "", letters)
 
 
 def split_title(title: str, units: Iterable[str]) -> tuple[str, str | None]:
-    """Take the unit off a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``.
+    """Split the unit from a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``.
 
     Args:
-        title: Of a column.
-        units: Those that need no brackets at the end, in small letters.
+        title: Title of a column.
+        units: Units that need no brackets at the end, in lower case.
     """
     text = title.strip().replace("\u00b5", "u").replace("\u03bc", "u")
     bracket = re.search(r"[(\[]\s*([^)\]]*?)\s*[)\]]", text)
@@ -70,7 +70,7 @@ def split_title(title: str, units: Iterable[str]) -> tuple[str, str | None]:
 
 
 def three_of(role: str, names: Sequence[str]) -> tuple[int, int, int] | None:
-    """Return which columns have a role of :data:`ROLES`; None if not all three are there."""
+    """Return which columns have a role of :data:`ROLES`; None unless all three are there."""
     for spelt in ([name.lower().lstrip("/#").strip() for name in names],
                   [plain(name) for name in names]):
         for one, two, three in ROLES[role]:
@@ -80,6 +80,6 @@ def three_of(role: str, names: Sequence[str]) -> tuple[int, int, int] | None:
 
 
 def stated_unit(text: str) -> str | None:
-    """Return the unit of length that a comment or a preamble states, if any."""
+    """Return the unit of length stated by a comment or a preamble, if any."""
     return next((LENGTHS[word.lower()] for word in _STATED.findall(text)
                  if word.lower() in LENGTHS), None)

@@ -13,7 +13,7 @@ _handles = []
 
 
 def run_command(arguments: list[str]) -> int:
-    """Run ``limber ARGUMENTS`` on the worker's Python; its output and exit code are ours."""
+    """Run ``limber ARGUMENTS`` on the worker's Python and pass on its output and exit code."""
     try:
         command = [*preferences.worker_command(), *arguments]
     except WorkerNotFound as error:
@@ -35,7 +35,7 @@ def _exit_code(process: subprocess.Popen) -> int:
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            # Ctrl-C reaches the worker too; it ends by itself, in good order.
+            # Ctrl-C reaches the worker too; it ends in good order without help.
             continue
         return code if code >= 0 else 128 - code
 

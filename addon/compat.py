@@ -1,4 +1,4 @@
-"""What differs between Blender 4.2 and 5.2, and between builds, in one place."""
+"""Differences between Blender 4.2 and 5.2, and between builds, in one module."""
 
 import ctypes
 import os
@@ -6,23 +6,25 @@ import os
 import bpy
 
 IS_MODULE = bool(getattr(bpy.app, "module", not bpy.app.binary_path))
-"""Whether this is the ``bpy`` package in a plain Python, not Blender's program; 4.2 tells it only
-by having no program."""
+"""Whether this is the ``bpy`` package in a plain Python, not Blender's program. In 4.2 only the
+missing program shows it.
+"""
 
 PATH_OPTIONS: set[str] = (
     {"PATH_SUPPORTS_BLEND_RELATIVE"}
     if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties else set())
-"""Options of a property that holds a path: it may begin with ``//``, and Blender keeps it right."""
+"""Options of a property that holds a path: it may begin with ``//``, and Blender keeps it correct.
+"""
 
 POINT_SHADER = "POINT_UNIFORM_COLOR" if bpy.app.version >= (4, 5, 0) else "UNIFORM_COLOR"
-"""Built-in shader of points that have a size in pixels."""
+"""Built-in shader of points with a size in pixels."""
 
 COLOURED_POINT_SHADER = "POINT_FLAT_COLOR" if bpy.app.version >= (4, 5, 0) else "FLAT_COLOR"
-"""The same with a colour each; where it is there the other draws points of one pixel."""
+"""The same with a colour per point; if it exists the other draws points of one pixel."""
 
 
 def can_denoise() -> bool:
-    """Whether Cycles has OpenImageDenoise; Debian's build has not, and renders nothing with it."""
+    """Whether Cycles has OpenImageDenoise; Debian's build does not, and cannot render with it."""
     try:
         import _cycles
     except ImportError:
@@ -49,13 +51,14 @@ def fcurves_of(thing: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def flush_native_output() -> None:
-    """Write out what Blender's C code has printed so far, lest it come after later output."""
+    """Flush the output of Blender's C code, so that it does not follow later output."""
     if os.name == "posix":
         ctypes.CDLL(None).fflush(None)
 
 
 def placeholder(text: str) -> dict[str, str]:
-    """Return the argument of ``UILayout.prop`` that shows a text while a field is empty; none where
-    a Blender does not have it."""
+    """Return the argument of ``UILayout.prop`` that shows a text while a field is empty; none if
+    this Blender does not have it.
+    """
     known = bpy.types.UILayout.bl_rna.functions["prop"].parameters
     return {"placeholder": text} if "placeholder" in known else {}

@@ -12,7 +12,7 @@ from .frame_values import FrameValues
 from .scene_data import SceneData
 
 _NOW = "now"
-"""Attribute of the values of the frame in sight, and of its colours with ``_color``."""
+"""Attribute of the values of the visible frame, and of its colours with ``_color``."""
 _kept: dict[Path, FrameValues | None] = {}
 
 
@@ -55,7 +55,7 @@ def show(surface: bpy.types.Object, name: str, frame: float) -> None:
 
 
 def shown_scale(surface: bpy.types.Object) -> dict | None:
-    """Return the scale of the value that changes with the frames, None where none is shown."""
+    """Return the scale of the value that changes with the frames, None if none is shown."""
     name = surface.get(FRAME_SCALAR_KEY)
     return None if name is None else (info_of(surface).get("frame_scalars") or {}).get(name)
 
@@ -64,7 +64,7 @@ def _write(surface: bpy.types.Object, frame: float) -> None:
     """Write values and colours of the frame of the cache that is nearest to ``frame``."""
     name, values = surface[FRAME_SCALAR_KEY], _values_of(surface)
     if values is None or name not in changing(surface):
-        # The folder is gone, or has another motion: what was shown last stays.
+        # The folder no longer exists, or has another motion: the last colours stay.
         return
     last = len(values.scalars[name]) - 1
     number = min(max(round(animation.cache_frame(surface, frame)), 0), last)
@@ -94,7 +94,7 @@ def _frame_changed(current: bpy.types.Scene, *_) -> None:
 
 @persistent
 def _forget(*_) -> None:
-    """Another file may have another folder at the same place, or what was kept has changed."""
+    """Another file may have another folder at the same path, or the cache has changed."""
     _kept.clear()
 
 

@@ -1,7 +1,7 @@
 """The values that colour a branch in each frame of its motion, kept in its folder. No bpy.
 
 A .blend keeps the values of only one frame. Those of all frames are in ``.viewport/MOTION.npz`` of
-the branch folder, so that a file that was closed and moved still plays in colours.
+the branch folder, so that a closed and moved file still plays in colours.
 """
 
 import errno
@@ -28,8 +28,8 @@ class FrameValues:
     """Values of a motion's frames by name.
 
     Attributes:
-        scalars: In their real unit, each [frames, v].
-        levels: Which colour of its palette each has, bytes, each [frames, v].
+        scalars: Values in their real unit, each [frames, v].
+        levels: Index into the palette of each, bytes, each [frames, v].
         palettes: Linear colours, each [256, 4].
     """
 
@@ -42,7 +42,7 @@ class FrameValues:
         return self.palettes[palette][self.levels[name][frame]]
 
     def names(self, frame_count: int, vertex_count: int) -> set[str]:
-        """Return what there is of a motion of this size."""
+        """Return the available values of a motion of this size."""
         size = (frame_count, vertex_count)
         return {name for name, values in self.scalars.items()
                 if values.shape == size and self.levels.get(name, values[:0]).shape == size}
@@ -62,16 +62,16 @@ def path_of(folder: Path, motion: str) -> Path:
 
 
 def _frames_sha256(folder: Path, motion: str) -> str:
-    """Return the checksum of the motion itself, which may be made anew; nothing without one."""
+    """Return the checksum of the motion itself, which may be made again; empty without one."""
     path = folder / "frames" / f"{motion}.pc2"
     return branch_folder.file_sha256(path) if path.is_file() else ""
 
 
 def keep(folder: Path, motion: str, values: FrameValues) -> None:
-    """Write the values of a motion into the branch folder; OSError where that cannot be."""
+    """Write the values of a motion into the branch folder; OSError if that is impossible."""
     path = path_of(folder, motion)
     if path.name != f"{motion}.npz" or path.parent.is_symlink():
-        # The folder, and the name in it, may come from anybody.
+        # The folder, and the name in it, are not trusted.
         raise OSError(errno.EPERM, "a name or link in it points outside the branch folder")
     path.parent.mkdir(exist_ok=True)
     arrays = {f"{kind}:{name}": array for kind, named in (
@@ -89,7 +89,7 @@ def keep(folder: Path, motion: str, values: FrameValues) -> None:
 
 
 def read(folder: Path, motion: str) -> FrameValues | None:
-    """Return what was kept of a motion; None where there is nothing whole, or of other frames."""
+    """Return the cached values of a motion; None if they are incomplete, or of other frames."""
     try:
         with np.load(path_of(folder, motion), allow_pickle=False) as content:
             about = json.loads(str(content["about"]))

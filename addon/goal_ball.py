@@ -1,4 +1,4 @@
-"""The goal's ball in the view: wherever it is moved to by hand, there is the plan's goal."""
+"""The goal's ball in the view: moving it by hand moves the plan's goal."""
 
 import bpy
 from bpy.app.handlers import persistent
@@ -10,11 +10,11 @@ from .bridge import materials, meshes
 from .properties import OPEN
 
 _PLACE_KEY = "limber_goal_m"
-"""Where the ball was when the plan's goal was last set [m]."""
+"""Position of the ball when the plan's goal was last set [m]."""
 _FIELD_KEY = "limber_goal_field"
 COLOUR = (0.02, 0.42, 0.08)
 _FIELDS = {"grasp": "goal", "tip": "tip_goal", "target": "tip_goal"}
-"""The field of the plan that a kind of goal is given by."""
+"""Field of the plan for each kind of goal."""
 _OTHERS = ("goal", "tip_goal", "target_box", "goal_seed")
 """A plan takes one of these."""
 
@@ -44,7 +44,7 @@ def place_of(thing: bpy.types.Object) -> Vector | None:
 
 
 def follow(scene: bpy.types.Scene) -> None:
-    """Set the plan's goal to where the current branch's ball was moved to, if it was."""
+    """Set the plan's goal to the new position of the current branch's ball, if it was moved."""
     surface = branches.find_surface(scene)
     ball = None if surface is None else of(branches.branch_of(surface))
     if ball is None or list(ball[_PLACE_KEY]) == list(ball.location):

@@ -22,13 +22,14 @@ _SILENT_SECONDS = 20.0
 Starting takes a few seconds."""
 _IDLE_SECONDS = 30.0
 _LEAST_CPU_SECONDS = 0.05
-"""Of work within a beat; a sign of life itself takes some thousandths."""
+"""Least CPU time that counts as work within a beat; a sign of life itself takes some thousandths.
+"""
 _KNOWN_SHARE, _KNOWN_SECONDS = 0.03, 3.0
-"""How much must be done before the rest can be foretold."""
+"""Least progress and time before the remaining time can be predicted."""
 
 
 def _what_to_do(code: int) -> str:
-    """Return why a worker that told no reason of its own may have ended, and what to do."""
+    """Return possible causes of a worker's end without a reason of its own, and what to do."""
     if code < 0:
         return ("It was killed, by a person or because memory ran out. Earlier results are "
                 "unchanged. Run it again.")
@@ -37,7 +38,7 @@ def _what_to_do(code: int) -> str:
 
 
 class JobState(enum.Enum):
-    """Where a job is."""
+    """State of a job."""
 
     WAITING = "waiting"
     RUNNING = "running"
@@ -55,16 +56,16 @@ class Life(enum.Enum):
 
 
 class Job:
-    """One command of the worker in a process of its own, once it is its turn.
+    """One command of the worker in its own process, once it is its turn.
 
     Attributes:
-        title: What the user reads.
-        folder: The branch folder that it works in or makes, if it is about one.
+        title: Title that the user reads.
+        folder: The branch folder in which it works or that it makes, if any.
         fraction: Fraction done, 0 to 1.
         message: The current work of the worker.
         numbers: Further progress values, by name.
         result: Its last JSON object, once it has ended.
-        error: Why it failed, for the user; empty otherwise.
+        error: Reason of its failure, for the user; empty otherwise.
         log: The last lines of its standard error.
     """
 
@@ -86,7 +87,7 @@ class Job:
         self._process: WorkerProcess | None = None
 
     def launch(self) -> None:
-        """Start the process; OSError where the program cannot be started."""
+        """Start the process; OSError if the program cannot be started."""
         self._process = WorkerProcess(self.command, LIMBER_PARENT_PIPE="stdin")
         self.state, self.message = JobState.RUNNING, "starting"
         self._started_at = self._heard_at = self._worked_at = time.monotonic()
@@ -109,7 +110,7 @@ class Job:
         code = self._process.poll()
         if code is not None:
             for reader in self._readers:
-                # A grandchild may keep the pipe open; what matters was said by then.
+                # A grandchild may keep the pipe open; the relevant lines have been read by then.
                 reader.join(timeout=2.0)
         self._take_lines()
         if code is not None:
@@ -126,7 +127,7 @@ class Job:
         return self.state
 
     def life(self) -> tuple[Life, float]:
-        """Return whether the worker works, and for how long it has not [s]."""
+        """Return whether the worker works, and the time since its last work [s]."""
         now = time.monotonic()
         if now - self._heard_at > _SILENT_SECONDS:
             return Life.SILENT, now - self._heard_at
@@ -135,11 +136,11 @@ class Job:
         return Life.WORKING, 0.0
 
     def elapsed(self) -> float:
-        """Return for how long it has run [s]."""
+        """Return its running time [s]."""
         return time.monotonic() - self._started_at
 
     def remaining(self) -> float | None:
-        """Return how long it will take if it goes on like this [s]; None while that is not known.
+        """Return the remaining time at this rate [s]; None while it is unknown.
         """
         elapsed = self.elapsed()
         if self.fraction < _KNOWN_SHARE or elapsed < _KNOWN_SECONDS:
@@ -147,7 +148,8 @@ class Job:
         return elapsed * (1.0 - self.fraction) / self.fraction
 
     def cancel(self) -> None:
-        """Ask the worker to stop; it keeps what was there before. Killed if it does not."""
+        """Ask the worker to stop; it keeps the previous results. It is killed if it does not stop.
+        """
         if self.state is JobState.WAITING:
             self._give_up("")
         elif self.state is JobState.RUNNING and self._cancelled_at is None:
@@ -168,13 +170,13 @@ class Job:
                 self._process.wait(5.0)
 
     def _give_up(self, why: str) -> None:
-        """It will not run any more."""
+        """It will not run."""
         self.state, self.message = JobState.CANCELLED, why
         if self in _waiting:
             _waiting.remove(self)
 
     def _read(self, name: str, stream) -> None:
-        # Closed at its end, whoever else has had it open.
+        # Closed at its end, whichever process still has it open.
         with stream:
             for line in stream:
                 self._lines.put((name, line.rstrip("\n")))
@@ -214,7 +216,7 @@ class Job:
             self.error = self.result.get("error") or " ".join(
                 [f"The worker ended with exit code {code}.", *said, _what_to_do(code)])
         if self.state is not JobState.DONE and self.folder:
-            # What was to go on from there has nothing to go on from.
+            # Jobs that were to continue from there have no input.
             for job in [job for job in _waiting if job.folder == self.folder]:
                 job._give_up(f"not run because {self.title} failed before it")
 
@@ -227,7 +229,7 @@ def _json_object(line: str) -> dict[str, Any] | None:
     try:
         content = json.loads(line)
     except (ValueError, RecursionError):
-        # Native libraries print lines of their own among ours.
+        # Native libraries print lines of their own among the worker's.
         return None
     return content if isinstance(content, dict) else None
 
@@ -251,7 +253,7 @@ def is_running() -> bool:
 
 
 def works_in(folder: str) -> bool:
-    """Whether a job that runs or waits is about a branch folder."""
+    """Whether a running or waiting job belongs to a branch folder."""
     jobs = _waiting + [job for job in _last if job.state is JobState.RUNNING]
     return bool(folder) and any(job.folder == folder for job in jobs)
 
@@ -272,10 +274,10 @@ def start(title: str, command: list[str], folder: str = "") -> Job:
 
 
 def add(title: str, command: list[str], folder: str = "", *, is_next: bool = False) -> Job:
-    """Start ``command``, or queue it: it starts when it is its turn and is polled.
+    """Start ``command``, or queue it: it starts in its turn and is polled.
 
     Args:
-        is_next: Before all that wait.
+        is_next: Put it before all waiting jobs.
 
     Raises:
         OSError: the program cannot be started.
@@ -288,7 +290,7 @@ def add(title: str, command: list[str], folder: str = "", *, is_next: bool = Fal
 
 
 def _advance() -> None:
-    """Start the first of those that wait, where nothing runs."""
+    """Start the first of the waiting jobs if none is running."""
     if is_running() or not _waiting:
         return
     job = _waiting.pop(0)
@@ -300,7 +302,7 @@ def _advance() -> None:
 
 
 def forget() -> None:
-    """End the current job, if any, and forget it: the add-on goes away or Blender closes."""
+    """End the current job, if any, and forget it: the add-on is removed or Blender closes."""
     for job in (*_waiting, *_last):
         job.stop_now()
     _waiting.clear()

@@ -1,4 +1,4 @@
-"""Keeps which branch was used last: it stays the current one when another object is chosen."""
+"""Keeps the last used branch: it stays the current one when another object is selected."""
 
 import bpy
 from bpy.app.handlers import persistent

@@ -1,7 +1,7 @@
-"""The legend of a picture: text and colour keys that stand still before the camera.
+"""The legend of a picture: text and colour keys fixed before the camera.
 
-It has a margin of its own: lines are broken where it ends, and what is too long for the picture's
-height is made smaller as a whole.
+It has a margin of its own. Lines are broken at its end, and a legend too long for the picture's
+height is scaled down as a whole.
 """
 
 import textwrap
@@ -23,20 +23,20 @@ _LINE = 0.044
 _BAR_WIDTH = 0.032
 _BAR_HEIGHT = 0.26
 _BROKEN = 1.3
-"""Distance of the lines of a broken text in heights of the text."""
+"""Line distance of a broken text in heights of the text."""
 _LETTER = 0.41
 """Mean width of a letter in heights of the text."""
 
 
 class _Sheet:
-    """A plane before the camera on which things are laid from the top left corner down."""
+    """A plane before the camera on which objects are laid out from the top left corner down."""
 
     def __init__(self, scene: bpy.types.Scene, camera: bpy.types.Object):
         self.collection = bpy.data.collections.new("Legend")
         scene.collection.children.link(self.collection)
         self.camera = camera
         frame = camera.data.view_frame(scene=scene)
-        # Just behind the near plane, so that nothing of the scene gets before it.
+        # Just behind the near plane, so that no object of the scene is in front of it.
         depth = 2.0 * camera.data.clip_start
         corners = [corner * (depth / -corner.z) for corner in frame]
         left = min(corner.x for corner in corners)
@@ -58,8 +58,9 @@ class _Sheet:
 
     def text(self, words: str, *, size: float = _TEXT, x: float = 0.0, y: float | None = None,
              ) -> None:
-        """Write ``words`` with their upper edge at ``y``, or at the current line; more lines than
-        one push the current line down."""
+        """Write ``words`` with their upper edge at ``y``, or at the current line. Further lines
+        push the current line down.
+        """
         top = self.y if y is None else y
         letters = max(8, int((self.width - self.x - x) / (_LETTER * size)))
         for number, line in enumerate(textwrap.wrap(words, letters)):
@@ -73,14 +74,14 @@ class _Sheet:
                 self.y += _BROKEN * size
 
     def fit(self) -> None:
-        """Make everything smaller, where it would not end within the picture."""
+        """Scale everything down if it would not end within the picture."""
         share = min(1.0, (1.0 - 1.5 * _MARGIN) / self.y)
         for thing in self.collection.objects:
             thing.location = self.corner + (thing.location - self.corner) * share
             thing.scale = (share, share, share)
 
     def ground(self) -> None:
-        """Lay paper behind all of it: what reaches into the margin ends there."""
+        """Put a background behind all of it, with the margin as its edge."""
         behind = 1.1
         mesh = meshes.new_rectangle("Legend ground", behind * self.width * self.unit,
                                     behind * self.unit)
@@ -91,7 +92,7 @@ class _Sheet:
         _hide_from_light(thing)
 
     def swatch(self, color: tuple[float, float, float], width: float, height: float) -> None:
-        """Lay a bar of one colour on the current line."""
+        """Put a bar of one colour on the current line."""
         mesh = meshes.new_rectangle("Legend key", width * self.unit, height * self.unit)
         material = materials.flat_material("Legend key", color)
         self.put("Legend key", mesh, material, self.x + (0.05 - width) / 2,
@@ -99,14 +100,14 @@ class _Sheet:
 
 
 def _hide_from_light(thing: bpy.types.Object) -> None:
-    """Let a thing be seen by the camera alone, without shadow or reflection."""
+    """Make an object visible to the camera alone, without shadow or reflection."""
     for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(thing, f"visible_{ray}", False)
 
 
 def add_legend(scene: bpy.types.Scene, camera: bpy.types.Object, data: SceneData,
                shown: ShownBranch) -> bpy.types.Collection:
-    """Write what the picture shows, with units, left of the branch; returns the collection."""
+    """Write the picture's contents, with units, left of the branch; returns the collection."""
     sheet = _Sheet(scene, camera)
     sheet.text(data.info["name"].replace("_", " "), size=_TITLE)
     sheet.y += 1.6 * _TITLE

@@ -1,6 +1,6 @@
-"""The force that a moving robot feels, read from the file that the worker writes meanwhile. No bpy.
+"""The force at a moving robot, read from a file that the worker writes meanwhile. No bpy.
 
-It is there also where the robot was armed at a terminal. Nothing is ordered from here.
+The file also exists if the robot was armed at a terminal. This module orders nothing.
 """
 
 import json
@@ -12,12 +12,12 @@ from pathlib import Path
 FILE = ".robot-live.json"
 FORMAT = 1
 _OLDEST_SECONDS = 3.0
-"""What is older was left behind by a worker that was killed."""
+"""Older files were left behind by a worker that was killed."""
 
 
 @dataclass(frozen=True)
 class LiveForce:
-    """What the gripper feels now [N]; ``force`` and ``expected`` are None where not known."""
+    """Force at the gripper now [N]; ``force`` and ``expected`` are None if unknown."""
 
     title: str
     step: str
@@ -28,7 +28,7 @@ class LiveForce:
 
     @property
     def share(self) -> float:
-        """Of the limit, at which the guard pauses the robot."""
+        """Force as a fraction of the limit at which the guard pauses the robot."""
         return (self.force or 0.0) / self.limit
 
 
@@ -37,7 +37,7 @@ def read(folder: Path, now: float | None = None) -> LiveForce | None:
     file is invalid."""
     path = folder / FILE
     if not path.is_file():
-        # There is none; or a pipe, which Blender would wait for.
+        # There is none; or a pipe, for which Blender would wait.
         return None
     try:
         told = json.loads(path.read_text(encoding="utf-8"))

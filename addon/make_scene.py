@@ -24,7 +24,7 @@ _PLAY_SECONDS = 4.0
 
 
 def _load_addon():
-    """Import the folder of this file as a package, whatever it is called there."""
+    """Import the folder of this file as a package, whatever its name there."""
     folder = Path(__file__).resolve().parent
     if "limber_addon" in sys.modules:
         return
@@ -36,9 +36,9 @@ def _load_addon():
 
 
 def _end_with_parent() -> None:
-    """End when whoever started this does: `limber` then closes our standard input.
+    """End when the parent does: `limber` then closes this process's standard input.
 
-    The core says so by LIMBER_PARENT_PIPE; see limber.core.processes.ending, which Blender's
+    The core requests it by LIMBER_PARENT_PIPE; see limber.core.processes.ending, which Blender's
     Python lacks.
     """
     if os.environ.pop("LIMBER_PARENT_PIPE", None) != "stdin":
@@ -47,7 +47,7 @@ def _end_with_parent() -> None:
     def watch() -> None:
         while os.read(0, 1024):
             continue
-        # Rendering hears no exception: the scene file is written whole or not at all.
+        # Rendering receives no exception: the scene file is written whole or not at all.
         os._exit(1)
 
     threading.Thread(target=watch, name="parent watch", daemon=True).start()
@@ -64,11 +64,11 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     """Build the scene of ``data_path``, save it and render its last frame; returns a summary.
 
     Args:
-        data_path: What the worker wrote.
+        data_path: File written by the worker.
         scene_path: The .blend to write.
         picture_path: The PNG to render, if any.
-        width: Of the picture [pixels].
-        color: What the colours mean: a scalar of the data, the first by default.
+        width: Width of the picture [pixels].
+        color: Meaning of the colours: a scalar of the data, the first by default.
         round_path: A folder for pictures from all sides, if any; ``sides`` of them.
     """
     _load_addon()
@@ -107,15 +107,15 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
 
 
 def _render_round(scene: bpy.types.Scene, folder: Path, sides: int) -> None:
-    """Render the branch as it is shown now from all sides; the file that was saved stays."""
+    """Render the branch in its present display from all sides; the saved file stays."""
     sharing = importlib.import_module("limber_addon.operators.sharing")
     sharing.register()
     bpy.ops.limber.turntable(frames=sides)
     pivot = bpy.data.objects[f"{sharing.RIG} pivot"]
-    # The branch stands still meanwhile: the camera turns by hand, not by the scene's frames.
+    # The branch is at rest meanwhile: the camera turns by hand, not by the scene's frames.
     pivot.animation_data_clear()
     for collection in bpy.data.collections:
-        # It stands before the other camera.
+        # It is in front of the other camera.
         collection.hide_render |= collection.name == "Legend"
     for number in range(sides):
         _say(progress=0.3 + 0.7 * number / sides, message="turntable")
@@ -125,7 +125,7 @@ def _render_round(scene: bpy.types.Scene, folder: Path, sides: int) -> None:
 
 
 def _look_through_camera() -> None:
-    """Let every 3D view of the file open on the branch, in its colours."""
+    """Set every 3D view of the file to the branch, in its colours."""
     layout = bpy.data.workspaces.get("Layout")
     if layout is not None:
         layout.name = "Limber"
@@ -139,7 +139,8 @@ def _look_through_camera() -> None:
 
 
 def _frame_rate(frames: dict | None) -> int:
-    """Return frames a second: a motion's own, up to 60; a path's so that it can be followed."""
+    """Return frames per second: a motion's own, up to 60; for a path a rate that can be followed.
+    """
     if not frames:
         return 24
     if frames["is_timed"]:
@@ -170,9 +171,9 @@ def main(arguments: list[str]) -> int:
 
 
 def _end(code: int) -> None:
-    """End the process, without the end of Blender where that is a package of this Python.
+    """End the process, without Blender's own exit if that is a package of this Python.
 
-    There it hangs (4.5) or crashes (4.2) on the way out, after all has been written.
+    There it hangs (4.5) or crashes (4.2) on exit, after everything has been written.
     """
     _load_addon()
     if importlib.import_module("limber_addon.compat").IS_MODULE:
@@ -188,7 +189,7 @@ if __name__ == "__main__":
     try:
         exit_code = main(sys.argv[sys.argv.index("--") + 1:])
     except Exception:
-        # Told here: left to Python it would lead to Blender's own end.
+        # Reported here: left to Python it would lead to Blender's own exit.
         traceback.print_exc()
         exit_code = 3
     _end(exit_code)

@@ -1,4 +1,4 @@
-"""What the worker says, in the words of the panels: it speaks of options and commands. No bpy."""
+"""The worker's texts in the words of the panels instead of options and commands. No bpy."""
 
 import re
 
@@ -7,7 +7,7 @@ from .stages import Field, Stage, stages
 _OPTION = re.compile(r"--(?P<name>[a-z][a-z0-9-]*)(?:[ =](?P<value>[^\s,;:()]+))?")
 _COMMAND = re.compile(r"`limber (?P<name>[a-z-]+)[^`]*`")
 _BUTTONS = {"doctor": "Check the Worker"}
-"""Of commands that are no stages."""
+"""Buttons of commands that are no stages."""
 _SENTENCE = re.compile(r"(?<=[.?!])\s+(?=[A-Z])")
 
 
@@ -15,8 +15,7 @@ def plain(text: str, stage: Stage | None = None) -> str:
     """Return a text with the titles of settings for options, and of buttons for commands.
 
     ``--plants largest`` becomes ``Plants: largest``, `` `limber energy` `` becomes ``Sample the
-    Energy``. What no panel has stays. Of an option that several stages have, it is that of
-    ``stage``.
+    Energy``. Options without a panel stay. An option that several stages have is that of ``stage``.
     """
     text = _COMMAND.sub(lambda match: _label(match["name"]) or match[0], text)
     return _OPTION.sub(lambda match: _setting(match, stage), text)
@@ -28,7 +27,7 @@ def first_sentence(text: str) -> str:
 
 
 def choice_title(stage: Stage, option: str, value: object) -> str:
-    """Return what the button of a choice says; nothing if the stage has no such setting."""
+    """Return the button's title of a choice; empty if the stage has no such setting."""
     field = stage.fields.get(option)
     if field is None:
         return ""

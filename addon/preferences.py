@@ -1,4 +1,4 @@
-"""The add-on's preferences: which Python has the worker."""
+"""The add-on's preferences: the Python that has the worker."""
 
 import json
 import textwrap
@@ -44,7 +44,7 @@ class LimberPreferences(bpy.types.AddonPreferences):
 
 
 def get(context: bpy.types.Context | None = None) -> LimberPreferences | None:
-    """Return the preferences; None where the add-on runs without being enabled (a script)."""
+    """Return the preferences; None if the add-on runs without being enabled (a script)."""
     addon = (context or bpy.context).preferences.addons.get(__package__)
     return addon.preferences if addon else None
 
@@ -57,7 +57,7 @@ def worker_command() -> list[str]:
 
 
 def has_worker() -> bool:
-    """Whether there is a worker, looked up every few seconds only: panels ask at every redraw."""
+    """Whether there is a worker, checked every few seconds only: panels ask at every redraw."""
     now = time.monotonic()
     if now - _looked.get("at", -_LOOK_AGAIN_SECONDS) >= _LOOK_AGAIN_SECONDS:
         _looked["at"] = now
@@ -78,7 +78,7 @@ def worker_trouble() -> str:
 
 
 def draw_parts(layout: bpy.types.UILayout, parts: str) -> None:
-    """Draw what the worker has and lacks: part, version, or what does not work without it.
+    """Draw the worker's parts: name, version, or what does not work without it.
 
     Args:
         parts: JSON; by name a version, or ``missing: `` and what then does not work.
@@ -88,7 +88,7 @@ def draw_parts(layout: bpy.types.UILayout, parts: str) -> None:
     except ValueError:
         return
     column = layout.column(align=True)
-    # What is missing first.
+    # Missing parts come first.
     for name, told in sorted(known.items(), key=lambda part: not _lacks(part[1])):
         row = column.split(factor=0.25)
         row.label(text=name, icon="ERROR" if _lacks(told) else "CHECKMARK")

@@ -1,4 +1,4 @@
-"""What the user chooses in the sidebar, kept in the scene: made from the stages' schema."""
+"""The user's choices in the sidebar, kept in the scene: made from the stages' schema."""
 
 import json
 from typing import Any
@@ -11,14 +11,14 @@ from .overlays import graph as viewport_graph
 from .stages import Field, SettingError, Stage, rows_of, stages
 
 OPEN = "use_"
-"""Before the name of a field that may be left open: whether it is given."""
+"""Prefix of the property that states whether an optional field is given."""
 _LARGEST_INTEGER = 2**31 - 1
 
 _registered: list[type] = []
 
 
 def _set_fruit_mass(settings: bpy.types.PropertyGroup, _context) -> None:
-    """Give every fruit that hangs the mass of the slider."""
+    """Set the mass of all hanging fruits to that of the slider."""
     field = stages()["load"].fields["fruit"]
     try:
         rows = rows_of(field, settings.load.fruit)
@@ -35,7 +35,7 @@ def _show_scan(settings: bpy.types.PropertyGroup, _context) -> None:
 
 
 def _color_again(settings: bpy.types.PropertyGroup, _context) -> None:
-    """Show what the branch is coloured by in the other way."""
+    """Switch the colours to the other mode."""
     surface = branches.find_surface(settings.id_data)
     if surface is None:
         return
@@ -55,7 +55,7 @@ def _choose_folder(settings: bpy.types.PropertyGroup, path: str) -> None:
 
 
 _NOT_SHOWN = "/"
-"""Instead of a collection's name: of a folder that is not shown."""
+"""Instead of a collection's name: for a folder that is not shown."""
 _branch_items: list[tuple[str, str, str, str, int]] = []
 """Blender keeps no copy of these texts."""
 
@@ -83,7 +83,7 @@ def _choose_branch(settings: bpy.types.PropertyGroup, number: int) -> None:
 
 
 class LimberSettings(bpy.types.PropertyGroup):
-    """Choices of one scene; the settings of each stage stand below its name."""
+    """Choices of one scene; the settings of each stage are under its name."""
 
     branch_folder: bpy.props.StringProperty(
         name="Branch Folder", subtype="DIR_PATH", options=compat.PATH_OPTIONS,
@@ -119,7 +119,7 @@ class LimberSettings(bpy.types.PropertyGroup):
 
 
 def attribute_name(stage: str) -> str:
-    """Return the name of a stage as Python has it."""
+    """Return the Python name of a stage."""
     return stage.replace("-", "_")
 
 
@@ -129,11 +129,11 @@ def group_of(scene: bpy.types.Scene, stage: Stage) -> bpy.types.PropertyGroup:
 
 
 def values_of(group: Any, stage: Stage, only: set[str] | None = None) -> dict[str, Any]:
-    """Return what is set for a stage, by field: None where it is left open.
+    """Return the settings of a stage by field: None if it is left open.
 
     Args:
-        group: Whatever has the properties of :func:`stage_properties`.
-        stage: Whose they are.
+        group: An object with the properties of :func:`stage_properties`.
+        stage: Stage of the settings.
         only: Names of the fields to return; all by default.
     """
     found: dict[str, Any] = {}
@@ -151,7 +151,7 @@ def values_of(group: Any, stage: Stage, only: set[str] | None = None) -> dict[st
 
 
 def take_over(group: bpy.types.PropertyGroup, stage: Stage, settings: dict[str, Any]) -> None:
-    """Set the settings of a stage to those with which a branch was made."""
+    """Set the settings of a stage to those that made a branch."""
     for name in stage.settings & settings.keys():
         field, value = stage.fields[name], settings[name]
         if field.is_optional and has_switch(field):
@@ -162,12 +162,12 @@ def take_over(group: bpy.types.PropertyGroup, stage: Stage, settings: dict[str, 
         try:
             setattr(group, name, field.shown(value))
         except (TypeError, ValueError):
-            # The branch is of a version that knew other choices: the default stays.
+            # The branch is from a version with other choices: the default stays.
             group.property_unset(name)
 
 
 def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
-    """Whether the stage would now run with other settings than ``settings``, as JSON has them."""
+    """Whether the stage would now run with settings other than ``settings``, as in JSON."""
     now = values_of(group, stage)
     for name in stage.settings & settings.keys():
         value, before = now[name], settings[name]
@@ -183,7 +183,7 @@ def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
 
 
 def has_switch(field: Field) -> bool:
-    """Whether a property of its own says if the field is given; an empty text says so itself."""
+    """Whether a separate property states if the field is given; an empty text needs none."""
     return field.kind not in ("string", "path")
 
 
@@ -201,11 +201,11 @@ def stage_properties(stage: Stage, options: set[str] = frozenset()) -> dict[str,
 
 _PATTERNS = {"plan": "plans/{name}.csv", "motion": "frames/{name}.pc2",
              "pull": "pulls/{name}/pull.toml", "target": "target:"}
-"""What a field of this name chooses from, as :meth:`BranchRecord.names` takes it."""
+"""Pattern of the files offered for a field of this name, as :meth:`BranchRecord.names` takes it."""
 
 
 def _pattern(stage: Stage, field: Field) -> str:
-    """Return what the folder offers for a field, or nothing: its name, where it reads such a file.
+    """Return the pattern of the files that the folder offers for a field; or empty.
     """
     if field.name == "name":
         read = next((each for each in stage.reads if "{name}" in each), "")
@@ -214,12 +214,12 @@ def _pattern(stage: Stage, field: Field) -> str:
 
 
 def _search(pattern: str) -> Any:
-    """Return the function that lists what the current branch has for a text field."""
+    """Return the function that lists the current branch's entries for a text field."""
     def found(settings: bpy.types.PropertyGroup, _context, typed: str) -> list[str]:
         folder = branches.current_folder(settings.id_data)
         record = None if folder is None else branch_folder.read_record(folder)
         names = [] if record is None else record.names(pattern)
-        # What is chosen already would hide all others.
+        # A text that is already a choice would hide all others.
         return names if typed in names else [name for name in names if typed in name]
     return found
 
@@ -260,7 +260,7 @@ def _limits(field: Field) -> dict[str, float]:
     limits = {}
     if field.least is not None:
         least = np.float32(field.least)
-        # The number above it: what is more than 0 may be as small as one likes.
+        # The next number above it: a value above 0 may be arbitrarily small.
         limits["min"] = float(np.nextafter(least, np.float32(np.inf)) if field.is_open else least)
     if field.most is not None:
         limits["max"] = float(np.float32(field.most))
@@ -274,10 +274,10 @@ def _digits(field: Field) -> int:
 
 
 def arguments_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> list[str]:
-    """Return the command line that runs a stage in a branch folder with what is set in ``scene``.
+    """Return the command line that runs a stage in a branch folder with the settings of ``scene``.
 
     Raises:
-        SettingError: what is required is missing, or a text is no list of what it should be.
+        SettingError: a required value is missing, or a text is not a list as required.
     """
     values = values_of(group_of(scene, stage), stage)
     for field in stage.fields.values():
@@ -287,7 +287,7 @@ def arguments_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> list[str]
 
 
 def outcome_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> dict[str, Any]:
-    """Return how the stage last ended for the branch in ``folder``: error, warnings, status."""
+    """Return the stage's last outcome for the branch in ``folder``: error, warnings, status."""
     try:
         outcome = json.loads(group_of(scene, stage).outcome or "{}")
     except ValueError:
@@ -297,9 +297,9 @@ def outcome_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> dict[str, A
 
 def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dict[str, Any],
                  ) -> None:
-    """Keep what the user shall still read when the message is gone.
+    """Keep the texts that the user must be able to read after the message has disappeared.
 
-    Where the branch folder keeps no result (of loads, of an export, of a dry run), that too.
+    If the branch folder keeps no result (of loads, of an export, of a dry run), keep that too.
     """
     common = ("status", "error", "warnings", "seconds", "arguments", "choices", "code", "place")
     kept = {name: outcome[name] for name in common if name in outcome}

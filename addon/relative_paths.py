@@ -1,9 +1,10 @@
 """Keeps branch folders and motions relative to the .blend, so that all can move together.
 
-A result opened before the first save has an absolute path: Blender cannot know better then. It is
-made relative when the file is saved. What is relative already, Blender itself keeps right in a
-modifier; of the settings and of what a collection shows, it does not know. So it is with what is
-appended from another file; Blender 4.2 does not tell of that, and *Find the Folder Again* has to.
+A result opened before the first save has an absolute path, since Blender cannot know better then.
+It is made relative when the file is saved. Blender itself keeps relative paths of a modifier
+correct, but does not know those of the settings and of a collection's branch. The same holds for
+data appended from another file. Blender 4.2 does not report that, and *Find the Folder Again* is
+needed.
 """
 
 from pathlib import Path
@@ -18,7 +19,7 @@ from .bridge import animation
 @persistent
 def _before_saving(path: str, *_) -> None:
     if not path:
-        # The startup file: it has no place of its own.
+        # The startup file: it has no path of its own.
         return
     for thing in bpy.data.objects:
         modifier = thing.modifiers.get(animation.MODIFIER)
@@ -33,9 +34,9 @@ def _before_saving(path: str, *_) -> None:
 
 
 def _moved(value: str, folder: Path | None, start: Path | None = None) -> str:
-    """Return a path as a file in ``folder`` has it, or absolute where that has no place yet.
+    """Return a path relative to a file in ``folder``, or absolute without a folder.
 
-    Relative ones count from ``start``, by default from where the open file was before.
+    Relative ones count from ``start``, by default from the open file's previous folder.
     """
     if not value:
         return value

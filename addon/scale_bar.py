@@ -1,4 +1,4 @@
-"""A bar of a round length beside a branch: it tells in a picture how large things are."""
+"""A bar of a round length beside a branch: it shows the scale of a picture."""
 
 import bpy
 import numpy as np
@@ -8,14 +8,14 @@ from .branches import add_object
 from .bridge import materials, meshes
 
 _SHARE = 0.25
-"""Of the branch's size that the bar takes at most."""
+"""Greatest length of the bar as a fraction of the branch's size."""
 _LENGTHS = [digit * 10.0**power for power in range(-5, 4) for digit in (1, 2, 5)]
 _UNITS = ((1.0, "m"), (0.01, "cm"), (0.001, "mm"))
 _INK = (0.012, 0.014, 0.018)
 
 
 def length_for(size: float) -> float:
-    """Return the longest round length that is a quarter of ``size`` at most [m]."""
+    """Return the longest round length of at most a quarter of ``size`` [m]."""
     return max((length for length in _LENGTHS if length <= _SHARE * size), default=_LENGTHS[0])
 
 
@@ -28,11 +28,11 @@ def words_for(length: float) -> str:
 
 def add(collection: bpy.types.Collection, camera: bpy.types.Object, foot: np.ndarray,
         size: float) -> None:
-    """Stand a bar on the ground right of the branch, its length beside it, facing the camera.
+    """Put a bar on the ground right of the branch, its length beside it, facing the camera.
 
     Args:
-        foot: Where the branch stands on the ground [m], shape [3].
-        size: Of the branch [m].
+        foot: Base of the branch on the ground [m], shape [3].
+        size: Size of the branch [m].
     """
     length, thin = length_for(size), 0.006 * size
     right = camera.rotation_quaternion @ Vector((1.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""A scan as it is shown, and read by a thread while the interface goes on. No bpy here.
+"""A scan as it is shown, read by a thread while the interface stays usable. No bpy here.
 
 A million points take most of a second.
 """
@@ -17,12 +17,12 @@ class Scan:
     """A scan to be shown.
 
     Attributes:
-        points: In its own unit, ``offset`` taken off, float32, shape [n, 3].
-        offset: Whole numbers [3]: map coordinates would lose their last digits in a viewport.
-        colours: Red, green, blue, alpha from 0 to 1 as on a screen, float32, [n, 4], if it has any.
+        points: Points in the scan's own unit, ``offset`` subtracted, float32, shape [n, 3].
+        offset: Integers [3]: map coordinates would lose their last digits in a viewport.
+        colours: Red, green, blue, alpha from 0 to 1 in sRGB, float32, [n, 4], if it has any.
         extent: Its longest side, in its own unit.
-        sha256: Of the file. folder: The branch folder that is, or would be, its own.
-        unit: That the file states, if it does.
+        sha256: Checksum of the file. folder: Its own branch folder, existing or not.
+        unit: Unit that the file states, if any.
     """
 
     points: np.ndarray
@@ -35,7 +35,7 @@ class Scan:
 
 
 def read_scan(path: Path) -> Scan:
-    """Read what is shown of a scan; ValueError as :func:`.clouds.read_points`."""
+    """Read the shown data of a scan; ValueError as :func:`.clouds.read_points`."""
     points, unit = clouds.read_points(path)
     low, high = points.min(axis=0), points.max(axis=0)
     middle = np.round((low + high) / 2)
@@ -50,7 +50,7 @@ def read_scan(path: Path) -> Scan:
 
 
 class Reading:
-    """A scan that is being read by a thread; look at ``is_done``, then ask for the scan."""
+    """A scan being read by a thread; check ``is_done``, then ask for the scan."""
 
     def __init__(self, path: Path):
         self._found: Scan | None = None
@@ -63,7 +63,7 @@ class Reading:
         return not self._thread.is_alive()
 
     def scan(self) -> Scan:
-        """Return the scan, once it is done; raises what reading it raised."""
+        """Return the scan, once it is done; raises the exception of reading it."""
         self._thread.join()
         if self._error is not None:
             raise self._error

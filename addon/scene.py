@@ -29,7 +29,7 @@ from .bridge import animation, curves, materials, meshes, skeletons
 from .scene_data import SceneData
 from .skeleton_edits import Skeleton
 
-# Linear colours. Those of the marks stand apart from the colour map of the branch.
+# Linear colours. Those of the marks are distinct from the colour map of the branch.
 COLORS = {
     "path:plan": (0.78, 0.015, 0.06),
     "path:baseline": (0.01, 0.13, 0.62),
@@ -46,18 +46,18 @@ COLORS = {
 
 def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = None,
                 ) -> ShownBranch:
-    """Put the branch into a collection of ``scene``; one shown before from that folder goes.
+    """Put the branch into a collection of ``scene``; an earlier one from that folder is removed.
 
     Args:
-        scene: Where to.
-        data: What the worker found in the branch folder.
-        scalar: What the colours mean: a name of ``data.info["scalars"]``, the first by default.
+        scene: Target scene.
+        data: Data that the worker found in the branch folder.
+        scalar: Meaning of the colours: a name of ``data.info["scalars"]``, the first by default.
 
     Raises:
         bridge.animation.CacheError: the frames cannot move this surface.
     """
     if bpy.context.mode != "OBJECT":
-        # What is being edited may be what is shown anew.
+        # The object in Edit Mode may be the one shown again.
         bpy.ops.object.mode_set(mode="OBJECT")
     before = _remove_shown(scene, data)
     shown = _new_branch(scene, data, scalar)
@@ -80,15 +80,15 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
 
 
 def place_scans(scene: bpy.types.Scene, data: SceneData) -> int:
-    """Put imported scans to where the branch made of them is: it was set upright and to 0.
+    """Move imported scans to the branch made from them, which was set upright and to 0.
 
     Returns:
-        How many there are.
+        Number of scans.
     """
     count = 0
     for thing in scene.objects:
         if thing.get(SCAN_KEY) == data.info["source"].get("sha256", ""):
-            # In double precision: offset and alignment take far places off each other.
+            # In double precision: offset and alignment subtract large coordinates from each other.
             matrix = np.array(data.info["alignment"], float)
             matrix[:3, 3] += matrix[:3, :3] @ np.array(thing.get(OFFSET_KEY, (0.0,) * 3))
             thing.matrix_world = Matrix(matrix.tolist())
@@ -143,8 +143,9 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
 
 @dataclass
 class _Before:
-    """What stays of a branch that is shown anew: its skeleton where edits are not applied yet, and
-    where it was put beside others [m]."""
+    """State kept from a branch that is shown again: its skeleton with edits not applied yet, and
+    its position beside others [m].
+    """
 
     edited: bpy.types.Mesh | None = None
     has_skeleton_in_sight: bool = False
@@ -152,7 +153,7 @@ class _Before:
 
 
 def _remove_shown(scene: bpy.types.Scene, data: SceneData) -> _Before:
-    """Remove what was shown of this branch before, also when its folder has moved since."""
+    """Remove earlier objects of this branch, also when its folder has moved since."""
     found = _Before()
     for collection in list(scene.collection.children):
         if FOLDER_KEY not in collection or not _is_same(collection, data):
@@ -170,7 +171,7 @@ def _remove_shown(scene: bpy.types.Scene, data: SceneData) -> _Before:
 
 
 def _is_same(collection: bpy.types.Collection, data: SceneData) -> bool:
-    """Whether a collection shows the branch: its folder, or one that was there before it moved."""
+    """Whether a collection shows the branch: its folder, or one from before it moved."""
     before = Path(bpy.path.abspath(collection[FOLDER_KEY])).resolve()
     if before == data.folder.resolve():
         return True
@@ -180,7 +181,7 @@ def _is_same(collection: bpy.types.Collection, data: SceneData) -> bool:
 
 
 def _add_paths(shown: ShownBranch, data: SceneData) -> None:
-    # The baseline is a little thinner: where both run together, both are seen.
+    # The baseline is a little thinner: if both coincide, both are visible.
     for key, share in (("plan", 0.0035), ("baseline", 0.0026)):
         name = f"path:{key}"
         if name not in data.arrays:
@@ -193,7 +194,7 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
 
 
 def _add_trees(shown: ShownBranch, data: SceneData) -> None:
-    """Add what the planners searched as lines; hidden, since they cover all of the space."""
+    """Add the planners' search trees as lines; hidden, since they cover all of the space."""
     for key, about in (data.info.get("trees") or {}).items():
         mesh = _lines(f"{about['title']} tree", data, f"tree:{key}", f"tree_parent:{key}")
         thing = add_object(shown.collection, f"{about['title']} tree", mesh)
@@ -210,9 +211,9 @@ def _lines(name: str, data: SceneData, nodes: str, parents: str) -> bpy.types.Me
 
 
 def _add_skeleton(shown: ShownBranch, data: SceneData, before: _Before) -> None:
-    """Add the centreline with its radii, hidden at first: it lies inside the branch.
+    """Add the centreline with its radii, hidden at first: it is inside the branch.
 
-    Edits of it that are not applied yet stay where it is the same skeleton.
+    Edits that are not applied yet stay if it is the same skeleton.
     """
     if "skeleton" not in data.arrays:
         return
@@ -258,7 +259,7 @@ def _add_goal(shown: ShownBranch, data: SceneData) -> None:
     goal = data.info.get("goal")
     if not goal:
         return
-    # Never smaller than what shall reach it; the legend says how near is near enough.
+    # Never smaller than the part that is to reach it; the legend states the tolerance.
     least = 1.6 * data.arrays["grasp_radius"][0] if "grasp_radius" in data.arrays else (
         0.02 * data.info["size_m"])
     goal_ball.add(shown, goal["kind"], goal["centre_m"], max(goal["radius_m"] or 0.0, least))
@@ -280,7 +281,7 @@ def _add_base(shown: ShownBranch, data: SceneData) -> None:
 
 
 def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
-    """Add arm and gripper, a rod with round ends a link, moving along with the frames."""
+    """Add arm and gripper, one capsule per link, moving along with the frames."""
     if "robot_starts" not in data.arrays:
         return
     starts, ends = data.arrays["robot_starts"], data.arrays["robot_ends"]
@@ -291,7 +292,7 @@ def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
         reach = starts[:, number], ends[:, number]
         length = math.dist(reach[0][0], reach[1][0])
         if length < radius / 4:
-            # Two joints whose axes meet: the round ends beside it are all there is to see.
+            # Two joints with intersecting axes: only the adjacent round ends are visible.
             continue
         rod = meshes.new_capsule(f"{title} link {number + 1}", radius, length)
         meshes.set_one_color(rod, COLORS["robot"])
@@ -301,9 +302,9 @@ def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
 
 
 def own_speed(scene: bpy.types.Scene, frames: dict) -> float:
-    """Return how many frames of a motion a frame of the scene goes on, in its own time.
+    """Return the number of frames of a motion per frame of the scene, in its own time.
 
-    It keeps that in the user's frame rate; a path has none, and plays pose by pose.
+    A motion keeps its own time at the user's frame rate; a path has none, and plays pose by pose.
     """
     return frames["rate_hz"] * scene.render.fps_base / scene.render.fps if (
         frames["is_timed"]) else 1.0
@@ -321,7 +322,7 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     rest = meshes.new_mesh("Rest shape", data.arrays["vertices"], data.arrays["faces"])
     material = materials.plain_material("Rest shape", COLORS["rest"], alpha=0.25)
     ghost = add_object(shown.collection, "Rest shape", rest, material)
-    # In the viewport, lines, and on demand: they lie over colours that mean numbers.
+    # In the viewport, lines, and on demand: they cover colours that show numbers.
     ghost.display_type = "WIRE"
     ghost.hide_viewport = True
     shown.objects["rest"] = [ghost]
@@ -337,7 +338,7 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
             animation.move_along(thing, data.arrays[f"{name}_motion"][:, number], speed=speed)
     _add_robot(shown, data, speed)
     annotations.add_measured(shown, data, speed)
-    # Last: what was keyed stands where it is at the first frame, not at its last key.
+    # Last: keyed objects are then at the first frame, not at their last key.
     scene.frame_set(1)
     if "frame_energy" in data.arrays:
         shown.surface[ENERGY_KEY] = [float(value) for value in data.arrays["frame_energy"]]

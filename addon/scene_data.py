@@ -1,4 +1,4 @@
-"""Reads the worker's data that show a branch: one .npz file, nothing pickled.
+"""Reads the worker's data that show a branch: one .npz file without pickled data.
 
 The file comes from another process. It may have another version or be truncated, so every size,
 shape and index is checked before use.
@@ -20,9 +20,9 @@ _MOST_ARRAYS = 500
 
 # Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
 # points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
-# seen, p points of a path (each path has its own), q nodes of a search tree, u vertices and x
-# faces of rods (likewise), y colours of a palette, l places along an arm. i: whole numbers, b:
-# truth values, r: real.
+# seen, p points of a path (each path has its own), q nodes of a search tree, u vertices and x faces
+# of rods (likewise), y colours of a palette, l positions along an arm. i: integers, b: booleans, r:
+# real numbers.
 _SHAPES = {
     "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
     "frame_level": "sv i", "palette": "y4 r",
@@ -49,7 +49,7 @@ _NEEDED_INFO = {"name": str, "folder": str, "scalars": dict, "paths": dict, "not
 
 
 class SceneDataError(ValueError):
-    """The file is not one that this version of the add-on can show."""
+    """This version of the add-on cannot show the file."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ def read_scene_data(path: Path) -> SceneData:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file whose members hold what their headers say."""
+    """Return the arrays of an .npz file, if their sizes match their headers."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if len(members) > _MOST_ARRAYS or sum(m.file_size for m in members) > _LARGEST_BYTES:
             raise ValueError("it is too large")
         for member in members:
             if member.compress_type != zipfile.ZIP_STORED:
-                # What is stored as it is cannot grow while it is read.
+                # Uncompressed data cannot grow while it is read.
                 raise ValueError(f"{member.filename} is compressed")
             with archive.open(member) as stream:
                 version = np.lib.format.read_magic(stream)
@@ -126,7 +126,7 @@ def _info_trouble(info: dict[str, Any]) -> str:
 
 
 def _is_graph(graph: Any) -> bool:
-    """Whether a graph is what can be drawn: places as shares of a frame, words at ticks."""
+    """Whether a graph can be drawn: positions as fractions of a frame, texts at ticks."""
     try:
         rows = [row for line in graph["lines"] for row in line["points"]]
         bands = [row for band in graph["bands"] for row in band["rows"]]
@@ -146,9 +146,9 @@ def _is_graph(graph: Any) -> bool:
 
 
 def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
-    """Return which array is missing or of a wrong shape or kind, or nothing.
+    """Return which array is missing or has a wrong shape or type, or an empty text.
 
-    Arrays that this version does not know are let through: nothing draws them.
+    Arrays unknown to this version are accepted: they are not drawn.
     """
     missing = [name for name in _NEEDED if name not in arrays]
     if missing:
@@ -184,7 +184,7 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
-    """Return what ``info`` speaks of that the arrays do not have, or nothing."""
+    """Return what ``info`` names that the arrays do not have, or an empty text."""
     wanted = [f"{kind}:{name}" for name in info["scalars"] for kind in ("scalar", "color")]
     wanted += [f"path:{name}" for name in info["paths"]]
     wanted += [f"{kind}:{name}" for name in info.get("trees") or {}

@@ -1,8 +1,8 @@
-"""A branch held by a process of the worker (``limber session``) that answers while it is bent.
+"""A branch held by a process of the worker (``limber session``), which answers while it is bent.
 
-No bpy here. Threads only read the process's output into a queue; whoever holds the session calls
-:meth:`Session.poll` from Blender's main thread. What goes to and fro is written down in
-``python -m limber.session.worker --help``; frames come through a file that both have mapped.
+No bpy here. Threads only read the process's output into a queue; the owner of the session calls
+:meth:`Session.poll` from Blender's main thread. ``python -m limber.session.worker --help``
+describes the protocol. Frames come through a file that both have mapped.
 """
 
 import atexit
@@ -33,17 +33,17 @@ _GRASP_COLUMNS = 13
 
 @dataclass(frozen=True)
 class HeldFrame:
-    """The branch as it is held now.
+    """The present state of the held branch.
 
     Attributes:
         sequence: Number of the frame.
         answers: Number of the command that it answers.
-        who: ``learning``, ``reduced``, ``full`` or ``untrusted``: who answers.
+        who: ``learning``, ``reduced``, ``full`` or ``untrusted``: the model that answers.
         energy: [J], above the hanging branch.
-        force: Of the gripper on the branch [N], three components.
+        force: Force of the gripper on the branch [N], three components.
         strain: The greatest principal strain.
-        sag: How far what moved most along gravity has come down [m].
-        positions: Of the surface's vertices [m], float32, shape [v, 3].
+        sag: Largest displacement along gravity [m].
+        positions: Positions of the surface's vertices [m], float32, shape [v, 3].
     """
 
     sequence: int
@@ -57,7 +57,7 @@ class HeldFrame:
 
 
 class FrameFile:
-    """The file of frames, read; ValueError where it is none, or of another version."""
+    """The file of frames, read; ValueError if it is not one, or of another version."""
 
     def __init__(self, path: Path, vertex_count: int):
         with open(path, "rb") as stream:
@@ -96,7 +96,7 @@ class FrameFile:
         return None
 
     def close(self) -> None:
-        """Let go of the file: a map cannot be closed while arrays look into it."""
+        """Release the file: a map cannot be closed while arrays refer to it."""
         self._numbers, self._positions, self._sequence = [], [], np.zeros(1, "<u8")
         self._map.close()
 
@@ -105,8 +105,8 @@ class Session:
     """One branch that is held; close it when done.
 
     Attributes:
-        hello: What the session reported about itself after loading the branch; empty before.
-        error: Why it ended, for the user; empty while it runs.
+        hello: The session's report about itself after loading the branch; empty before.
+        error: Reason of its end, for the user; empty while it runs.
         message: Its current work, with the fraction done.
     """
 
@@ -129,7 +129,7 @@ class Session:
         return self._process.pid
 
     def poll(self) -> list[dict[str, Any]]:
-        """Return the replies and errors that came since the last call; notes the rest."""
+        """Return the replies and errors since the last call; the other messages are stored."""
         told = []
         has_ended = self._process.poll() is not None
         while not self._lines.empty():
@@ -160,7 +160,7 @@ class Session:
         return self._frames.read(after) if self._frames else None
 
     def grasp(self, point: tuple[float, float, float], radius: float) -> int:
-        """Hold the branch about ``point`` [m], on the branch as it was scanned, where it is now.
+        """Hold the branch about ``point`` [m], on the branch as scanned, at its present position.
 
         Returns:
             The number that the reply carries.
@@ -168,23 +168,23 @@ class Session:
         return self._send(command="grasp", point=list(point), radius_m=radius, mode="pinned")
 
     def move(self, grasp: int, position: tuple[float, float, float]) -> int:
-        """Bring a grasp to ``position`` [m]."""
+        """Move a grasp to ``position`` [m]."""
         return self._send(command="move", grasp=grasp, pose=[*position, 0.0, 0.0, 0.0])
 
     def release(self) -> int:
-        """Let go of all."""
+        """Release all grasps."""
         return self._send(command="release")
 
     def load(self, **loads: Any) -> int:
-        """Let wind, snow and fruit act and cut twigs off, instead of those before.
+        """Apply wind, snow, fruit and cut twigs, instead of the previous ones.
 
         Returns:
-            The number that the reply carries; it says what is ``gone``.
+            The number that the reply carries; it states what is ``gone``.
         """
         return self._send(command="outdoors", **loads)
 
     def weigh(self, on: bool) -> int:
-        """Let the branch bear its weight, or not."""
+        """Switch the branch's weight on or off."""
         return self._send(command="gravity", on=on)
 
     def close(self) -> None:
@@ -195,7 +195,7 @@ class Session:
             self._frames.close()
             self._frames = None
         try:
-            # It ends with its input, within seconds, and takes its own file away.
+            # It ends with its input, within seconds, and removes its own file.
             self._process.stdin.close()
             self._process.wait(2.0)
         except (OSError, subprocess.TimeoutExpired):
@@ -223,7 +223,7 @@ class Session:
             self._process.stdin.write(json.dumps({"id": self._ids, **command}) + "\n")
             self._process.stdin.flush()
         except (OSError, ValueError):
-            # It has ended; the next poll says why.
+            # It has ended; the next poll states why.
             self.error = self.error or "The session has ended."
         return self._ids
 
@@ -237,7 +237,7 @@ def _event(line: str) -> dict[str, Any] | None:
     try:
         content = json.loads(line)
     except (ValueError, RecursionError):
-        # Native libraries print lines of their own among ours.
+        # Native libraries print lines of their own among the worker's.
         return None
     return content if isinstance(content, dict) and isinstance(content.get("event"), str) else None
 
@@ -246,7 +246,7 @@ _open: list[Session] = []
 
 
 def close_all() -> None:
-    """End every session: the add-on goes away or Blender closes."""
+    """End every session: the add-on is removed or Blender closes."""
     for session in list(_open):
         session.close()
 

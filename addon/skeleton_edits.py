@@ -1,7 +1,7 @@
-"""The user's changes of a skeleton's nodes, as the list of edits that the worker takes. No bpy.
+"""The user's changes of a skeleton's nodes, as the worker's list of edits. No bpy.
 
-The worker applies edits one after the other (``limber skeleton --help``); here is only what has
-changed, in an order in which each finds its place: nodes first go to where they are now.
+The worker applies edits one after the other (``limber skeleton --help``). This module lists the
+changes, in an order in which each is valid: nodes first move to their present positions.
 """
 
 import enum
@@ -13,7 +13,7 @@ import numpy as np
 
 
 class Mark(enum.IntEnum):
-    """What a node is marked for; the worker's help describes what each edit needs."""
+    """Kind of edit of a node; the worker's help describes what each edit needs."""
 
     NONE = 0
     BRIDGE = 1
@@ -32,7 +32,7 @@ class SkeletonEditError(ValueError):
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A skeleton as the worker gave it: places [n, 3] and radii [n] m, parents [n], -1 at a root.
+    """A skeleton from the worker: positions [n, 3], radii [n] m, parents [n], -1 at a root.
 
     A parent comes before its children.
     """
@@ -46,7 +46,7 @@ class Skeleton:
         return int(np.flatnonzero(self.parent < 0)[0])
 
     def outwards(self, node: int, stops: set[int] = frozenset()) -> set[int]:
-        """Return a node and all nodes that it carries, but not those of ``stops`` and beyond."""
+        """Return a node and all its descendants, except those of ``stops`` and beyond."""
         found = {node}
         for child in range(node + 1, len(self.parent)):
             if int(self.parent[child]) in found and child not in stops:
@@ -59,11 +59,11 @@ class Nodes:
     """The nodes as the user left them, in any order.
 
     Attributes:
-        number: Of each in the skeleton, [k]; shows which are gone and which are new.
-        places: [k, 3] m. radius: [k] m. is_root: [k].
+        number: Number of each node in the skeleton, [k]; shows which are gone and which are new.
+        places: Positions, [k, 3] m. radius: [k] m. is_root: [k].
         marks: :class:`Mark` of each, [k]; ``targets`` the number of the node that it names, and
-            ``turns`` which mark came first.
-        edges: Places in this list, [e, 2].
+            ``turns`` the order of the marks.
+        edges: Indices into this list, [e, 2].
     """
 
     number: np.ndarray
@@ -77,7 +77,7 @@ class Nodes:
 
 
 def edits_of(before: Skeleton, now: Nodes) -> list[dict[str, Any]]:
-    """Return the edits, in the branch's frame [m], that make ``now`` of ``before``.
+    """Return the edits, in the branch's frame [m], that turn ``before`` into ``now``.
 
     Raises:
         SkeletonEditError: nodes were added, edges drawn or cut, or nodes are detached.
@@ -114,7 +114,7 @@ def _require_known(before: Skeleton, now: Nodes) -> None:
 
 def _require_carried(before: Skeleton, place: dict[int, Any], marked: dict[int, Mark],
                      gone: list[int]) -> None:
-    """What hung on a node that is gone must be gone too, or hang elsewhere by then."""
+    """A child of a removed node must be removed too, or be attached elsewhere by then."""
     if before.root in gone:
         raise SkeletonEditError("The root was deleted. Undo that, and set another root first.")
     rehung = {node for node, mark in marked.items() if mark.has_target}
@@ -132,7 +132,7 @@ def _point(values: np.ndarray) -> list[float]:
 
 def _moves(before: Skeleton, now: Nodes) -> Iterator[dict[str, Any]]:
     was = before.nodes[now.number]
-    # As Blender keeps them, in single precision.
+    # As Blender stores them, in single precision.
     for k in np.flatnonzero((was.astype(np.float32) != now.places).any(axis=1)):
         yield {"do": "move", "at": _point(was[k]), "to": _point(now.places[k])}
 
@@ -161,7 +161,7 @@ def _marks(now: Nodes, place: dict[int, np.ndarray]) -> Iterator[dict[str, Any]]
 
 def _deletions(before: Skeleton, gone: list[int]) -> Iterator[dict[str, Any]]:
     for node in gone:
-        # With the first goes what hangs on it.
+        # The first takes its children with it.
         if int(before.parent[node]) not in gone:
             yield {"do": "delete", "at": _point(before.nodes[node])}
 

@@ -1,7 +1,7 @@
-"""What the worker's stages take, read from ``stages.json``: the one source of panels and settings.
+"""Settings of the worker's stages, from ``stages.json``: the source of panels and settings.
 
 ``limber schema`` writes that file (``scripts/make_addon_schema``), so that the add-on knows every
-setting without a worker; ``LIMBER_STAGES`` names another, where the worker has stages of other
+setting without a worker. ``LIMBER_STAGES`` names another file, if the worker has stages of other
 packages. No bpy here.
 """
 
@@ -20,7 +20,7 @@ _FILE = Path(os.environ.get("LIMBER_STAGES") or Path(__file__).with_name("stages
 
 
 class SettingError(ValueError):
-    """A value that the worker would reject; states which one and what to give."""
+    """The worker would reject a value; states which one and what to give."""
 
 
 @dataclass(frozen=True)
@@ -28,23 +28,24 @@ class Field:
     """One input, setting or option of a stage.
 
     Attributes:
-        name: As the command line has it, with ``_``.
+        name: Name on the command line, with ``_``.
         kind: ``boolean``, ``integer``, ``number``, ``string``, ``path``, ``choice``, ``vector``
             (``length`` numbers), ``list`` (any number of texts or numbers) or ``rows`` (any number
             of vectors, ``length`` numbers each).
-        title: What the user reads, without the unit.
+        title: Displayed title, without the unit.
         description: The tooltip.
-        group: The title under which it stands.
-        unit: Of its value, or nothing.
-        default: As JSON has it; None where it may be left open.
+        group: Title of its group.
+        unit: Unit of its value, or empty.
+        default: Value as in JSON; None if it may be left open.
         is_required: It has no default.
         is_optional: It may be left open.
         is_argument: Given on the command line without its name.
         is_expert: Shown on demand only.
-        is_kept: False where no panel keeps it: it is typed each time, or has a button of its own.
-        choices: Of a choice.
-        least, most: Bounds of a number, or None; ``is_open`` says that ``least`` itself is out.
-        length: Of a vector.
+        is_kept: False if no panel keeps it: it is typed each time, or has its own button.
+        choices: Values of a choice.
+        least, most: Bounds of a number, or None; ``is_open`` states that ``least`` itself is
+        excluded.
+        length: Length of a vector.
     """
 
     name: str
@@ -71,7 +72,7 @@ class Field:
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     def typed(self, value: Any) -> list[str]:
-        """Return ``value`` as options of a command line; SettingError where it is none."""
+        """Return ``value`` as options of a command line; SettingError if it is invalid."""
         flag = "--" + self.name.replace("_", "-")
         if self.kind == "boolean":
             return [flag if value else f"--no-{flag[2:]}"]
@@ -84,7 +85,7 @@ class Field:
         return [flag, number_text(value) if self.kind == "number" else str(value)]
 
     def is_default(self, value: Any) -> bool:
-        """Whether ``value``, of single precision as Blender keeps it, is the default."""
+        """Whether ``value``, in Blender's single precision, is the default."""
         if self.kind in ("vector", "number") and value is not None and self.default is not None:
             return np.array_equal(np.asarray(value, np.float32),
                                   np.asarray(self.default, np.float32))
@@ -98,7 +99,7 @@ class Field:
         return value == self.default
 
     def shown(self, value: Any) -> Any:
-        """Return ``value``, as JSON has it, as a panel keeps it: lists are text."""
+        """Return ``value``, as in JSON, in a panel's form: lists are text."""
         if self.kind == "rows":
             return "; ".join(" ".join(map(number_text, row)) for row in value)
         if self.kind == "list":
@@ -109,10 +110,10 @@ class Field:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the worker: its fields by name, and what it reads and writes.
+    """A stage of the worker: its fields by name, and the files it reads and writes.
 
-    ``step`` names its panel (nothing: it has none), ``label`` is what its button says,
-    ``moves_robot`` whether it does: ``always``, ``when armed`` or nothing.
+    ``step`` names its panel (empty: it has none), ``label`` is the text of its button,
+    ``moves_robot`` whether it moves the robot: ``always``, ``when armed`` or empty.
     """
 
     name: str
@@ -128,23 +129,23 @@ class Stage:
 
     @property
     def makes_branch(self) -> bool:
-        """Whether it makes a branch folder; all others work in one."""
+        """Whether it makes a branch folder; all other stages work in one."""
         return "branch_folder" not in self.fields
 
     @property
     def own_fields(self) -> list[Field]:
-        """What a panel asks for: all but the branch folder, which the scene gives."""
+        """The fields of its panel: all but the branch folder, which the scene provides."""
         folder = "output" if self.makes_branch else "branch_folder"
         return [field for field in self.fields.values() if field.is_kept and field.name != folder]
 
     def keeps_entry(self, values: Mapping[str, Any]) -> bool:
-        """Whether the branch folder knows the result of a run with these values."""
+        """Whether the branch folder keeps the result of a run with these values."""
         is_dry_run = self.moves_robot == "when armed"
         return bool(self.key) and not is_dry_run and (
             "{name}" not in self.key or bool(values.get("name")))
 
     def groups(self) -> dict[str, list[Field]]:
-        """Return what a panel asks for by the title of its group, in the worker's order."""
+        """Return the panel's fields by the title of their group, in the worker's order."""
         found: dict[str, list[Field]] = {}
         for field in self.own_fields:
             found.setdefault(field.group, []).append(field)
@@ -153,10 +154,10 @@ class Stage:
     def arguments(self, values: Mapping[str, Any]) -> list[str]:
         """Return the command line that gives the stage these values; defaults are omitted.
 
-        Fields that ``values`` does not have keep the worker's default.
+        Fields missing in ``values`` keep the worker's default.
 
         Raises:
-            SettingError: what is required is missing, or a text is no list of what it should be.
+            SettingError: a required value is missing, or a text is not a list as required.
         """
         options: list[str] = []
         arguments: list[str] = []
@@ -249,7 +250,7 @@ def _items(text: str) -> list[str]:
 
 
 def rows_of(field: Field, text: str) -> list[list[float]]:
-    """Return the rows of numbers that a panel keeps as text; SettingError where it is none."""
+    """Return the rows of numbers that a panel keeps as text; SettingError if it is invalid."""
     try:
         rows = [[float(part) for part in row.split()] for row in text.split(";") if row.strip()]
     except ValueError as error:

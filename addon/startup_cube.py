@@ -9,11 +9,11 @@ from .bridge import meshes
 _NAME, _MATERIAL = "Cube", "Material"
 _CORNERS = np.array([(x, y, z) for x in (1, -1) for y in (1, -1) for z in (1, -1)], np.float32)
 _HIDDEN_KEY = "limber_hid"
-"""Of a cube that was hidden once: whoever shows it again wants it there."""
+"""Key of a cube that was hidden once: a user who shows it again wants it there."""
 
 
 def find(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the startup cube while it is as Blender brings it; None where a user changed it."""
+    """Return the startup cube in its original state; None if a user changed it."""
     cube = scene.objects.get(_NAME)
     return cube if cube is not None and _is_untouched(cube) else None
 

@@ -1,7 +1,6 @@
-"""The steps of the work: which stages stand in which panel, and how far each of them is. No bpy.
+"""The steps of the work: the stages of each panel, and their state. No bpy.
 
-Everything about a stage itself comes from its schema, also the step that it stands in; here are
-the steps.
+Each stage's data comes from its schema, including its step; this module has the steps.
 """
 
 import enum
@@ -10,18 +9,18 @@ from dataclasses import dataclass
 from .stages import stages
 
 WAYS = frozenset({"move"})
-"""Vectors in metres that say how far, not where: the 3D cursor does not give them."""
+"""Vectors in metres that are displacements, not positions: the 3D cursor does not give them."""
 REGIONS = ("goal", "tip_goal", "target_box", "workspace_low")
-"""Fields of a plan that the active object gives: a ball, or (with what belongs to it) a box."""
+"""Fields of a plan that the active object gives: a ball, or (with its related fields) a box."""
 PLACES = {"fruit": (0.1,), "cut": ()}
-"""Lists of places on the branch, and what stands behind a place: the mass [kg] of a fruit."""
+"""Lists of positions on the branch, and the values after a position: the mass [kg] of a fruit."""
 
 FIRST = {"plan": "energy"}
-"""What is run before a stage where the branch lacks it, or has it of an earlier shape."""
+"""Stage to run before a stage if its result is missing, or is of an earlier shape."""
 
 
 class StepState(enum.Enum):
-    """How far a stage is, with what the user reads and the icon beside it."""
+    """State of a stage, with its displayed text and icon."""
 
     NOT_RUN = ("not run yet", "RADIOBUT_OFF")
     RUNNING = ("running", "SORTTIME")
@@ -52,9 +51,9 @@ class StageView:
 
 @dataclass(frozen=True)
 class Step:
-    """One panel: its first stage. ``fields`` of it stand above its button, the rest is folded in.
+    """One panel: its first stage. ``fields`` of it are above its button, the rest is folded in.
 
-    ``scene_operator`` stands instead of the stage's button where the step itself runs none.
+    ``scene_operator`` replaces the stage's button if the step itself runs none.
     """
 
     name: str
@@ -66,7 +65,7 @@ class Step:
 
     @property
     def others(self) -> tuple[StageView, ...]:
-        """The further stages that stand in this step, as their schemas say."""
+        """The further stages of this step, according to their schemas."""
         return tuple(StageView(stage.name) for stage in stages().values()
                      if stage.step == self.name and stage.name != self.view.stage)
 

@@ -1,4 +1,4 @@
-"""Ground, light, camera and rendering around a branch, so that its picture explains itself."""
+"""Ground, light, camera and rendering for a self-explanatory picture of a branch."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from .branches import add_object
 from .bridge import materials, meshes
 from .scene_data import SceneData
 
-# Share of the picture's width that is kept free on the left, for the legend.
+# Fraction of the picture's width that is kept free on the left, for the legend.
 LEGEND_SHARE = 0.36
 
 
 PAPER = (0.779, 0.8075, 0.836)
-"""Linear colour behind the branch, and of the legend's own ground."""
+"""Linear colour behind the branch, and of the legend's own background."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Width of a rendered picture [pixels] and how many samples a pixel may take."""
+    """Width of a rendered picture [pixels] and most samples per pixel."""
 
     width: int = 1120
     samples: int = 32
@@ -33,7 +33,7 @@ class Picture:
 
 def set_up_studio(scene: bpy.types.Scene, data: SceneData,
                   picture: Picture = Picture()) -> bpy.types.Object:
-    """Add ground, lights and a camera that sees all of ``view_points``; returns the camera."""
+    """Add ground, lights and a camera that shows all of ``view_points``; returns the camera."""
     collection = bpy.data.collections.new("Studio")
     scene.collection.children.link(collection)
     _set_rendering(scene, picture)
@@ -52,9 +52,9 @@ def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_denoising = compat.can_denoise()
-    # Without a denoiser, more samples stand in for it.
+    # Without a denoiser, use more samples instead.
     cycles.samples = picture.samples if compat.can_denoise() else 4 * picture.samples
-    # Most of the picture is plain background: few samples there, and a tenth of the time.
+    # Most of the picture is plain background: it needs few samples, and a tenth of the time.
     cycles.use_adaptive_sampling = True
     if hasattr(cycles, "denoising_quality"):
         cycles.denoising_quality = "BALANCED"
@@ -63,7 +63,7 @@ def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
     cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 2, 1, 1
     cycles.transparent_max_bounces = 16
     cycles.use_light_tree = False
-    # Colours mean numbers here: no filmic curve may bend them.
+    # Colours show numbers: no filmic curve may change them.
     scene.view_settings.view_transform = "Standard"
 
 
@@ -80,7 +80,7 @@ def _set_world(scene: bpy.types.Scene) -> None:
 def _add_ground(collection: bpy.types.Collection, data: SceneData) -> np.ndarray:
     """Add a round plate below the branch; returns points of its rim [m], shape [4, 3].
 
-    It takes the shadow, and no horizon crosses the branch.
+    It receives the shadow, and no horizon crosses the branch.
     """
     size = data.info["size_m"]
     radius = 0.2 * size
@@ -123,7 +123,7 @@ def _add_camera(scene: bpy.types.Scene, collection: bpy.types.Collection,
 
 
 def _fit(scene: bpy.types.Scene, camera: bpy.types.Object, points: np.ndarray) -> None:
-    """Move the camera back until all ``points`` [m] are seen, right of the legend."""
+    """Move the camera back until all ``points`` [m] are visible, right of the legend."""
     render = scene.render
     width = render.resolution_x
     render.resolution_x = round(width * (1 - LEGEND_SHARE) * 0.92)

@@ -1,6 +1,6 @@
-"""Tables of points as text: what their columns are called, in which unit, and their numbers.
+"""Tables of points as text: names of columns, units and numbers.
 
-Numpy and nothing of Limber: ``addon/text_columns.py`` is a copy, so that worker and add-on read
+Imports numpy but not Limber: ``addon/text_columns.py`` is a copy, so that worker and add-on read
 alike. ``scripts/make_addon_schema`` makes the copy; a test compares the two.
 """
 
@@ -20,9 +20,9 @@ _MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 _COLMAP, _HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _LINES = 20_000
-"""Lines that are read at a stretch: numpy holds the interpreter meanwhile."""
+"""Lines read at a time: numpy holds the interpreter lock meanwhile."""
 _MOST_HEAD = 60
-"""Lines above the numbers that are looked at."""
+"""Most lines above the numbers that are examined."""
 
 
 class ColumnsError(ValueError):
@@ -39,10 +39,10 @@ class Columns:
 
     Attributes:
         names: In lower case, without units; coordinates are x, y, z.
-        titles: As the file has them.
+        titles: Titles as in the file.
         values: Shape [n, columns].
-        unit: Of the coordinates, one of the values of :data:`LENGTHS`, if the file states it.
-        notes: What of the file was not used.
+        unit: Unit of the coordinates, one of the values of :data:`LENGTHS`, if the file states it.
+        notes: Parts of the file that were not used.
     """
 
     names: list[str]
@@ -53,7 +53,8 @@ class Columns:
 
 
 def decoded(raw: bytes) -> str:
-    """Return the text of a file in UTF-8, UTF-16 or, as spreadsheets write it, Windows' letters."""
+    """Return the text of a file in UTF-8, UTF-16 or, as spreadsheets write it, a Windows code page.
+    """
     for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
                          (codecs.BOM_UTF16_BE, "utf-16")):
         if raw.startswith(mark):
@@ -67,13 +68,13 @@ def decoded(raw: bytes) -> str:
 def read_columns(path: Path) -> Columns:
     """Read the columns of a text file.
 
-    Numbers stand between blanks, tabs, commas or semicolons; lines above them may name the columns
-    and state a unit; the number of points may come before the points of each scan; decimals may be
-    commas where commas do not separate.
+    Numbers are separated by blanks, tabs, commas or semicolons. Lines above them may name the
+    columns and state a unit. The number of points may precede the points of each scan. Decimals may
+    be commas if commas are not separators.
 
     Raises:
-        ColumnsError: no numbers, too few columns, coordinates of several or unknown units, or a
-            line that does not fit, which is named.
+        ColumnsError: there are no numbers, too few columns, coordinates of several or unknown
+            units, or a line that does not fit; the message names it.
     """
     text = decoded(path.read_bytes()).replace('"', "")
     if _COLMAP in text[:_HEAD] or _has_tracks(text):
@@ -85,7 +86,7 @@ def read_columns(path: Path) -> Columns:
                            "Export it again.")
     comments = [line.lstrip(" #/") for line in every[:_MOST_HEAD] if _is_comment(line)]
     lines = _without_counts(lines)
-    # What stands above says little of how numbers are written.
+    # The lines above do not show how numbers are written.
     separator = _separator(lines[len(lines) // 2])
     first = _first_row(lines, separator)
     head, lines = lines[:first], lines[first:]
@@ -99,7 +100,7 @@ def read_columns(path: Path) -> Columns:
                            "Coordinates need three columns.", "Export it again.")
     if (len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0])) or (
             0 not in used and len(titles) == max(used)):
-        # R's write.table gives no title to its row names.
+        # R's write.table writes no title for its row names.
         titles = ["", *titles]
     titles = [titles[k] for k in used] if len(titles) > max(used) else []
     titles = titles or _commented(comments, separator, values)
@@ -111,7 +112,7 @@ def read_columns(path: Path) -> Columns:
 
 
 def _colmap(path: Path, text: str) -> Columns:
-    """COLMAP's points3D.txt, without the images that saw each point: as many as did."""
+    """COLMAP's points3D.txt without the images of each point; their number varies."""
     names = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
     cut = [" ".join(line.split()[:len(names)]) for line in text.splitlines()]
     lines = [line for line in cut if line and not _is_comment(line)]
@@ -136,7 +137,7 @@ def _has_tracks(text: str) -> bool:
 
 
 def _without_counts(lines: list[str]) -> list[str]:
-    """Lines without those that say how many points follow: first, below titles, at each scan."""
+    """Lines without counts of the points that follow: first, below titles, at each scan."""
     start = next((k for k, line in enumerate(lines[:2]) if line.strip().isdigit()), None)
     if start is None or start + 1 == len(lines):
         return lines
@@ -177,7 +178,7 @@ def _parts(line: str, separator: str | None) -> list[str]:
 
 
 def _number(part: str, commas: bool) -> float | None:
-    """A number of a table, NaN of a word for a missing one, None of another word."""
+    """A number of a table; NaN for a missing-value word, None for any other word."""
     if part.lower() in _MISSING:
         return float("nan")
     try:
@@ -192,14 +193,14 @@ def _first_row(lines: list[str], separator: str | None) -> int:
         parts = _parts(line, separator)
         numbers = [_number(part, separator != ",") for part in parts]
         known = [number for number in numbers if number is not None]
-        # In a row of a table a word may stand beside the numbers, never in most places.
+        # A row of a table may contain words besides numbers, but they are never the majority.
         if len(known) >= max(3, (len(parts) + 1) // 2) and not all(np.isnan(known)):
             return index
     return int(any(part[:1].isalpha() for part in _parts(lines[0], separator)))
 
 
 def _titles(path: Path, head: list[str], lines: list[str], separator: str | None) -> list[str]:
-    """Titles of the columns; none where no line above the numbers names coordinates."""
+    """Titles of the columns; none if no line above the numbers names coordinates."""
     for index in reversed(range(len(head))):
         line = head[index]
         other = separator if separator is None or separator in line else _separator(line)
@@ -220,7 +221,7 @@ def _titles(path: Path, head: list[str], lines: list[str], separator: str | None
 
 
 def _commented(comments: list[str], separator: str | None, values: np.ndarray) -> list[str]:
-    """Titles of a comment that names coordinates and as many columns as there are."""
+    """Titles in a comment that names coordinates and the right number of columns."""
     for comment in reversed(comments):
         for mark in (separator, _separator(comment)):
             titles = _parts(comment, mark)
@@ -232,7 +233,7 @@ def _commented(comments: list[str], separator: str | None, values: np.ndarray) -
 
 
 def _bare(titles: Iterable[str]) -> list[str]:
-    """Titles without units of length, in small letters."""
+    """Titles without units of length, in lower case."""
     found = []
     for title in titles:
         name, unit = split_title(title.lower().lstrip("/#").strip(), LENGTHS)
@@ -263,12 +264,12 @@ def _named(path: Path, titles: list[str]) -> tuple[list[str], str | None]:
 
 def _numbers(path: Path, lines: list[str], separator: str | None, text: str,
              titles: Sequence[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
-    """Which columns are numbers, those, and what the others are."""
+    """Which columns are numeric, their values, and what the others are."""
     commas = separator != ","
     ending = separator is not None and lines[0].rstrip().endswith(separator)
     parts = []
     try:
-        # A part at a time: copies of all would take several times the file's size.
+        # In chunks: a copy of all would take several times the file's size.
         for start in range(0, len(lines), _LINES):
             rows = lines[start:start + _LINES]
             clean = (line.replace(",", ".") for line in rows) if commas else iter(rows)
@@ -284,7 +285,7 @@ def _numbers(path: Path, lines: list[str], separator: str | None, text: str,
 
 def _with_words(path: Path, lines: list[str], separator: str | None, text: str,
                 titles: Sequence[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
-    """The numbers of a table that has missing ones, or columns of words beside named ones."""
+    """The numbers of a table with missing values, or with columns of words beside named ones."""
     width = len(_parts(lines[0], separator))
     rows = [[_number(part, separator != ",") for part in _parts(line, separator)]
             for line in lines]
@@ -317,10 +318,10 @@ def _place(text: str, line: str) -> int:
 
 
 def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:
-    """Names of unnamed columns [n, k] after x, y, z, as scanners and CloudCompare order them.
+    """Names of unnamed columns [n, k] after x, y, z, in the order of scanners and CloudCompare.
 
-    Of four, a scanner writes intensity and colour, CloudCompare colour and a scalar: where their
-    values do not tell, ``intensity_first`` does.
+    Of four columns, a scanner writes intensity and colour, CloudCompare colour and a scalar. If
+    their values are ambiguous, ``intensity_first`` decides.
     """
     count = extra.shape[1]
     if count == 3:

@@ -1,4 +1,4 @@
-"""A mark in the view at the place that an error is about."""
+"""A mark in the view at the position of an error."""
 
 import bpy
 from mathutils import Matrix, Vector
@@ -8,18 +8,19 @@ from .branches import FOLDER_KEY, OFFSET_KEY, SCAN_KEY
 from .stages import Stage
 
 _KEY = "limber_trouble"
-"""Of the mark: the stage whose error it shows."""
+"""Key of the mark: the stage whose error it shows."""
 _SIZE_SHARE = 0.05
 
 
 def show(scene: bpy.types.Scene, stage: Stage, place: list[float]) -> None:
-    """Put the mark of a stage at a place: in the scan's file where the stage makes the branch, else
-    in the branch's frame; nothing where that is not in the scene."""
+    """Put the mark of a stage at a position: in the scan's file if the stage makes the branch, else
+    in the branch's frame. If that is not in the scene, no mark is shown.
+    """
     remove(scene, stage)
     thing = _scan(scene) if stage.makes_branch else branches.find_surface(scene)
     if thing is None:
         return
-    # In a scan the offset was taken off in the file's unit.
+    # In a scan the offset was subtracted in the file's unit.
     offset = thing.get(OFFSET_KEY, (0.0,) * 3) if stage.makes_branch else (0.0,) * 3
     local = [a - b for a, b in zip(place, offset, strict=True)]
     mark = bpy.data.objects.new(f"Trouble: {stage.label}", None)
@@ -32,7 +33,7 @@ def show(scene: bpy.types.Scene, stage: Stage, place: list[float]) -> None:
 
 
 def remove(scene: bpy.types.Scene, stage: Stage) -> None:
-    """Take away the mark of a stage, if it has one."""
+    """Remove the mark of a stage, if it has one."""
     for thing in [thing for thing in scene.objects if thing.get(_KEY) == stage.name]:
         bpy.data.objects.remove(thing)
 

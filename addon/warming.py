@@ -1,7 +1,7 @@
 """After an installation the worker compiles its code once, in the background: for the first grab.
 
-It waits for nobody and keeps nobody: it is not among the jobs. What it has done is written down for
-the version of the worker, in the extension's own folder.
+It neither waits for jobs nor delays them. Its completion is recorded for the version of the worker,
+in the extension's own folder.
 """
 
 import hashlib
@@ -19,12 +19,12 @@ _running: list[jobs.Job] = []
 
 
 def current() -> jobs.Job | None:
-    """Return the job that compiles now; None if nothing is compiled."""
+    """Return the job that compiles now; None if no job does."""
     return _running[0] if _running else None
 
 
 def begin() -> bool:
-    """Start to compile if that was not done for this worker yet; returns whether it was started."""
+    """Start compiling if this worker has not compiled yet; returns whether it was started."""
     try:
         command = preferences.worker_command()
     except WorkerNotFound:
@@ -35,14 +35,14 @@ def begin() -> bool:
     try:
         job.launch()
     except OSError:
-        # The first job says why the worker does not start.
+        # The first job reports why the worker does not start.
         return False
     _running[:] = [job]
     return True
 
 
 def look() -> float | None:
-    """See how far it is; returns when to look again [s], or None when it has ended."""
+    """Check its progress; returns the time to the next check [s], or None when it has ended."""
     job = current()
     if job is None:
         return None
@@ -59,7 +59,7 @@ def look() -> float | None:
 
 
 def _done_file(command: list[str]) -> Path:
-    """Return the file that tells that this worker has compiled since the add-on was installed."""
+    """Return the file that marks that this worker has compiled since the add-on was installed."""
     installed = Path(__file__).stat().st_mtime_ns
     name = hashlib.sha256(f"{command}{installed}".encode()).hexdigest()[:16]
     try:
@@ -71,7 +71,7 @@ def _done_file(command: list[str]) -> Path:
 
 
 def draw(layout: bpy.types.UILayout) -> None:
-    """Say how far it is while it compiles; in a header: nothing moves under the mouse."""
+    """Show its progress while it compiles; in a header, so that nothing moves under the mouse."""
     job = current()
     if job is not None:
         layout.label(text=f"Compiling {100 * job.fraction:.0f} %", icon="SORTTIME")

@@ -21,8 +21,9 @@ class WorkerNotFound(Exception):
 
 
 def bundled_command() -> list[str]:
-    """Return how to start the worker that this Python has, by the extension's own wheels or because
-    bpy is a package beside it; nothing if it has none."""
+    """Return the command of this Python's own worker, from the extension's wheels or beside a bpy
+    package; empty if it has none.
+    """
     found = importlib.util.find_spec("limber")
     if found is None or found.origin is None:
         return []
@@ -31,14 +32,14 @@ def bundled_command() -> list[str]:
 
 
 def worker_command(python_path: str = "", bundled: list[str] | None = None) -> list[str]:
-    """Return how to start `limber`, to be followed by its arguments.
+    """Return the command that starts `limber`, to be followed by its arguments.
 
     Args:
-        python_path: A Python that the user chose, or nothing.
-        bundled: How to start the worker that this Python itself has, or nothing.
+        python_path: A Python that the user chose, or empty.
+        bundled: Command of the worker of this Python itself, or empty.
 
     Raises:
-        WorkerNotFound: none is set, found on the PATH, or the one that is set does not exist.
+        WorkerNotFound: none is set or found on the PATH, or the set one does not exist.
     """
     for chosen, source in ((python_path, "the preferences"),
                            (os.environ.get("LIMBER_PYTHON", ""), "LIMBER_PYTHON")):
@@ -57,7 +58,7 @@ def worker_command(python_path: str = "", bundled: list[str] | None = None) -> l
 
 
 def worker_environment() -> dict[str, str]:
-    """Return the environment for the worker: ours, less what would bend its Python to Blender's."""
+    """Return the worker's environment: the present one, without Blender's Python settings."""
     environment = dict(os.environ)
     for name in ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP"):
         environment.pop(name, None)

@@ -1,6 +1,6 @@
-"""The worker as a process: started without a console window, ended with all that it started.
+"""The worker as a process: started without a console window, ended with its child processes.
 
-On POSIX it leads a group of processes. On Windows it belongs to a job object, which also ends with
+On POSIX it leads a process group. On Windows it belongs to a job object, which also ends with
 Blender, however that ends. No bpy here.
 """
 
@@ -36,8 +36,8 @@ class _Limits(ctypes.Structure):
 class WorkerProcess(subprocess.Popen):
     """A process of the worker with pipes for text; OSError if the program cannot be started.
 
-    Its input closes when Blender ends, however that comes; with ``LIMBER_PARENT_PIPE`` in ``extra``
-    the worker ends then too.
+    Its input closes when Blender ends for any reason; with ``LIMBER_PARENT_PIPE`` in ``extra`` the
+    worker ends then too.
     """
 
     def __init__(self, command: list[str], **extra: str):
@@ -53,21 +53,21 @@ class WorkerProcess(subprocess.Popen):
             self._signal_group(signal.SIGTERM)
             return
         try:
-            # Windows has no gentle signal. It cancels when its input closes.
+            # Windows has no gentle signal. The worker cancels when its input closes.
             self.stdin.close()
         except OSError:
             # It has ended already.
             return
 
     def end_now(self) -> None:
-        """End it and all that it started; safe to call after it has ended."""
+        """End it and its child processes; safe to call after it has ended."""
         if _POSIX:
             self._signal_group(signal.SIGKILL)
         elif self._job is None or not _kernel().TerminateJobObject(self._job, 1):
             self.kill()
 
     def _signal_group(self, number: int) -> None:
-        # The whole group: a mesher or a pool may be running under the worker.
+        # The whole group: the worker may be running a mesher or a process pool.
         try:
             os.killpg(self.pid, number)
         except ProcessLookupError:
@@ -87,8 +87,9 @@ def _kernel() -> Any:
 
 
 def _job_object(kernel: Any, process: int) -> int | None:
-    """Return a job object that has a process and all that it will start; None where Windows
-    refuses. It ends with its last handle: with Blender."""
+    """Return a job object of a process and its later children; None if Windows refuses. It ends
+    with its last handle: with Blender.
+    """
     job = kernel.CreateJobObjectW(None, None)
     if not job:
         return None

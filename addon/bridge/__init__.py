@@ -1,1 +1,1 @@
-"""The one door between numpy arrays and Blender's data. Lengths in metres, one unit one metre."""
+"""The only interface between numpy arrays and Blender's data. Lengths are in metres."""

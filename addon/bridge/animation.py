@@ -54,10 +54,10 @@ def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1, *,
                  speed: float = 1.0) -> CacheHeader:
     """Let the PC2 file at ``path`` move ``target``, its first frame at ``frame_start``.
 
-    ``speed`` is how many frames of the file a frame of the scene goes on: at 2.5 a motion at 60 Hz
+    ``speed`` is the number of frames of the file per frame of the scene: at 2.5 a motion at 60 Hz
     plays in its own time in a scene of 24 frames a second.
 
-    The path is kept relative to the .blend where that is saved, so that both can move together.
+    The path is kept relative to the .blend if that is saved, so that both can move together.
 
     Raises:
         CacheError: the file is truncated, or has another number of vertices.
@@ -71,7 +71,7 @@ def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1, *,
     modifier.cache_format = "PC2"
     modifier.filepath = shown_path(path)
     modifier.frame_scale = speed
-    # Blender takes the start off after it has scaled the frame.
+    # Blender subtracts the start after it has scaled the frame.
     modifier.frame_start = speed * frame_start
     modifier.interpolation = "LINEAR"
     return header
@@ -100,7 +100,7 @@ def shown_path(path: Path) -> str:
 
 
 def relative_path(path: str, folder: Path) -> str:
-    """Return an absolute ``path`` as Blender's relative one from ``folder``; others as they are."""
+    """Return an absolute ``path`` relative to ``folder`` in Blender's form; others unchanged."""
     if path.startswith("//"):
         return path
     try:
@@ -112,18 +112,18 @@ def relative_path(path: str, folder: Path) -> str:
 
 def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 1, *,
                speed: float = 1.0) -> None:
-    """Key the place of ``target`` to ``points`` [m], shape [frames, 3]; ``speed`` as for the cache.
+    """Key the position of ``target`` to ``points`` [m], [frames, 3]; ``speed`` as for the cache.
 
-    It is left at its first place, where it stands at ``frame_start``.
+    It is left at its first position, that at ``frame_start``.
     """
     _key(target, "location", np.asarray(points, float), frame_start, speed)
 
 
 def appear(target: bpy.types.Object, seen: np.ndarray, size: float, frame_start: int = 1, *,
            speed: float = 1.0) -> None:
-    """Key the scale of ``target``: ``size`` where ``seen`` [frames] is true, else nothing of it.
+    """Key the scale of ``target``: ``size`` where ``seen`` [frames] is true, else zero.
 
-    By its scale, so that hiding it is still the user's.
+    By its scale, so that hiding it is left to the user.
     """
     sizes = np.where(np.asarray(seen, bool), size, 0.0)
     _key(target, "scale", np.repeat(sizes[:, None], 3, axis=1), frame_start, speed,
@@ -132,7 +132,7 @@ def appear(target: bpy.types.Object, seen: np.ndarray, size: float, frame_start:
 
 def move_between(target: bpy.types.Object, starts: np.ndarray, ends: np.ndarray,
                  frame_start: int = 1, *, speed: float = 1.0) -> None:
-    """Key a rod that lies along z about its middle to reach from ``starts`` to ``ends`` [m].
+    """Key a rod along z about its middle to reach from ``starts`` to ``ends`` [m].
 
     Both have the shape [frames, 3]; otherwise as :func:`move_along`.
     """
@@ -142,7 +142,7 @@ def move_between(target: bpy.types.Object, starts: np.ndarray, ends: np.ndarray,
     for way in ends - starts:
         turn = Vector(way).to_track_quat("Z", "Y")
         if turns:
-            # Of the two quaternions of a rotation the one on this side: no spin in between.
+            # Of the two quaternions of a rotation, the nearer one: no spin in between.
             turn.make_compatible(turns[-1])
         turns.append(turn)
     _key(target, "location", (starts + ends) / 2, frame_start, speed)
@@ -153,12 +153,12 @@ def _key(target: bpy.types.Object, channel: str, values: np.ndarray, frame_start
          speed: float, *, is_stepped: bool = False) -> None:
     """Key a channel to rows of ``values``, all at once, and leave it at the first.
 
-    Straight from one key to the next, as the cache goes, or in steps.
+    Linear interpolation between keys, as in the cache, or steps.
     """
     if not len(values):
         return
     setattr(target, channel, values[0].tolist())
-    # The first makes the curves, whatever this Blender keeps them in.
+    # The first key makes the curves, however this Blender stores them.
     target.keyframe_insert(channel, frame=frame_start)
     frames = frame_start + np.arange(len(values)) / speed
     for curve in compat.fcurves_of(target):
@@ -175,16 +175,16 @@ def _key(target: bpy.types.Object, channel: str, values: np.ndarray, frame_start
 
 def retime(things: Iterable[bpy.types.Object], moved: bpy.types.Object, frame_start: float,
            speed: float) -> None:
-    """Let the motion of ``moved``, and what is keyed along with it, start and run otherwise.
+    """Change start and speed of the motion of ``moved``, and of everything keyed along with it.
 
     Args:
-        things: What was keyed by :func:`move_along` and :func:`move_between` with ``moved``.
-        moved: What the cache moves.
+        things: Objects keyed by :func:`move_along` and :func:`move_between` with ``moved``.
+        moved: The object that the cache moves.
         frame_start: The motion's first frame in the scene.
-        speed: Frames of the file a frame of the scene.
+        speed: Frames of the file per frame of the scene.
     """
     modifier = moved.modifiers[MODIFIER]
-    # The modifier has the start scaled.
+    # The modifier stores the scaled start.
     before, start = modifier.frame_scale, modifier.frame_start / modifier.frame_scale
     modifier.frame_scale, modifier.frame_start = speed, speed * frame_start
     for thing in things:

@@ -9,7 +9,7 @@ from .. import compat
 
 def plain_material(name: str, color: tuple[float, float, float], *, alpha: float = 1.0,
                    roughness: float = 0.5) -> bpy.types.Material:
-    """Make a material of one linear colour; ``alpha`` below 1 lets light through."""
+    """Make a material of one linear colour; ``alpha`` below 1 is transparent."""
     material, shader = _new(name)
     shader.inputs["Base Color"].default_value = (*color, 1.0)
     shader.inputs["Roughness"].default_value = roughness
@@ -30,7 +30,7 @@ def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:
 
 
 def flat_material(name: str, color: tuple[float, float, float]) -> bpy.types.Material:
-    """Make a material that shows its linear colour whatever the light: for a legend."""
+    """Make a material that shows its linear colour independent of the light: for a legend."""
     material, shader = _new(name)
     _make_flat(material, shader)
     material.node_tree.nodes["Emission"].inputs["Color"].default_value = (*color, 1.0)
@@ -43,13 +43,13 @@ def scalar_material(name: str, attribute: str, *, low: float, high: float, log: 
     """Make a material that shows FLOAT attribute ``attribute`` by colour.
 
     Args:
-        name: Of the material.
-        attribute: Of the mesh, in its real unit.
+        name: Name of the material.
+        attribute: Attribute of the mesh, in its real unit.
         low: Value of the first colour.
         high: Value of the last colour.
         log: Whether the colours are spread over the logarithm.
         stops: Rows ``[position 0..1, red, green, blue]``, linear.
-        flat: Whether light does not matter.
+        flat: Whether it is independent of the light.
     """
     material, shader = _new(name)
     nodes, links = material.node_tree.nodes, material.node_tree.links
@@ -74,7 +74,7 @@ def scalar_material(name: str, attribute: str, *, low: float, high: float, log: 
         links.new(ramp.outputs["Color"], nodes["Emission"].inputs["Color"])
     else:
         links.new(ramp.outputs["Color"], shader.inputs["Base Color"])
-        # A little light of its own: the colour stays readable on the shaded side.
+        # A little emission: the colour stays readable on the shaded side.
         links.new(ramp.outputs["Color"], shader.inputs["Emission Color"])
         shader.inputs["Emission Strength"].default_value = 0.12
         shader.inputs["Roughness"].default_value = 0.55

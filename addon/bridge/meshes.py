@@ -9,7 +9,7 @@ def new_mesh(name: str, vertices: np.ndarray, faces: np.ndarray | None = None) -
     """Make a mesh of triangles, or of points alone.
 
     Args:
-        name: Of the data block.
+        name: Name of the data block.
         vertices: Positions [m], shape [v, 3].
         faces: Vertex indices, shape [f, 3].
 
@@ -54,7 +54,7 @@ def _add_faces(mesh: bpy.types.Mesh, faces: np.ndarray, vertex_count: int) -> No
 
 
 def set_positions(mesh: bpy.types.Mesh, vertices: np.ndarray) -> None:
-    """Write all vertex positions [m], shape [v, 3]; by the attribute, 50 times as fast as co."""
+    """Write all vertex positions [m], shape [v, 3]; the attribute is 50 times as fast as co."""
     values = np.ascontiguousarray(_checked(vertices, 3, "vertices"), np.float32)
     if len(values) != len(mesh.vertices):
         raise ValueError(f"{len(values)} positions for {len(mesh.vertices)} vertices")
@@ -81,7 +81,7 @@ def faces(mesh: bpy.types.Mesh) -> np.ndarray:
 
 
 def set_scalars(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write one number a vertex as FLOAT attribute ``name``, in its real unit; shape [v]."""
+    """Write one number per vertex as FLOAT attribute ``name``, in its real unit; shape [v]."""
     values = _checked(values, None, name)
     _attribute(mesh, name, "FLOAT", len(values)).data.foreach_set(
         "value", np.ascontiguousarray(values, np.float32))
@@ -96,7 +96,7 @@ def scalars(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
 
 
 def set_integers(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write one whole number a vertex as INT attribute ``name``; shape [v]."""
+    """Write one integer per vertex as INT attribute ``name``; shape [v]."""
     values = _checked(values, None, name)
     _attribute(mesh, name, "INT", len(values)).data.foreach_set(
         "value", np.ascontiguousarray(values, np.int32))
@@ -104,7 +104,7 @@ def set_integers(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
 
 
 def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write a linear RGBA colour a vertex and make it the one that Solid mode shows; [v, 4]."""
+    """Write a linear RGBA colour per vertex and make it the one that Solid mode shows; [v, 4]."""
     values = _checked(values, 4, name)
     _attribute(mesh, name, "FLOAT_COLOR", len(values)).data.foreach_set(
         "color", np.ascontiguousarray(values, np.float32).ravel())
@@ -113,7 +113,7 @@ def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
 
 
 def set_screen_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
-    """Write an RGBA colour a vertex as screens take it, a byte a part; shape [v, 4]."""
+    """Write an sRGB colour with alpha per vertex, one byte per component; shape [v, 4]."""
     values = _checked(values, 4, name)
     _attribute(mesh, name, "BYTE_COLOR", len(values)).data.foreach_set(
         "color_srgb", np.ascontiguousarray(values, np.float32).ravel())
@@ -147,14 +147,14 @@ def new_cylinder(name: str, radius: float, height: float) -> bpy.types.Mesh:
 
 
 def new_capsule(name: str, radius: float, length: float) -> bpy.types.Mesh:
-    """Make a rod with round ends along z, ``length`` [m] between the middles of its two ends.
+    """Make a rod with round ends along z, ``length`` [m] between the centres of its two ends.
 
-    The ends are half balls of ``radius`` [m], so that rods that meet at any angle join smoothly.
+    The ends are hemispheres of ``radius`` [m], so that rods that meet at any angle join smoothly.
     """
     def make(builder: bmesh.types.BMesh) -> None:
         bmesh.ops.create_uvsphere(builder, u_segments=48, v_segments=24, radius=radius)
         for vertex in builder.verts:
-            # The ring about the middle goes to the upper end: the faces below it make the rod.
+            # The ring about the middle moves to the upper end: the faces below it form the rod.
             vertex.co.z += length / 2 if vertex.co.z > -1e-6 * radius else -length / 2
     return _primitive(name, make)
 

@@ -1,4 +1,4 @@
-"""The skeleton as a mesh of nodes that can be edited, to and from arrays.
+"""The skeleton as a mesh of editable nodes, to and from arrays.
 
 The user's marks are attributes of the vertices, not properties of the object, because undo in Edit
 Mode restores only the mesh.
@@ -15,15 +15,15 @@ from ..skeleton_edits import Mark, Nodes, Skeleton, SkeletonEditError, edits_of
 from . import meshes
 
 NODES_KEY = "limber_skeleton_m"
-"""Property of the mesh: places [m] as the worker gave them, three numbers a node."""
+"""Property of the mesh: positions [m] as the worker gave them, three numbers per node."""
 _RADIUS_KEY, _PARENT_KEY, _FLAGS_KEY = (
     "limber_skeleton_radius_m", "limber_skeleton_parent", "limber_skeleton_flags")
-# Truth values too: bmesh has no layers of them before Blender 5.0.
+# Booleans too: bmesh has no layers of them before Blender 5.0.
 _INTEGERS = ("node", "mark", "mark_target", "mark_turn", "root", "flags")
 
 
 def new_skeleton(name: str, skeleton: Skeleton, flags: np.ndarray) -> bpy.types.Mesh:
-    """Make a mesh with a vertex a node and an edge to what carries it.
+    """Make a mesh with one vertex per node and an edge to its parent.
 
     Attributes of the vertices: ``node`` (its number), ``radius`` [m], ``root`` (1 there), ``flags``
     of the worker, and the marks of :class:`~..skeleton_edits.Nodes`.
@@ -52,7 +52,7 @@ def as_given(mesh: bpy.types.Mesh) -> Skeleton:
 
 
 def flags_of(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Return the worker's flags of the nodes that it gave, shape [n]."""
+    """Return the worker's flags of its nodes, shape [n]."""
     return np.array(mesh[_FLAGS_KEY], int)
 
 
@@ -65,7 +65,7 @@ def is_of(mesh: bpy.types.Mesh, skeleton: Skeleton) -> bool:
 
 
 def is_edited(thing: bpy.types.Object) -> bool:
-    """Whether the nodes are not as the worker gave them."""
+    """Whether the nodes differ from those that the worker gave."""
     try:
         return bool(edits_of(as_given(thing.data), nodes_of(thing)))
     except SkeletonEditError:
@@ -78,7 +78,7 @@ def as_it_was(mesh: bpy.types.Mesh) -> bpy.types.Mesh:
 
 
 def nodes_of(thing: bpy.types.Object) -> Nodes:
-    """Return the nodes as they are now, in Edit Mode too."""
+    """Return the present nodes, in Edit Mode too."""
     with nodes_edited(thing, is_changed=False) as builder:
         layer = {name: builder.verts.layers.int[name] for name in _INTEGERS}
         radius = builder.verts.layers.float["radius"]
@@ -96,7 +96,7 @@ def nodes_of(thing: bpy.types.Object) -> Nodes:
 @contextmanager
 def nodes_edited(thing: bpy.types.Object, *, is_changed: bool = True,
                  ) -> Iterator[bmesh.types.BMesh]:
-    """Give the mesh of ``thing`` to be read or changed, in Edit Mode as in Object Mode."""
+    """Provide the mesh of ``thing`` for reading or changing, in Edit Mode and in Object Mode."""
     if thing.mode == "EDIT":
         builder = bmesh.from_edit_mesh(thing.data)
         builder.verts.index_update()
@@ -125,7 +125,7 @@ def mark(builder: bmesh.types.BMesh, vertex: bmesh.types.BMVert, kind: Mark,
 
 
 def set_root(builder: bmesh.types.BMesh, vertex: bmesh.types.BMVert) -> None:
-    """Make a node the root, and no other."""
+    """Make a node the only root."""
     layer = builder.verts.layers.int["root"]
     for other in builder.verts:
         other[layer] = int(other is vertex)

@@ -30,13 +30,13 @@ def main(arguments: list[str]) -> None:
     if given.frame is not None:
         scene.frame_set(given.frame)
     bpy.ops.limber.color_by(scalar=given.colour, each_frame=given.frame is not None)
-    # What was opened is active. Nothing else is in the picture: no startup cube, no lamp, nor the
-    # grey rest shape, in which an unbent branch lies.
+    # The opened branch is active. The picture has nothing else: no startup cube, no lamp, and not
+    # the grey rest shape, inside which an unbent branch is.
     branch = bpy.context.view_layer.objects.active.users_collection[0]
     for thing in scene.objects:
         thing.hide_render |= thing.name not in branch.all_objects or (
             thing.get("limber_shows") == "rest")
-    # A camera that sees the branch whole in a picture of this shape, and a sun.
+    # A camera that shows the whole branch in a picture of this shape, and a sun.
     scene.render.resolution_x = scene.render.resolution_y = given.width
     bpy.ops.limber.turntable(frames=2)
     sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
 
 
 def check(picture: Path) -> None:
-    """Raise RuntimeError unless the picture shows a branch: opaque, with nothing around it."""
+    """Raise RuntimeError unless the picture shows a branch: opaque, on an empty background."""
     if not picture.is_file():
         raise RuntimeError(f"Blender rendered no {picture}.")
     image = bpy.data.images.load(str(picture))
@@ -76,5 +76,5 @@ if __name__ == "__main__":
     try:
         main(sys.argv[sys.argv.index("--") + 1:])
     except Exception as error:
-        # Blender itself would end with 0, whatever went wrong here.
+        # Blender itself would end with 0, whatever the error.
         sys.exit(f"{Path(__file__).name}: {error}")

@@ -50,5 +50,5 @@ if __name__ == "__main__":
     try:
         main(sys.argv[sys.argv.index("--") + 1:])
     except Exception as error:
-        # Blender itself would end with 0, whatever went wrong here.
+        # Blender itself would end with 0, whatever the error.
         sys.exit(f"{Path(__file__).name}: {error}")

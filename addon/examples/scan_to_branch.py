@@ -23,7 +23,7 @@ def main(arguments: list[str]) -> None:
 
     settings = bpy.context.scene.limber
     settings.reconstruct.unit = given.unit
-    # Operators take what panels show as keyword arguments; an error raises RuntimeError.
+    # Operators take the panels' settings as keyword arguments; an error raises RuntimeError.
     bpy.ops.limber.import_cloud(filepath=str(given.scan.resolve()))
     bpy.ops.limber.reconstruct(young=given.young)
     bpy.ops.limber.open_result()
@@ -38,5 +38,5 @@ if __name__ == "__main__":
     try:
         main(sys.argv[sys.argv.index("--") + 1:])
     except Exception as error:
-        # Blender itself would end with 0, whatever went wrong here.
+        # Blender itself would end with 0, whatever the error.
         sys.exit(f"{Path(__file__).name}: {error}")

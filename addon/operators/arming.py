@@ -1,4 +1,4 @@
-"""Let a robot move, once somebody has typed the name of what it shall do."""
+"""Let a robot move, once a person has typed the name of the motion."""
 
 from typing import ClassVar
 
@@ -15,7 +15,7 @@ _WARNING = ("The robot will move. Clear its workspace, and keep a hand",
 
 
 class MovesRobot(StageOperator):
-    """Mix-in: a stage that moves a robot; the worker compares what was typed with ``name``."""
+    """Mix-in: a stage that moves a robot; the worker compares the typed text with ``name``."""
 
     confirm: bpy.props.StringProperty(
         name="Name to Confirm", options={"SKIP_SAVE"},
@@ -60,11 +60,11 @@ class MovesRobot(StageOperator):
         return ["--confirm", self.confirm, "--after-stop", "hold"]
 
     def name_of(self, context) -> str:
-        """Return what has to be typed."""
+        """Return the text that has to be typed."""
         return properties.group_of(context.scene, self.stage).name
 
     def trouble(self, context) -> str:
-        """Return why the robot may not move yet, or nothing."""
+        """Return why the robot may not move yet, or an empty text."""
         return ""
 
 
@@ -94,11 +94,12 @@ class LIMBER_OT_arm(MovesRobot, bpy.types.Operator):
         return why_not_armed(context)
 
     def _take_keywords(self, context) -> None:
-        """It has none of the stage's: the panel's settings are those of the dry run."""
+        """It has no properties of the stage: the panel's settings are those of the dry run."""
 
 
 def why_not_armed(context: bpy.types.Context) -> str:
-    """Return why the plan may not be followed yet: it was not checked as it is now; or nothing."""
+    """Return why the plan may not be followed yet, for lack of a current check; or an empty text.
+    """
     stage, folder = stages()["execute"], branches.current_folder(context.scene)
     if folder is None:
         return "Open a branch first"

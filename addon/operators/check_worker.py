@@ -1,4 +1,4 @@
-"""Ask the worker what it is and what it lacks."""
+"""Ask the worker for its version and what it lacks."""
 
 import json
 

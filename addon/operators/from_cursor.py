@@ -11,7 +11,7 @@ from ..stages import stages
 from ..steps import PLACES, REGIONS
 
 _BALLS = ("goal", "tip_goal")
-"""Regions that are a ball; the others are boxes."""
+"""Regions that are balls; the others are boxes."""
 
 
 class LIMBER_OT_from_cursor(bpy.types.Operator):
@@ -68,7 +68,7 @@ class LIMBER_OT_from_object(bpy.types.Operator):
     def execute(self, context):
         thing, plan = context.active_object, context.scene.limber.plan
         if (place := goal_ball.place_of(thing)) is not None and self.region in _BALLS:
-            # Its size is for the eye; the tolerance stays.
+            # Its size is only visual; the tolerance stays.
             setattr(plan, self.region, place)
             setattr(plan, properties.OPEN + self.region, True)
             return {"FINISHED"}
@@ -82,7 +82,7 @@ class LIMBER_OT_from_object(bpy.types.Operator):
             given = {"workspace_low": low, "workspace_high": high}
         else:
             given = {self.region: tuple((a + b) / 2 for a, b in zip(low, high, strict=True))}
-            # Of an empty, a point: the tolerance stays.
+            # An empty gives a point: the tolerance stays.
             plan.goal_tolerance = max(b - a for a, b in zip(low, high, strict=True)) / 2 or (
                 plan.goal_tolerance)
         for name, value in given.items():
@@ -116,7 +116,7 @@ class LIMBER_OT_crop_scan(bpy.types.Operator):
             self.report({"ERROR"}, "No points are selected. Select the points to keep in Edit "
                                    "Mode, or an object around them.")
             return {"CANCELLED"}
-        # The file's own numbers: in double precision, since maps have large ones.
+        # The file's own numbers: in double precision, since map coordinates are large.
         offset = scan.get(branches.OFFSET_KEY, (0.0,) * 3)
         settings = context.scene.limber.reconstruct
         for name, bound in (("crop_low", min), ("crop_high", max)):
@@ -128,7 +128,7 @@ class LIMBER_OT_crop_scan(bpy.types.Operator):
 
 
 def _scan_of(context: bpy.types.Context) -> bpy.types.Object | None:
-    """Return the scan that is active, else that of the current branch."""
+    """Return the active scan, else that of the current branch."""
     active = context.active_object
     if active is not None and branches.SCAN_KEY in active:
         return active

@@ -1,4 +1,4 @@
-"""Grab the branch where the mouse is and bend it by hand, the worker answering in real time."""
+"""Grab the branch at the mouse and bend it by hand, with the worker's answers in real time."""
 
 import enum
 import time
@@ -22,8 +22,9 @@ from .live_loads import LiveLoads
 from .needs_result import NeedsBranchInObjectMode, check_identity
 
 _INTERVAL_SECONDS = 1 / 120
-"""Between two looks for a frame: the session makes up to 60 a second, and half of this is how long
-one waits on average before it is seen."""
+"""Interval between two checks for a frame: the session makes up to 60 a second, and the average
+delay is half of this.
+"""
 _KEYS = ("Drag: bend | F: add a fruit | C: cut here | Enter: keep for a simulation | S, G: keep "
          "as the plan's start, goal | Esc: release and exit")
 _LOADING = "The branch is being loaded | Esc: exit"
@@ -37,7 +38,7 @@ _NORMAL, _OVER = (1.0, 1.0, 1.0, 1.0), (1.0, 0.25, 0.2, 1.0)
 
 
 class Kept(enum.Enum):
-    """What becomes of a grab that is kept."""
+    """Use of a grab that is kept."""
 
     MOTION = "RET"
     START = "S"
@@ -46,16 +47,16 @@ class Kept(enum.Enum):
 
 @dataclass
 class Hold:
-    """What the mouse holds.
+    """The place that the mouse holds.
 
     Attributes:
-        rest: Where that place is on the branch as it was scanned [m]; once the grasp is known,
-            its centre there.
-        begin: Where it was when the mouse took it, in the world.
+        rest: Position of that place on the branch as scanned [m]; once the grasp is known, its
+            centre there.
+        begin: Its position when the mouse took it, in the world.
         asked: Number of the command that the session answers with the grasp.
-        number: Of the grasp, None until it is known.
-        position: Where the grasp was when it was taken [m].
-        wanted: Where it is to be [m].
+        number: Number of the grasp, None until it is known.
+        position: Position of the grasp when it was taken [m].
+        wanted: Target position [m].
         is_dragged: Whether the mouse button is down.
     """
 
@@ -104,7 +105,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             return {"CANCELLED"}
         self._begin(context)
         if event.type == "LEFTMOUSE":
-            # Of the tool: what is pressed is taken as soon as the branch is there.
+            # For the tool: a pressed button takes effect as soon as the branch is ready.
             self._waiting = (event.mouse_region_x, event.mouse_region_y)
         return {"RUNNING_MODAL"}
 
@@ -118,7 +119,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             return {"CANCELLED"}
 
     def cancel(self, context):
-        """Blender closes or loads another file: the session must not live on unseen."""
+        """Blender closes or loads another file: the session must not continue unseen."""
         self._end(context)
 
     def _begin(self, context) -> None:
@@ -135,7 +136,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             motion.show_viewport = False
         self._area, self._region = context.area, context.region
         if self._region.type != "WINDOW":
-            # Pressed in the sidebar: the view beside it is meant.
+            # Pressed in the sidebar: it refers to the view beside it.
             self._region = next(r for r in context.area.regions if r.type == "WINDOW")
         self._timer = context.window_manager.event_timer_add(_INTERVAL_SECONDS,
                                                              window=context.window)
@@ -153,7 +154,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._mouse = self._in_region(event)
         is_dragged = self._hold is not None and self._hold.is_dragged
         if event.type in {"LEFTMOUSE", "MOUSEMOVE"} and not is_dragged and not self._is_view(event):
-            # Sidebar, toolbar and other editors stay in use.
+            # Sidebar, toolbar and other editors stay usable.
             return {"PASS_THROUGH"}
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             self._waiting = self._mouse
@@ -163,7 +164,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
                 self._hold.is_dragged = False
         elif event.type == "MOUSEMOVE" and is_dragged:
             self._drag()
-            # At once: the next timer may be as long away as the answer takes.
+            # At once: the next timer may be as far away as the answer.
             self._send()
         elif event.type in _PLACED and event.value == "PRESS":
             if (seen := self._seen(context, self._mouse)) is not None:
@@ -177,7 +178,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def _answered(self, context):
-        """Take in what the session has said, show its newest frame, say where to go."""
+        """Read the session's messages, show its newest frame, send the next target."""
         for told in self._session.poll():
             if self._loads.hear(told):
                 if self._loads.error:
@@ -217,13 +218,13 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             one.share > 1.0 for one in self._reached))
 
     def _send(self) -> None:
-        """Say where the grasp is to go, if that is not said yet."""
+        """Send the grasp's target, if it was not sent yet."""
         if self._hold is not None and self._hold.wanted is not None and self._hold.number:
             self._session.move(self._hold.number, tuple(self._hold.wanted))
             self._hold.wanted = None
 
     def _draw_panel(self) -> None:
-        """Let the sidebar show the numbers, a few times a second."""
+        """Update the sidebar's numbers, a few times a second."""
         if time.monotonic() - self._panel_drawn > _PANEL_SECONDS:
             self._panel_drawn = time.monotonic()
             self._area.header_text_set(f"{self._rate.per_second()} frames/s, "
@@ -231,7 +232,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             next(r for r in self._area.regions if r.type == "UI").tag_redraw()
 
     def _take(self, context, mouse: tuple[int, int]) -> None:
-        """Hold the branch where the mouse is; what was held before is let go."""
+        """Hold the branch at the mouse; a previous grasp is released."""
         seen = self._seen(context, mouse)
         if seen is None:
             return
@@ -242,7 +243,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._hold = Hold(rest, place, self._session.grasp(tuple(rest), self.radius))
 
     def _seen(self, context, mouse: tuple[int, int]) -> tuple[Vector, Vector] | None:
-        """Return the place under the mouse: on the branch as it was scanned, and in the world."""
+        """Return the position under the mouse: on the branch as scanned, and in the world."""
         view = self._area.spaces.active.region_3d
         origin = view3d_utils.region_2d_to_origin_3d(self._region, view, mouse)
         direction = view3d_utils.region_2d_to_vector_3d(self._region, view, mouse)
@@ -269,7 +270,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._drag()
 
     def _drag(self) -> None:
-        """Want the grasp where the mouse is, in the plane of the view through where it was."""
+        """Set the target to the mouse, in the view's plane through the grasp's first position."""
         hold = self._hold
         if hold.position is None:
             return
@@ -317,7 +318,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
     _target: Vector | None = None
 
     def _end(self, context, *, is_kept: bool = False) -> None:
-        """Let go, and show the branch as it was shown before."""
+        """Release, and show the branch as before."""
         if self._session is None:
             return
         context.window_manager.event_timer_remove(self._timer)
@@ -338,7 +339,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         return event.mouse_x - self._region.x, event.mouse_y - self._region.y
 
     def _is_view(self, event) -> bool:
-        """Whether the mouse is over the view itself: sidebar and toolbar lie upon it."""
+        """Whether the mouse is over the view itself: sidebar and toolbar overlap it."""
         def covers(region) -> bool:
             return (0 <= event.mouse_x - region.x < region.width
                     and 0 <= event.mouse_y - region.y < region.height)
@@ -346,7 +347,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             covers(region) for region in self._area.regions if region != self._region)
 
     def _draw(self) -> None:
-        """Write at the mouse what holds the branch and who says so."""
+        """Write at the mouse which forces hold the branch, and the model that answers."""
         if bpy.context.region != self._region:
             return
         lines, colour = self._lines()
@@ -381,7 +382,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         return lines, limits.colour_of(self._reached[0].share) if self._reached else _NORMAL
 
     def _held_at(self) -> tuple[float, float] | None:
-        """Return where the grasp is in the view [pixels]; None where nothing is held or seen."""
+        """Return the position of the grasp in the view [pixels]; None if none is held or seen."""
         hold = self._hold
         if hold is None or hold.position is None:
             return None

@@ -1,4 +1,4 @@
-"""The tool in the toolbar, and the shortcut, with which the branch is grabbed."""
+"""The tool in the toolbar, and the shortcut, to grab the branch."""
 
 import bpy
 
@@ -23,7 +23,7 @@ def register() -> None:
     if bpy.app.background:
         return
     bpy.utils.register_tool(LIMBER_TOOL_grab, after={"builtin.transform"}, separator=True)
-    # Among the add-ons' shortcuts: the user's own come before them, and may change them.
+    # Among the add-ons' shortcuts: the user's own have priority, and may change them.
     keys = bpy.context.window_manager.keyconfigs.addon
     if keys is not None:
         keymap = keys.keymaps.new("Object Mode")

@@ -1,4 +1,4 @@
-"""Import a scan, to look at it: from the tab, from File > Import, or dropped into a view."""
+"""Import a scan for viewing: from the tab, from File > Import, or dropped into a view."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -43,7 +43,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         path = self._path(context)
         if not self._is_from_user:
             return self._show(context, lambda: scans.read_scan(path))
-        # The interface goes on while the points are read.
+        # The interface stays usable while the points are read.
         self._reading = scans.Reading(path)
         manager = context.window_manager
         self._timer = manager.event_timer_add(_INTERVAL_SECONDS, window=context.window)
@@ -58,7 +58,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         return self._show(context, self._reading.scan)
 
     def cancel(self, context):
-        """Blender closes or loads another file: what is being read is shown nowhere."""
+        """Blender closes or loads another file: the points being read are not shown."""
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None

@@ -1,4 +1,4 @@
-"""The limits of the plan while the branch is held: how near each is, in words and as colour."""
+"""The limits of the plan while the branch is held: the fraction reached, in words and as colour."""
 
 from dataclasses import dataclass
 
@@ -13,32 +13,32 @@ from ..session import HeldFrame
 from ..stages import stages
 
 _TINT = "limber_limit"
-"""Attribute of the colours that the branch has while it is over a limit."""
+"""Attribute of the branch's colours while it exceeds a limit."""
 _OVER_LINEAR = (0.80, 0.02, 0.02)
 _FAR, _NEAR, _OVER = (0.35, 0.85, 0.40), (1.0, 0.80, 0.20), (1.0, 0.20, 0.15)
 _NEAR_SHARE = 0.7
 _TIMES = 10.0
-"""From this fraction on, it is shown as a multiple of the limit."""
+"""Fraction above which it is shown as a multiple of the limit."""
 _RING_PIXELS, _RING_CORNERS = 11.0, 24
 
 
 @dataclass(frozen=True)
 class Reached:
-    """How much of a limit is reached: 1 at the limit."""
+    """Fraction of a limit that is reached: 1 at the limit."""
 
     title: str
     share: float
 
     @property
     def words(self) -> str:
-        """What the user reads."""
+        """The displayed text."""
         if self.share >= _TIMES:
             return f"{self.share:.0f} times the plan's {self.title}"
         return f"{100 * self.share:.0f} % of the plan's {self.title}"
 
 
 def reached(scene: bpy.types.Scene, frame: HeldFrame) -> list[Reached]:
-    """Return the limits that are set for the plan, the most used first."""
+    """Return the limits that are set for the plan, the one with the highest fraction first."""
     limits = properties.group_of(scene, stages()["plan"])
     held = {"max_force": ("force", sum(part * part for part in frame.force) ** 0.5),
             "max_energy": ("energy", frame.energy), "max_strain": ("strain", frame.strain)}
@@ -67,7 +67,7 @@ class Tint:
         return self._before is not None
 
     def show(self, on: bool) -> None:
-        """Turn it on or off; safe to call again."""
+        """Turn the tint on or off; safe to call again."""
         mesh = self._surface.data
         if on == self.is_on:
             return

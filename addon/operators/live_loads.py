@@ -1,6 +1,6 @@
-"""Wind, snow, fruit, cuts and weight on a branch that a session holds, as set by the sliders.
+"""Wind, snow, fruit, cuts and weight on a branch held by a session, as set by the sliders.
 
-The settings are those of the worker's stage `load`: what was tried by hand can then be run there.
+The settings are those of the worker's stage `load`: loads tried by hand can then be run there.
 """
 
 from typing import Any
@@ -16,15 +16,15 @@ from ..steps import PLACES
 _MASK = "Limber cut"
 _NOTHING = {"wind_m_s": [0.0] * 3, "snow_kg_m2": 0.0, "fruit": [], "cuts": []}
 lines: list[str] = []
-"""What the panel says while a branch is held."""
+"""Text of the panel while a branch is held."""
 
 
 class LiveLoads:
     """Sends the sliders' settings to a session, one request at a time.
 
     Args:
-        scene: Whose settings they are.
-        surface: The branch; what is cut off is hidden there until :meth:`end`.
+        scene: Scene of the settings.
+        surface: The branch; parts that are cut off are hidden there until :meth:`end`.
     """
 
     def __init__(self, scene: bpy.types.Scene, surface: bpy.types.Object):
@@ -45,11 +45,11 @@ class LiveLoads:
             self._sent[name] != nothing for name, nothing in _NOTHING.items())
 
     def vertex(self, number: int) -> int:
-        """Return which vertex of the branch one of those in sight is: cut ones are hidden."""
+        """Return the branch's vertex of a visible one: cut ones are hidden."""
         return number if self._left is None else int(self._left[number])
 
     def step(self, session: Session) -> None:
-        """Say what has changed, unless the last wish is not answered yet."""
+        """Send the changes, unless the last request is not answered yet."""
         if self._asked is not None or not session.hello:
             return
         if self._scene.limber.live_weight != self._weighs:
@@ -58,13 +58,13 @@ class LiveLoads:
         try:
             wanted = self._wanted()
         except SettingError:
-            # Half typed: what was said before still acts.
+            # Half typed: the previous loads still act.
             return
         if wanted != self._sent:
             self._sent, self._asked = wanted, session.load(**wanted)
 
     def hear(self, told: dict[str, Any]) -> bool:
-        """Take a reply or an error; returns whether it was for us."""
+        """Take a reply or an error; returns whether it was for the loads."""
         if self._asked is None or told.get("id") != self._asked:
             return False
         self._asked = None
@@ -83,7 +83,7 @@ class LiveLoads:
         setattr(self._group, name, f"{given}; {row}" if given.strip() else row)
 
     def tell(self, frame: HeldFrame) -> None:
-        """Write down for the panel what the loads do."""
+        """Describe the effect of the loads for the panel."""
         lines[:] = [f"Sag {1000 * frame.sag:.3g} mm",
                     f"Maximum strain {100 * frame.strain:.3g} %"]
         if self._reply.get("wind_force_n"):
@@ -94,7 +94,7 @@ class LiveLoads:
             lines.append(self.error)
 
     def end(self, *, is_kept: bool) -> None:
-        """Show all of the branch again; fruit and cuts go where they are not kept."""
+        """Show all of the branch again; fruit and cuts are removed unless they are kept."""
         lines.clear()
         if not is_kept:
             for name, text in self._before.items():

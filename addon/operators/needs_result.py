@@ -1,4 +1,4 @@
-"""What an operator of a branch needs before it can run: an opened result, or a branch folder."""
+"""Requirements of an operator of a branch: an opened result, or a branch folder."""
 
 from pathlib import Path
 from typing import Any
@@ -16,22 +16,22 @@ def is_open(operator: type, thing: bpy.types.Object | None) -> bool:
 
 
 def branch_property() -> Any:
-    """Return the property of an operator that says which branch its button is about."""
+    """Return the property of an operator that states the branch of its button."""
     return bpy.props.StringProperty(
         name="Branch", options={"HIDDEN", "SKIP_SAVE"},
         description="UUID of the branch that is meant. Empty: the current one")
 
 
 def needed_folder(scene: bpy.types.Scene, uuid: str = "") -> Path:
-    """Return the folder of the branch with a UUID, by default of the current one, to work in it.
+    """Return the folder of the branch with a UUID, by default of the current one, for work in it.
 
-    One that a job is about to make will do.
+    A folder that a job is about to make will do.
 
     Raises:
         ValueError: there is none, or the folder has another branch than the one that is shown.
     """
     if uuid and branches.current_uuid(scene) not in ("", uuid):
-        # Another one has become the current one since the button was drawn.
+        # Another branch has become the current one since the button was drawn.
         meant = branches.shown_with(scene, uuid)
         if len(meant) != 1:
             raise ValueError("The branch that was meant is no longer in the scene. Choose a branch "
@@ -65,10 +65,10 @@ def _there(folder: Path) -> Path:
 
 
 def check_identity(scene: bpy.types.Scene, folder: Path, uuid: str = "") -> None:
-    """Refuse a folder that has another branch than the one that is meant, or that is shown from it.
+    """Refuse a folder with another branch than the intended one, or than the one shown from it.
 
     Raises:
-        ValueError: so it is; nothing may be written there.
+        ValueError: it is another branch; the folder must not be written to.
     """
     shown = branches.shown_from(scene, folder)
     meant = uuid or ("" if shown is None else shown.get(branches.UUID_KEY, ""))
@@ -88,7 +88,7 @@ class NeedsBranch:
 
 
 class NeedsBranchInObjectMode:
-    """Mix-in: needs a branch in the scene, and nothing that is being edited."""
+    """Mix-in: needs a branch in the scene, and no object in Edit Mode."""
 
     @classmethod
     def poll(cls, context):

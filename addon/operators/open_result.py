@@ -65,12 +65,12 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         if trouble := frame_colours.keep(data):
             self.report({"WARNING"}, trouble)
         if scene.place_scans(context.scene, data):
-            # The branch would be buried under it; a switch in the panel brings it back.
+            # It would hide the branch; a switch in the panel shows it again.
             context.scene.limber.show_scan = False
         if data.info.get("plan"):
-            # Its numbers are those that the panel shall show.
+            # Its numbers are those for the panel.
             context.scene.limber.plan.name = data.info["plan"]
-            # The plan in sight is the one that a robot would follow.
+            # The visible plan is the one that a robot would follow.
             context.scene.limber.execute.name = data.info["plan"]
         self._take_over_settings(context, data.folder)
         hidden = clear_view(context.scene)
@@ -79,7 +79,8 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(told)}")
 
     def _take_over_settings(self, context, folder: Path) -> None:
-        """Set the panels to what the branch was made with: running again then changes nothing."""
+        """Set the panels to the settings that made the branch: running again then changes nothing.
+        """
         record = branch_folder.read_record(folder)
         for stage in stages().values() if record else ():
             group = properties.group_of(context.scene, stage)

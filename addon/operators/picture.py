@@ -12,7 +12,7 @@ from ..scene_data import SceneData
 from .needs_result import NeedsBranchInObjectMode
 
 _KEY = "limber_picture"
-"""Of the collections that this operator made: pressed again, they are made anew."""
+"""Key of the collections that this operator made: pressed again, it makes them again."""
 _HIGH = studio.Picture(width=1440)
 """1080 pixels high."""
 _FRONT = (0.0, 1.0, -0.15)
@@ -56,7 +56,7 @@ class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
 
 
 def _seen(scene: bpy.types.Scene, branch: bpy.types.Collection) -> np.ndarray:
-    """Return corners of all that is in the picture, at rest and moved [m], shape [n, 3]."""
+    """Return corners of everything in the picture, at rest and moved [m], shape [n, 3]."""
     frame, corners = scene.frame_current, []
     for each in {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end}:
         scene.frame_set(each)

@@ -1,4 +1,4 @@
-"""Run a stage of the worker with what is set in the scene: one operator a stage."""
+"""Run a stage of the worker with the scene's settings: one operator per stage."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ class StageOperator(WorkerOperator):
             self._take_keywords(context)
             trouble = "" if self.replace else self._foreign(context)
         except (ValueError, OSError):
-            # Starting it says the same, and where.
+            # Starting it reports the same, with the position.
             trouble = ""
         if not trouble or bpy.app.background or context.window is None:
             return super().invoke(context, event)
@@ -77,7 +77,7 @@ class StageOperator(WorkerOperator):
         if not first:
             return super()._start(context)
         try:
-            # What is wrong with the settings is said before anything runs.
+            # Errors in the settings are reported before anything runs.
             self.arguments(context)
             if self._lacks(context, stages()[first]):
                 how = "INVOKE_DEFAULT" if self._is_beside else "EXEC_DEFAULT"
@@ -110,12 +110,11 @@ class StageOperator(WorkerOperator):
         if bpy.app.background or not _is_seen(self.stage):
             return
         self._show_what_was_made(context)
-        # The folder that this job filled, whatever the scene names by now.
+        # The folder that this job filled, whichever one the scene names by now.
         bpy.ops.limber.open_result("INVOKE_DEFAULT", directory=str(self._folder))
 
     def _show_what_was_made(self, context) -> None:
-        """Let the scene show the plan or the motion that this stage has just made, whatever it
-        was told to show before."""
+        """Show the plan or the motion that this stage has just made."""
         shown = context.scene.limber.scene
         made = next((name.removeprefix("frames/").removesuffix(".pc2")
                      for name in self.stage.writes if name.endswith(".pc2")), "")
@@ -147,7 +146,7 @@ class StageOperator(WorkerOperator):
                 setattr(group, properties.OPEN + name, True)
 
     def _source(self, context) -> Path:
-        """Return the scan or surface that a new branch is made of."""
+        """Return the scan or surface from which a new branch is made."""
         field = next(field for field in self.stage.fields.values() if field.is_argument)
         given = getattr(properties.group_of(context.scene, self.stage), field.name)
         path = Path(bpy.path.abspath(given)) if given else None
@@ -157,7 +156,7 @@ class StageOperator(WorkerOperator):
         return path
 
     def _foreign(self, context) -> str:
-        """Return why the folder is not this scan's, or nothing."""
+        """Return why the folder does not belong to this scan, or an empty text."""
         if not self.stage.makes_branch:
             return ""
         source = self._source(context)
@@ -168,7 +167,7 @@ class StageOperator(WorkerOperator):
 
 
 def _is_seen(stage: Stage) -> bool:
-    """Whether what the stage writes is shown in the scene."""
+    """Whether the stage's result is shown in the scene."""
     return any(name in ("mesh.vtu", "targets.json", "energy.npz")
                or name.startswith(("plans/", "frames/", "executions/")) for name in stage.writes)
 
@@ -186,10 +185,10 @@ def stage_operator(name: str, base: type = StageOperator) -> type:
 
 
 def _own_properties(stage: Stage) -> dict:
-    """Return the properties of a stage's operator by name: what panels keep."""
+    """Return the properties of a stage's operator by name: those that panels keep."""
     hidden = {name for field in stage.fields.values() if not field.is_kept
               for name in (field.name, properties.OPEN + field.name)}
-    # Not saved: what a script gave once is not given again by the button.
+    # Not saved: the button does not repeat what a script gave once.
     return {name: value for name, value in
             properties.stage_properties(stage, {"SKIP_SAVE"}).items() if name not in hidden}
 

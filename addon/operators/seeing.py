@@ -1,4 +1,4 @@
-"""What of a branch is in sight, and what its colours mean."""
+"""Visible parts of a branch, and the meaning of its colours."""
 
 from typing import ClassVar
 
@@ -23,7 +23,7 @@ GROUPS = {
     "observed": ("Measured Points", ("observed",)),
     "rest": ("Rest Shape", ("rest",)),
     "base": ("Fixed Base", ("base",))}
-"""What can be shown and hidden: its title, and the keys of the objects that show it."""
+"""Parts that can be shown and hidden: title, and the keys of the objects that show it."""
 NO_FRAMES = ("The values of each frame are missing from the branch folder, so the worst value "
              "over all frames is shown. Open the result again.")
 

@@ -10,7 +10,7 @@ from ..bridge import animation
 from .needs_result import NeedsBranch
 
 _GAP = 0.25
-"""Between branches that stand side by side, in widths of the widest."""
+"""Gap between branches side by side, in widths of the widest."""
 _MOST_LOOKED_AT = 2000
 
 
@@ -61,7 +61,7 @@ class LIMBER_OT_side_by_side(NeedsBranch, bpy.types.Operator):
 
 
 def _span(surface: bpy.types.Object) -> tuple[float, float]:
-    """Return from where to where a branch reaches along x where it was scanned [m]."""
+    """Return the range of a branch along x as scanned [m]."""
     along = [corner[0] for corner in surface.bound_box]
     return min(along), max(along)
 
@@ -109,13 +109,13 @@ class LIMBER_OT_relink(NeedsBranch, bpy.types.Operator):
 
 
 def is_lost(branch: bpy.types.Collection) -> bool:
-    """Whether the folder of a branch is not where it was."""
+    """Whether the folder of a branch is no longer at its path."""
     folder = Path(bpy.path.abspath(branch[branches.FOLDER_KEY]))
     return branch_folder.read_record(folder) is None
 
 
 def _set_folder(branch: bpy.types.Collection, folder: Path) -> None:
-    """Let a branch and its motion be in another folder."""
+    """Set another folder for a branch and its motion."""
     branch[branches.FOLDER_KEY] = animation.shown_path(folder)
     for thing in branch.objects:
         modifier = thing.modifiers.get(animation.MODIFIER)
@@ -127,12 +127,12 @@ def _set_folder(branch: bpy.types.Collection, folder: Path) -> None:
 def _is_of(branch: bpy.types.Collection, record: branch_folder.BranchRecord) -> bool:
     if branches.UUID_KEY in branch:
         return branch[branches.UUID_KEY] == record.uuid
-    # Of a file from before branches had a number of their own.
+    # From a file made before branches had a number of their own.
     return branch[branches.NAME_KEY] == record.name
 
 
 def _beside_file(branch: bpy.types.Collection) -> Path | None:
-    """Return the branch's folder if it lies in that of the .blend, or in a folder there."""
+    """Return the branch's folder if it is in the folder of the .blend, or in a subfolder."""
     if not bpy.data.filepath:
         return None
     home = Path(bpy.data.filepath).parent

@@ -1,4 +1,4 @@
-"""Give the branch's motion to other programs, and show it from all sides."""
+"""Export the branch's motion to other programs, and show it from all sides."""
 
 import math
 from pathlib import Path
@@ -111,7 +111,7 @@ class LIMBER_OT_turntable(NeedsBranchInObjectMode, bpy.types.Operator):
 
 
 def _half_angle(render: bpy.types.RenderSettings, lens: bpy.types.Camera) -> float:
-    """Return half of the angle [rad] that the shorter side of the picture sees."""
+    """Return half of the angle of view [rad] of the picture's shorter side."""
     sides = (render.resolution_x * render.pixel_aspect_x,
              render.resolution_y * render.pixel_aspect_y)
     # The lens's own angle is that of the longer side.
@@ -119,7 +119,8 @@ def _half_angle(render: bpy.types.RenderSettings, lens: bpy.types.Camera) -> flo
 
 
 def _turn(pivot: bpy.types.Object, first: int, frames: int) -> None:
-    """Key one turn at an even speed, each frame: no curve of the user's choice bends it."""
+    """Key one turn at constant speed, each frame: no interpolation of the user's choice changes it.
+    """
     for number in range(frames + 1):
         pivot.rotation_euler[2] = 2 * math.pi * number / frames
         pivot.keyframe_insert("rotation_euler", index=2, frame=first + number)

@@ -1,6 +1,6 @@
-"""Edit the skeleton: nodes are moved and deleted as any mesh's, the rest by these operators.
+"""Edit the skeleton: nodes are moved and deleted as in any mesh, the rest by these operators.
 
-Nothing is computed here: :class:`LIMBER_OT_apply_skeleton` hands what was changed to the worker.
+This module computes nothing: :class:`LIMBER_OT_apply_skeleton` passes the changes to the worker.
 """
 
 import json
@@ -118,7 +118,8 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
                                target[number] if target is not None else -1)
 
     def _chosen(self, builder: bmesh.types.BMesh, has_target: bool):
-        """Return the nodes meant, and the one that they lead to; SkeletonEditError without."""
+        """Return the selected nodes, and the one to which they attach; SkeletonEditError without.
+        """
         number = builder.verts.layers.int["node"]
         by_number = {vertex[number]: vertex for vertex in builder.verts}
         for given in (self.node, self.target):
@@ -143,7 +144,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
         layers = builder.verts.layers.int
         skeleton = skeletons.as_given(thing.data)
         by_number = {vertex[layers["node"]]: vertex for vertex in builder.verts}
-        # What is hung over to another branch stays.
+        # Nodes reattached to another branch stay.
         stops = {number for number, vertex in by_number.items()
                  if Mark(vertex[layers["mark"]]).has_target}
         gone = set().union(*(skeleton.outwards(vertex[layers["node"]], stops)

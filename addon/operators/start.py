@@ -13,7 +13,7 @@ WORKSPACE = "Limber"
 
 
 def example_folder() -> Path | None:
-    """Return where the example lies: in the extension, or beside the add-on in a checkout."""
+    """Return the example's folder: in the extension, or beside the add-on in a checkout."""
     here = Path(__file__).parents[1]
     places = (here / "example", here.parent / "blend_files")
     return next((place for place in places if (place / EXAMPLE / "branch.json").is_file()), None)
@@ -82,7 +82,7 @@ class LIMBER_OT_workspace(bpy.types.Operator):
             self.report({"ERROR"}, "A workspace can only be added in a window.")
             return {"CANCELLED"}
         bpy.ops.workspace.duplicate()
-        # Blender goes to the copy when it next draws.
+        # Blender opens the copy when it next draws.
         bpy.app.timers.register(_set_up, first_interval=0.2)
         return {"FINISHED"}
 
@@ -96,19 +96,19 @@ def _set_up() -> None:
 
 
 def _choose_tab() -> None:
-    """A sidebar has its tabs once it has been drawn."""
+    """A sidebar has its tabs only after it has been drawn."""
     for area in bpy.context.window_manager.windows[0].screen.areas:
         if area.type == "VIEW_3D":
             sidebar = next(region for region in area.regions if region.type == "UI")
             try:
                 sidebar.active_panel_category = "Limber"
             except TypeError:
-                # Not drawn (too narrow): the user opens it there.
+                # Not drawn (too narrow): the user opens it.
                 continue
 
 
 def show_tab(screen: bpy.types.Screen) -> None:
-    """Let the 3D views of a screen show colours at vertices and their sidebar."""
+    """Set the 3D views of a screen to show vertex colours and their sidebar."""
     for area in screen.areas:
         if area.type == "VIEW_3D":
             area.spaces.active.shading.color_type = "VERTEX"

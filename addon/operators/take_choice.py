@@ -1,4 +1,4 @@
-"""Do what an error offers instead: set the option that it names, and run the stage again."""
+"""Take a choice that an error offers: set its option, and run the stage again."""
 
 import json
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""Where the user looks after an action."""
+"""The view after an action."""
 
 import bpy
 
@@ -6,7 +6,7 @@ from .. import branches, startup_cube
 
 
 def clear_view(scene: bpy.types.Scene) -> str:
-    """Hide Blender's startup cube, which encloses a branch; returns what the user reads of it."""
+    """Hide Blender's startup cube, which encloses a branch; returns a text for the user."""
     cube = startup_cube.find(scene)
     if cube is None:
         return ""
@@ -15,10 +15,10 @@ def clear_view(scene: bpy.types.Scene) -> str:
 
 
 def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
-    """Make ``thing`` active, and let the 3D views show it whole, in its colours; one undo step.
+    """Make ``thing`` active, and show it whole in the 3D views, in its colours; one undo step.
 
-    Not selected: an outline would lie over the colours of thin twigs. Without a window there is
-    no view to set.
+    Not selected: an outline would cover the colours of thin twigs. Without a window there is no
+    view to set.
     """
     branches.activate(context.scene, thing)
     if bpy.app.background or context.window is None:

@@ -10,11 +10,11 @@ _INTERVAL_SECONDS = 0.1
 
 
 class WorkerOperator:
-    """Mix-in: ``arguments`` says what to run, ``finish`` what to do with the result.
+    """Mix-in: ``arguments`` states what to run, ``finish`` what to do with the result.
 
-    Called from a button it runs beside the interface, after what runs or waits already; from a
-    script or without a window it is waited for. ``folder`` is the branch folder that it is about;
-    ``is_next`` lets it run before all that waits.
+    Called from a button it runs beside the interface, after running or waiting jobs. From a script
+    or without a window the call waits for it. ``folder`` is its branch folder; ``is_next`` puts it
+    before all waiting jobs.
     """
 
     title = "Working"
@@ -35,7 +35,8 @@ class WorkerOperator:
         raise NotImplementedError
 
     def folder(self, context: bpy.types.Context) -> str:
-        """Return the branch folder that it is about, absolute, after ``arguments``; or nothing."""
+        """Return the absolute branch folder of the operator, after ``arguments``; or an empty text.
+        """
         return ""
 
     def finish(self, context: bpy.types.Context, result: dict) -> None:
@@ -69,16 +70,16 @@ class WorkerOperator:
         return self._end(context)
 
     def cancel(self, context):
-        """Blender closes or loads another file: the worker must not live on unseen."""
+        """Blender closes or loads another file: the worker must not continue unseen."""
         self._remove_timer(context)
         if self._job is not None:
-            # Not a failure: the panel of the next file shall not show one.
+            # Not a failure: the panel of the next file must not show one.
             self._job.cancel()
             self._job.stop_now()
             self._job.poll()
 
     def ended(self, context: bpy.types.Context, outcome: dict) -> None:
-        """Keep how it ended: ``status``, ``error``, ``warnings``, ``seconds``."""
+        """Keep its outcome: ``status``, ``error``, ``warnings``, ``seconds``."""
 
     def _start(self, context) -> bool:
         try:
@@ -126,7 +127,7 @@ def _no_result(job: jobs.Job) -> str:
 
 
 def redraw_sidebars(context: bpy.types.Context) -> None:
-    """Let the panels be drawn again; not the view: a million points take their time."""
+    """Redraw the panels, but not the view: a million points take their time."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PREFERENCES":

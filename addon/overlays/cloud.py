@@ -12,7 +12,7 @@ from ..branches import SCAN_KEY
 from ..bridge import meshes
 
 COLOUR = "scan_color"
-"""Attribute of a scan's vertices, where its file has colours."""
+"""Attribute of a scan's vertices, if its file has colours."""
 _PLAIN = (0.55, 0.75, 0.95, 1.0)
 _SIZE = 3.0
 _batches: dict[tuple, gpu.types.GPUBatch] = {}
@@ -43,9 +43,9 @@ def _draw() -> None:
 
 
 def _before_loose_vertices(projection: Matrix, view_distance: float) -> Matrix:
-    """Return a projection that draws a little nearer than Blender 5 draws its own loose vertices.
+    """Return a projection that draws slightly nearer than Blender 5 draws its own loose vertices.
 
-    It brings those forward, by GPU_polygon_offset_calc, so that faces do not hide them.
+    It moves those forward, by GPU_polygon_offset_calc, so that faces do not hide them.
     """
     is_perspective = projection[3][3] < 0.5
     nearer = -0.0125 * projection[2][3] if is_perspective else 5e-5 * view_distance
@@ -55,7 +55,7 @@ def _before_loose_vertices(projection: Matrix, view_distance: float) -> Matrix:
 
 
 def colours_of(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Return the colours of a scan's points as a screen takes them, float32, shape [n, 4]."""
+    """Return the sRGB colours of a scan's points, float32, shape [n, 4]."""
     count = len(mesh.vertices)
     attribute = mesh.attributes.get(COLOUR)
     if attribute is None:

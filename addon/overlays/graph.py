@@ -1,7 +1,6 @@
 """A graph in the 3D view's lower right corner: Young's modulus along the branch, energy, force.
 
-The worker says where everything stands in the frame (``limber.results.scene.graphs``); here it is
-drawn.
+The worker states all positions in the frame (``limber.results.scene.graphs``); here it is drawn.
 """
 
 import blf
@@ -16,7 +15,7 @@ from . import covered_width
 NONE = "none"
 GRAPHS = {"young": "Young's modulus along the branch", "energy": "Energy along the paths",
           "force": "Force of the pull"}
-"""Graphs that a branch may have, by their name in what the worker says."""
+"""Graphs that a branch may have, by their name in the worker's data."""
 _WIDTH, _HEIGHT = 230, 110
 _LEFT, _BELOW, _ABOVE, _RIGHT = 62, 38, 42, 14
 _MARGIN, _TEXT, _DOT = 18, 11, 3.0
@@ -41,7 +40,7 @@ def strip(rows: list[list[float]]) -> tuple[list, list]:
 
 
 class _Frame:
-    """The frame of a graph, in pixels: where shares of its width and height are."""
+    """The frame of a graph, in pixels: positions of fractions of its width and height."""
 
     def __init__(self, x: float, y: float, size: float):
         self.x, self.y, self.size = x, y, size
@@ -52,7 +51,7 @@ class _Frame:
 
     def draw(self, kind: str, points, color, triangles=None) -> None:
         places = [self.at(point) for point in points]
-        # Text that was written before has set it back.
+        # Text written before has reset it.
         gpu.state.blend_set("ALPHA")
         self.shader.bind()
         self.shader.uniform_float("color", color)
@@ -127,7 +126,8 @@ def _draw_content(frame: _Frame, graph: dict, cursor: float | None) -> None:
 
 
 def cursor_of(name: str, surface: bpy.types.Object, scene: bpy.types.Scene) -> float | None:
-    """Return where the frame in sight stands in a graph, None where it is of something else."""
+    """Return the position of the visible frame in a graph, None if the graph is of something else.
+    """
     info = branches.info_of(surface)
     places = graphs_of(surface)[name].get("cursor") or []
     frames, observation = info.get("frames") or {}, info.get("observation") or {}

@@ -18,7 +18,8 @@ _handle: list = []
 
 
 def shown_scales(surface: bpy.types.Object) -> list[dict]:
-    """Return the scales of what is coloured now: the branch's, then those of what is about it."""
+    """Return the scales of everything coloured now: the branch's, then those of its surroundings.
+    """
     scales = [frame_colours.shown_scale(surface) or _scale_at_rest(surface)]
     for thing in branches.branch_of(surface).objects:
         if branches.SCALE_KEY in thing and thing.visible_get():
@@ -46,7 +47,7 @@ def bar(stops: list[list[float]], x: float, y: float, width: float, height: floa
 
 
 def _display(value: float) -> float:
-    """Return a linear part of a colour as sRGB screens take it."""
+    """Return a linear component of a colour as sRGB."""
     return 12.92 * value if value < 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
 
 
@@ -72,7 +73,7 @@ def _draw() -> None:
 
 
 def _write(scale: dict, x: float, y: float, size: float) -> float:
-    """Write title and values of a scale; returns how wide it is [pixels]."""
+    """Write title and values of a scale; returns its width [pixels]."""
     blf.size(0, _TEXT * size)
     blf.color(0, 1.0, 1.0, 1.0, 1.0)
     blf.enable(0, blf.SHADOW)

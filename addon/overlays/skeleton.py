@@ -1,4 +1,4 @@
-"""Marks upon the nodes of a skeleton in sight: its root, what is edited, what is doubtful."""
+"""Marks on the nodes of a visible skeleton: its root, edited and uncertain nodes."""
 
 from dataclasses import dataclass, field
 
@@ -22,9 +22,9 @@ WORDS = {"root": "green: root", "edited": "orange: edited", "doubtful": "yellow:
 
 @dataclass(frozen=True)
 class Marks:
-    """Points of each colour [m], and lines to where marked nodes lead, two points each.
+    """Points of each colour [m], and lines from marked nodes to their targets, two points each.
 
-    ``edit_count`` is how many edits are not applied yet; ``trouble`` says why they cannot be.
+    ``edit_count`` is the number of edits not applied yet; ``trouble`` states why they cannot be.
     """
 
     points: dict[str, np.ndarray]
@@ -39,7 +39,7 @@ _handle: list = []
 
 
 def marks_in_sight(thing: bpy.types.Object) -> Marks:
-    """Return what is marked on a skeleton, looked at once for each state of it."""
+    """Return the marks of a skeleton, computed once for each state of it."""
     key = (thing.name, thing.data.name)
     if key not in _kept:
         _kept.clear()
@@ -48,7 +48,7 @@ def marks_in_sight(thing: bpy.types.Object) -> Marks:
 
 
 def marks_of(nodes: Nodes, mesh: bpy.types.Mesh) -> Marks:
-    """Return what is marked among the nodes of a skeleton's mesh."""
+    """Return the marks among the nodes of a skeleton's mesh."""
     given = skeletons.as_given(mesh)
     known = np.clip(nodes.number, 0, len(given.nodes) - 1)
     flags = skeletons.flags_of(mesh)[known]
@@ -103,7 +103,7 @@ def _draw_batch(batches: dict, name: str, kind: str, points: np.ndarray, color) 
 
 @persistent
 def _changed(_scene, depsgraph=None) -> None:
-    """Look at the nodes again only where a mesh or an object has changed."""
+    """Check the nodes again only if a mesh or an object has changed."""
     if depsgraph is None or depsgraph.id_type_updated("MESH") or (
             depsgraph.id_type_updated("OBJECT")):
         _kept.clear()

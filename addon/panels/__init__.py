@@ -1,1 +1,1 @@
-"""The sidebar tab "Limber": one step of the work a file."""
+"""The sidebar tab "Limber": one file per step of the work."""

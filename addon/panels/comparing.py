@@ -17,7 +17,7 @@ _PLAN = "plan:"
 
 def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
                record: BranchRecord | None, stress_share: float) -> None:
-    """Draw the planned path beside the one without energy, what is proven, and other plans.
+    """Draw the planned path beside the one without energy, proven bounds, and other plans.
 
     ``stress_share`` is the largest stress over the strength: beyond 1 the plan is not ticked.
     """
@@ -63,7 +63,7 @@ def draw_moduli(layout: bpy.types.UILayout, result: dict[str, Any]) -> None:
 
 
 def draw_branches(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the branches of the scene where there are several, and a button where one is lost."""
+    """Draw the branches of the scene if there are several, and a button if one is lost."""
     shown = branches.branches(context.scene)
     surface = branches.find_surface(context.scene)
     chosen = branches.branch_of(surface) if surface is not None else None
@@ -83,7 +83,7 @@ def draw_branches(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
 
 
 def _told(branch: bpy.types.Collection) -> str:
-    """Return E and the energy saved of a branch, as far as its folder knows them."""
+    """Return E and the energy saved of a branch, as far as its folder has them."""
     record = branch_folder.read_record(bpy.path.abspath(branch[branches.FOLDER_KEY]))
     if record is None:
         return "folder not found"

@@ -1,4 +1,4 @@
-"""What the worker is doing, on top of the tab while it works or after it failed."""
+"""The worker's activity, at the top of the tab while it works or after it failed."""
 
 import textwrap
 
@@ -12,7 +12,7 @@ _LETTERS = 40
 _LOG_LINES = 12
 _MODULI_LINES = 8
 _OPEN = 100.0
-"""A modulus that may be so many times more or less is not known."""
+"""Factor of uncertainty above which a modulus counts as unknown."""
 
 
 class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
@@ -71,7 +71,7 @@ def _draw_log(layout: bpy.types.UILayout, job: jobs.Job) -> None:
 
 
 def time_words(job: jobs.Job) -> str:
-    """Return for how long a job has run, and how long it will still take if that is known."""
+    """Return the running time of a job, and its remaining time if that is known."""
     words = f"{_span(job.elapsed())} so far"
     remaining = job.remaining()
     return words if remaining is None else f"{words}, about {_span(remaining)} left"
@@ -98,7 +98,7 @@ def number_lines(numbers: dict) -> list[str]:
 
 
 def _with_interval(value: str, factor: str) -> str:
-    """Return a modulus as what its interval's ends are, where a worker's words are numbers."""
+    """Return a modulus with its interval, if the worker's words are numbers."""
     try:
         middle, times = float(value), float(factor)
     except ValueError:

@@ -44,7 +44,7 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
 
 @persistent
 def _redraw_sidebars(*_) -> None:
-    """Keep frame and energy right while playing: Blender redraws the view alone."""
+    """Keep frame and energy current while playing: Blender redraws the view alone."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":

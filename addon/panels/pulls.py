@@ -7,7 +7,7 @@ from ..operators.replay import pulls_of
 
 
 def draw_pulls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the recordings of the branch; of that in sight, when it is and what is measured."""
+    """Draw the recordings of the branch; of the visible one, its time and measured values."""
     folder = branches.current_folder(context.scene)
     names = pulls_of(None if folder is None else branch_folder.read_record(folder))
     if not names:
@@ -25,7 +25,7 @@ def draw_pulls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 
 def _draw_timeline(layout: bpy.types.UILayout, context: bpy.types.Context, info: dict) -> None:
-    """Draw where in the recording the frame in sight is."""
+    """Draw the visible frame's position in the recording."""
     frames, scene = info["frames"], context.scene
     count = sum(thing.get(branches.SHOWS_KEY) == "observed" for thing in scene.objects)
     column = layout.column(align=True)

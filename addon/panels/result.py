@@ -1,4 +1,4 @@
-"""The branch: its folder, what it holds, and what its colours mean."""
+"""The branch: its folder, its contents, and the meaning of its colours."""
 
 import bpy
 
@@ -55,7 +55,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_live(layout: bpy.types.UILayout, settings) -> None:
-    """Draw what acts on the branch while it is held, and what it does."""
+    """Draw the loads on the branch while it is held, and their effect."""
     header, body = layout.panel("limber_live_loads", default_closed=True)
     header.label(text="Live Loads")
     if body is None:
@@ -74,7 +74,7 @@ def _draw_live(layout: bpy.types.UILayout, settings) -> None:
 
 
 def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:
-    """Draw what the branch can be coloured by, with the values that the colours span."""
+    """Draw the quantity that colours the branch, with the range of the colours."""
     info = branches.info_of(surface)
     header, body = layout.panel("limber_colours")
     header.label(text="Colours")
@@ -98,7 +98,7 @@ def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, setting
 
 
 class LIMBER_MT_colours(bpy.types.Menu):
-    """What the branch can be coloured by."""
+    """Quantities by which the branch can be coloured."""
 
     bl_idname = "LIMBER_MT_colours"
     bl_label = "Colour By"
@@ -115,7 +115,7 @@ class LIMBER_MT_colours(bpy.types.Menu):
 
 
 def _shown_scalar(surface: bpy.types.Object) -> str:
-    """Return the quantity that the branch is coloured by; nothing if by none."""
+    """Return the quantity by which the branch is coloured; empty if by none."""
     if shown := surface.get(branches.FRAME_SCALAR_KEY):
         return shown
     active = surface.data.color_attributes.active_color
@@ -134,14 +134,14 @@ def _scale(info: dict, settings, name: str) -> dict:
 
 
 def _span(scale: dict, rest: str) -> str:
-    """Return the values that the colours span, with what stands in brackets in the title."""
+    """Return the range of the colours, with the text in brackets in the title."""
     ticks = scale["ticks"]
     span = f"{ticks[1]} everywhere" if scale.get("is_one") else f"{ticks[0]} to {ticks[-1]}"
     return f"{span} ({rest}" if rest else span
 
 
 def _draw_in_sight(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:
-    """Draw what can be shown and hidden about the branch, and which graph stands in the view."""
+    """Draw the parts of the branch that can be shown and hidden, and the choice of graph."""
     header, body = layout.panel("limber_in_sight", default_closed=True)
     header.label(text="Show")
     if body is None:

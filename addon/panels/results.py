@@ -11,7 +11,7 @@ _LONGEST_LIST = 6
 
 
 def draw_results(layout: bpy.types.UILayout, name: str, result: dict[str, Any]) -> None:
-    """Draw a part that opens with the numbers of a result."""
+    """Draw a collapsible section with the numbers of a result."""
     lines = result_lines(result)
     if not lines:
         return

@@ -1,4 +1,4 @@
-"""The part of the robot's panel that arms it, and shows what it feels while it moves."""
+"""The part of the robot's panel that arms it, and shows its force while it moves."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ _seen: dict[str, bool] = {}
 
 
 def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the live force where a robot moves, else the button that lets it."""
+    """Draw the live force if a robot moves, else the button that lets it."""
     is_ours = _moving() is not None
     folder = _folder(context)
     live = live_force.read(folder) if folder is not None else None
@@ -64,13 +64,13 @@ def _titles_in_motion() -> tuple[str, ...]:
 
 
 def _folder(context: bpy.types.Context) -> Path | None:
-    """Return the folder of the branch that our robot moves, whichever is the current one."""
+    """Return the folder of the branch that the robot moves, whichever is the current one."""
     job = _moving()
     return branches.current_folder(context.scene) if job is None else Path(job.folder)
 
 
 def _look() -> float:
-    """Redraw the sidebars while a robot moves, whoever let it; returns when to look again [s]."""
+    """Redraw the sidebars while a robot moves; returns the time to the next check [s]."""
     folder = _folder(bpy.context)
     is_there = folder is not None and (folder / live_force.FILE).is_file()
     if is_there or _seen.get("there"):

@@ -1,4 +1,4 @@
-"""The part of the skeleton's panel with which its nodes are edited."""
+"""The part of the skeleton's panel that edits its nodes."""
 
 import textwrap
 
@@ -13,7 +13,7 @@ _LABELS = {"DELETE": "Delete Branch", "CONFIRM": "Confirm", "BRIDGE": "Bridge", 
 
 
 def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the buttons that edit nodes, and those that apply or discard what was done."""
+    """Draw the buttons that edit nodes, and those that apply or discard the edits."""
     thing = branches.find_skeleton(context.scene)
     if thing is None:
         return

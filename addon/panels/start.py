@@ -1,4 +1,4 @@
-"""What to do first, while the scene has neither a branch nor a scan."""
+"""First actions, while the scene has neither a branch nor a scan."""
 
 import bpy
 

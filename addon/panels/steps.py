@@ -1,4 +1,4 @@
-"""One panel a step of the work, drawn from the stages' schema."""
+"""One panel per step of the work, drawn from the stages' schema."""
 
 import json
 import textwrap
@@ -21,7 +21,7 @@ from .skeleton import draw_skeleton
 
 _FIRST_ORDER = 3
 _GRAPHS = {"estimate": "young", "plan": "energy"}
-"""Which graph a stage's result is seen in."""
+"""Graph that shows a stage's result."""
 _registered: list[type] = []
 
 
@@ -31,7 +31,7 @@ class StepPanel(SidebarPanel):
     step: Step
 
     def draw_header_preset(self, context):
-        """Show how far it is, at the right end of the header."""
+        """Show its state, at the right end of the header."""
         self.layout.label(text="", icon=step_state(context.scene, self.step).icon)
 
     def draw(self, context):
@@ -77,7 +77,7 @@ class StepPanel(SidebarPanel):
 
 
 def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord | None]:
-    """Return how far a stage is for the branch of ``scene``, and what its folder has of it."""
+    """Return the state of a stage for the branch of ``scene``, and its entry in the folder."""
     stage = stages()[name]
     folder = branches.current_folder(scene)
     record = None if folder is None else branch_folder.read_record(folder)
@@ -93,14 +93,14 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
     if outcome.get("status") == "failed":
         return StepState.FAILED, entry
     if entry is None:
-        # What makes no entry (a prediction) is done where it has ended well.
+        # A stage without an entry (a prediction) is done if it ended well.
         return (StepState.DONE if outcome.get("status") == "done"
                 and not stage.keeps_entry(values) else StepState.NOT_RUN), None
     return _age(stage, group, record, entry), entry
 
 
 def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
-    """Return how far a step is: by another of its stages that makes the same, where that was run.
+    """Return the state of a step, or of another stage with the same result if that was run.
     """
     state, _ = state_of(scene, step.view.stage)
     made = set(stages()[step.view.stage].writes)
@@ -112,8 +112,9 @@ def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
 
 
 def next_stage(scene: bpy.types.Scene) -> Stage | None:
-    """Return the first step's stage that was not run for the branch as it is, and can be now: what
-    it needs is there or set. None where there is none."""
+    """Return the first stage not yet run for the branch as it is, whose inputs exist or are set.
+    None if there is none.
+    """
     folder = branches.current_folder(scene)
     record = None if folder is None else branch_folder.read_record(folder)
     for step in STEPS if record is not None else ():
@@ -131,8 +132,7 @@ def next_stage(scene: bpy.types.Scene) -> Stage | None:
 
 
 def stress_share(scene: bpy.types.Scene) -> float:
-    """Return the largest stress over the strength of the plan that is set, where it is the one in
-    sight; 0 where that is not known."""
+    """Return the largest stress over the strength of the visible plan; 0 if unknown."""
     surface = branches.find_surface(scene)
     info = {} if surface is None else branches.info_of(surface)
     scale = info.get("scalars", {}).get("stress_over_strength")
@@ -150,7 +150,7 @@ def _age(stage: Stage, group: bpy.types.PropertyGroup, record: BranchRecord,
 
 def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView, *,
                 is_primary: bool) -> None:
-    """Draw what must be given, the button, the state, and what came out."""
+    """Draw the required fields, the button, the state, and the result."""
     stage = stages()[view.stage]
     required = [field.name for field in stage.own_fields if field.is_required]
     if view.stage != "reconstruct":
@@ -195,7 +195,7 @@ def _draw_scene_button(layout: bpy.types.UILayout, context: bpy.types.Context, s
 
 
 def _draw_origin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Say whether Young's modulus was measured: an assumed one looks the same in colours."""
+    """State whether Young's modulus was measured: an assumed one has the same colours."""
     is_estimated = state_of(context.scene, "estimate")[1] is not None
     layout.label(text="Young: estimated from pulls" if is_estimated else
                  "Young: assumed, not measured",
@@ -251,7 +251,7 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
 
 def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
                outcome: dict[str, Any]) -> None:
-    """Draw what was seen, a button for each choice, and the whole text on demand."""
+    """Draw what was seen, a button for each choice, and the full text on demand."""
     text = plain(outcome["error"], stage)
     short = first_sentence(text)
     _draw_text(layout, short, "ERROR")

@@ -1,1 +1,1 @@
-"""Benchmarks: one module a topic; each measures what an issue asked, and softens nothing."""
+"""Benchmarks: one module per topic; each measures what an issue required, and hides nothing."""

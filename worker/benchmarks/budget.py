@@ -1,4 +1,4 @@
-"""The time that a benchmark may take, and trials that stop while the next one still fits."""
+"""The time budget of a benchmark, and trials that stop when the next one no longer fits."""
 
 import re
 import time
@@ -18,8 +18,8 @@ class Budget:
     """Time until a deadline.
 
     Args:
-        seconds: From now on [s].
-        clock: Returns the time [s]; it never goes back.
+        seconds: Time from now on [s].
+        clock: Returns the time [s]; monotonic.
     """
 
     def __init__(self, seconds: float, clock: Callable[[], float] = time.monotonic):
@@ -38,8 +38,8 @@ class Budget:
     def items(self, items: Iterable[Task], at_least: int = 1) -> Iterator[Task]:
         """Yield items while the next trial fits, as long as the longest so far took.
 
-        The time of a trial is that of the loop's body. The first ``at_least`` are yielded whatever
-        is left.
+        A trial's time is that of the loop's body. The first ``at_least`` are yielded regardless of
+        the time left.
         """
         longest = 0.0
         for number, item in enumerate(items):
@@ -54,7 +54,7 @@ class Budget:
         return self.items(range(first, first + at_most), at_least)
 
     def shares(self, items: list[Task]) -> Iterator[tuple[Task, "Budget"]]:
-        """Yield each item with an even share of what is left then: of nothing after the end."""
+        """Yield each item with an even fraction of the time left then: none after the end."""
         for number, item in enumerate(items):
             yield item, self.part(self.remaining / (len(items) - number))
 
@@ -63,7 +63,7 @@ def parsed_seconds(text: str) -> float:
     """Return the seconds of a duration: ``90s``, ``15m``, ``1.5h``; a bare number is seconds.
 
     Raises:
-        ValueError: it is none, or not positive.
+        ValueError: it is not a duration, or is not positive.
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*([smh]?)", text.strip())
     seconds = float(found[1]) * _UNITS[found[2] or "s"] if found else 0.0
@@ -75,16 +75,16 @@ def parsed_seconds(text: str) -> float:
 def side_by_side(work: Callable[[Task], Result], tasks: Iterable[Task], budget: Budget,
                  workers: int | None = None, at_least: int = 1,
                  ) -> Iterator[tuple[Task, Result]]:
-    """Yield tasks with their results as they come, several processes at work.
+    """Yield tasks with their results as they come, on several processes.
 
-    No task begins for which the time is too short, as long as the longest so far took.
+    No task begins if the time left is shorter than the longest so far took.
 
     Args:
         work: A function of one task, which other processes can import.
         tasks: In the order in which they begin.
-        budget: What they may take together.
-        workers: How many at once; by default as many as there are cores.
-        at_least: So many begin whatever is left.
+        budget: Time for all of them.
+        workers: Number of parallel processes; by default the number of cores.
+        at_least: Number of tasks that begin regardless of the time left.
     """
     workers = workers or core_budget()
     if workers < 2:

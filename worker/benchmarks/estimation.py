@@ -1,4 +1,4 @@
-"""Measures of estimation: what was asked, what comes out.
+"""Measures of estimation: required and measured.
 
 The truth is always simulated on another, finer mesh than the fit, with noise of another seed.
 """
@@ -35,7 +35,7 @@ from limber.recordings.synchronisation import frames_of
 
 SETTINGS = EstimateSettings(hold_out=False)
 _BEAM_YOUNG_PA = (1.6e5, 4.0e5)
-"""Of simulated beams, least and most."""
+"""Range of simulated beams."""
 
 
 _TABLE = tuple(Asked(f"paper's table, {branch.name}: E1..E4 [1e7 Pa], nu", " ".join(
@@ -116,7 +116,7 @@ def _moved(truth: object, displacements: list) -> list[np.ndarray]:
 
 
 def _optimiser_rows(setting: Setting) -> list[Row]:
-    """Both from the same start; how many simulations each needs to Nelder-Mead's final loss."""
+    """Both from the same start; the simulations each needs to reach Nelder-Mead's final loss."""
     branch = BRANCHES[1]
     bench = Bench(branch)
     pull = measured(exact_pull(branch, 0, frames=40), setting.seed)
@@ -160,7 +160,7 @@ def _speed_rows(setting: Setting) -> list[Row]:
 
 
 def _reduced(bench: Bench, pull: Pull, found: Estimate) -> tuple[float, float, float]:
-    """Seconds with the basis built and with building it; how far E is from the full model's."""
+    """Seconds with the basis built and with building it; difference of E from the full model's."""
     settings, seconds = SETTINGS.model_copy(update={"forward": "reduced"}), []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(2):
@@ -173,10 +173,11 @@ def _reduced(bench: Bench, pull: Pull, found: Estimate) -> tuple[float, float, f
 
 def followed(bench: Bench, earlier: Pull, pull: Pull, found: Estimate,
              ) -> tuple[np.ndarray, float, float]:
-    """Follow a pull at its own pace, with what a rough fit of an earlier one gave to start with.
+    """Follow a pull at its own pace, starting from a rough fit of an earlier one.
 
     Returns:
-        Seconds of each frame; how far E is from the full fit's after the last frame, and settled.
+        Seconds of each frame; difference of E from the full fit's after the last frame, and
+        settled.
     """
     mesh = bench.mesh.with_data(cell_data={"young": np.full(bench.mesh.tet_count, 1e7)})
     subject = Subject(mesh, bench.branch.skeleton, bench.points, bench.weights,
@@ -224,7 +225,7 @@ def _beam_rows(_setting: Setting) -> list[Row]:
 
 
 def _other_loads_row(setting: Setting) -> list[Row]:
-    """Drawn beams, weighed with one load: how far the drops under others are off."""
+    """Drawn beams, weighed with one load: errors of the predicted drops under others."""
     source = source_digest(("estimation", "mechanics"), __file__, silicone_beam.__file__)
     trials = numbers_of("beam", setting.seeds(6, 1), partial(_simulated_beam, source=source),
                         source, setting.kept / "estimation-beam.jsonl", setting.budget,
@@ -245,7 +246,7 @@ def _simulated_beam(seed: int, source: str) -> Numbers:
         found = silicone_beam.estimate_beam(branch, path, silicone_beam.LOAD_N, "simulated")
         worst = 0.0
         for load in (0.0, 0.2, 1.0):
-            # Markers where they should be: what is compared is the beam.
+            # Markers at their nominal positions: the beam is compared.
             true = silicone_beam.drop(young, load, cells=(16, 5, 5))
             foretold = silicone_beam.predicted_drop(branch, "simulated", load)
             worst = max(worst, abs(foretold / true - 1))

@@ -1,7 +1,7 @@
-"""The paper's way of driving, by the measured force, beside driving by pose, under noise.
+"""The paper's drive by the measured force, compared with drive by pose, under noise.
 
 A force bends a branch little beyond its last control point, and its own noise moves all points at
-once: the outer modulus is known to within a factor, and the interval has to say so.
+once: the outer modulus is known only to within a factor, and the interval must reflect this.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ FORCE_ROWS = tuple(Asked(
 
 
 def force_rows(setting: Setting) -> list[Row]:
-    """Both drives on the three branches, one pull of 60 frames each, as many noises as fit."""
+    """Both drives on the three branches, one pull of 60 frames each, as many noise seeds as fit."""
     source = source_digest(("estimation",), __file__, paper_branches.__file__)
     tasks = [len(BRANCHES) * seed + number for seed in setting.seeds(20, 2)
              for number in range(len(BRANCHES))]
@@ -49,7 +49,7 @@ def force_rows(setting: Setting) -> list[Row]:
 
 
 def fitted(task: int, source: str) -> Numbers:
-    """Relative errors, and whether the intervals hold the truth, for each drive.
+    """Relative errors, and whether the intervals contain the truth, for each drive.
 
     Args:
         task: Seed of the noise times the number of branches, and the branch's number.

@@ -1,7 +1,7 @@
-"""The paper's three branches under noise, over many seeds; a stopped run goes on.
+"""The paper's three branches under noise, over many seeds; a stopped run continues.
 
-Each trial is a fit of one pull or of three with fresh noise on points and force; what is kept of
-it tells error, interval and whether the truth lies inside.
+Each trial is a fit of one pull or of three with fresh noise on points and force. It keeps error,
+interval and whether the truth is inside.
 """
 
 import time
@@ -25,14 +25,14 @@ class Trial:
 
     Attributes:
         branch: Number of the branch in :data:`benchmarks.paper_branches.BRANCHES`.
-        seed: Of the noise.
-        pulls: How many pulls were fitted together.
+        seed: Seed of the noise.
+        pulls: Number of pulls fitted together.
         errors: Relative errors of the moduli, shape [4].
         low, high: 95 % interval over the true modulus, shape [4].
-        variance_factor: Mean squared residual over the stated.
+        variance_factor: Mean squared residual over the stated variance.
         group_count: Moduli fitted; fewer than 4 where some were tied.
-        seconds: Of the fit.
-        source: Digest of the estimator's source; another one's trials are not taken over.
+        seconds: Time of the fit.
+        source: Digest of the estimator's source; trials of another one are not reused.
     """
 
     branch: int
@@ -52,7 +52,7 @@ class Trial:
 
     @property
     def covered(self) -> np.ndarray:
-        """Whether each interval holds the truth, shape [4] of bool."""
+        """Whether each interval contains the truth, shape [4] of bool."""
         return (np.array(self.low) <= 1) & (np.array(self.high) >= 1)
 
 
@@ -64,7 +64,7 @@ _LIMITS = (0.06, 0.03)
 
 
 def noise_rows(setting: Setting) -> list[Row]:
-    """Measure as many noises of each branch as there is time for."""
+    """Measure as many noise seeds of each branch as there is time for."""
     seeds = setting.seeds(20, 3)
     tasks = [(branch, seed, pulls) for seed in seeds for branch in range(len(BRANCHES))
              for pulls in PULL_COUNTS]
@@ -84,7 +84,7 @@ def noise_rows(setting: Setting) -> list[Row]:
 
 
 def _error_row(asked: Asked, limit: float, trials: list[Trial]) -> Row:
-    """The worst median of the three branches; not judged while one of them lacks."""
+    """The worst median of the three branches; not judged while one of them is missing."""
     medians = {branch.name: float(np.median(worst)) for number, branch in enumerate(BRANCHES)
                if (worst := [trial.worst for trial in trials if trial.branch == number])}
     if not medians:
@@ -114,7 +114,7 @@ _PULLS: dict[int, list] = {}
 
 
 def _exact_pulls(number: int) -> list:
-    """Pulls without noise, simulated once a process."""
+    """Pulls without noise, simulated once per process."""
     if number not in _PULLS:
         _PULLS[number] = [exact_pull(BRANCHES[number], pull) for pull in range(3)]
     return _PULLS[number]

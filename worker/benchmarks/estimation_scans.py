@@ -1,7 +1,7 @@
-"""Intervals where the branch's shape is known from a scan alone; a stopped run goes on.
+"""Intervals if the branch's shape is known only from a scan; a stopped run continues.
 
-Each trial is what a user does, from start to end: a branch is generated and scanned, its scan
-reconstructed, the true branch pulled, and the moduli estimated on the reconstructed mesh.
+Each trial follows a user's steps: a branch is generated and scanned, its scan reconstructed, the
+true branch pulled, and the moduli estimated on the reconstructed mesh.
 """
 
 import json
@@ -28,7 +28,7 @@ from limber.store import Branch
 
 VIEWS = ("round", "one-sided")
 NOISES = (1e-3, 4e-4)
-"""Of the scan's points [m]; seeds take turns."""
+"""Noise of the scan's points [m]; seeds take turns."""
 PARTS = ("sensor", "geometry", "mesh")
 
 
@@ -37,16 +37,16 @@ class Trial:
     """One branch from scan to moduli.
 
     Attributes:
-        seed: Of branch, scan and pull.
+        seed: Seed of branch, scan and pull.
         view: How it was scanned.
-        errors: Of log E, shape [K]; empty where the trial failed.
+        errors: Errors of log E, shape [K]; empty if the trial failed.
         low, high: 95 % interval of log E less the true one, shape [K].
         total: Stated standard deviation of log E, shape [K].
         parts: Its parts, median over the control points, in the order of ``PARTS``.
-        is_poor: Whether the estimate itself warned that model and pull do not fit.
-        failure: Why there is no estimate, or nothing.
-        seconds: Of all.
-        source: Digest of the sources; another one's trials are not taken over.
+        is_poor: Whether the estimate warned that model and pull do not fit.
+        failure: Why there is no estimate, or empty.
+        seconds: Total time.
+        source: Digest of the sources; trials of other sources are not reused.
     """
 
     seed: int
@@ -63,7 +63,7 @@ class Trial:
 
     @property
     def covered(self) -> np.ndarray:
-        """Whether each interval holds the truth, shape [K] of bool."""
+        """Whether each interval contains the truth, shape [K] of bool."""
         return (np.array(self.low) <= 0) & (np.array(self.high) >= 0)
 
 
@@ -81,7 +81,7 @@ def scan_rows(setting: Setting) -> list[Row]:
 
 
 def coverage_row(trials: list[Trial]) -> Row:
-    """How many intervals hold the truth; a trial without an estimate holds nothing."""
+    """Number of intervals that contain the truth; a trial without an estimate contains none."""
     sound = [trial for trial in trials if not trial.failure]
     covered = [trial.covered for trial in sound]
     share = float(np.mean(np.concatenate(covered))) if covered else 0.0
@@ -99,7 +99,7 @@ def coverage_row(trials: list[Trial]) -> Row:
 
 
 def size_row(trials: list[Trial]) -> Row:
-    """How far off the moduli are, and what the intervals say."""
+    """Errors of the moduli, and of the intervals."""
     told = []
     for view in VIEWS:
         chosen = [trial for trial in trials if trial.view == view and not trial.failure]
@@ -117,7 +117,7 @@ def size_row(trials: list[Trial]) -> Row:
 
 def run_trials(tasks: list[tuple[int, str]], kept: Path, budget: Budget,
                workers: int | None = None, progress: Progress = SILENT) -> list[Trial]:
-    """Trials of seeds and views, those that ``kept`` has from the same sources included."""
+    """Trials of seeds and views, including those in ``kept`` from the same sources."""
     return go_on(read_trials(Trial, kept), tasks, lambda trial: (trial.seed, trial.view), trial_of,
                  _source_digest(), kept, budget, workers, progress)
 

@@ -1,4 +1,4 @@
-"""What the geometry issue asked: accuracy on generated branches, speed, real scans, pictures."""
+"""Requirements on geometry: accuracy on generated branches, speed, real scans, pictures."""
 
 import csv
 import json
@@ -52,9 +52,9 @@ _WATERTIGHT = Asked("generated: surface watertight, no self-intersection", "all"
 _VOLUME = Asked("generated: mesh volume against the true branch", "within 5 %")
 _PAPER_RADII = Asked("the paper's k-nearest median radii, against ours (for comparison)", "-")
 _CONTRACTION_SECONDS = {14_667: (2.5, 10.3), 58_219: (12.0, 56.5)}
-"""Asked [s] and what pc-skeletor took [s], by number of points."""
+"""Required time [s] and the time of pc-skeletor [s], by number of points."""
 _SPEED_SECONDS = {15_000: (4.0, ""), 100_000: (20.0, ""), 1_000_000: (60.0, ", under 3 GB")}
-"""Asked [s], and of memory, by number of points."""
+"""Required time [s], and memory, by number of points."""
 _SURFACES = Asked("real scans: surface watertight, no self-intersection", "all")
 _EXPLAINED = Asked("real scans: points no farther outside a branch than twice their spacing",
                    "report")
@@ -100,7 +100,7 @@ def _generated(setting: Setting) -> list[Row]:
 
 
 def _generated_trial(seed: int, source: str, first: int, out: Path | None) -> Numbers:
-    """Scores of both views of one branch; the first three are drawn."""
+    """Scores of both views of one branch; the first three are drawn as pictures."""
     found: dict[str, Any] = {"valid": 0}
     for view in VIEWS:
         branch = generated(seed, view=view)
@@ -238,7 +238,7 @@ def _speed(setting: Setting, count: int) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "points.npy")
         np.save(path, points)
-        # A process of its own, since peak memory is a process's.
+        # A process of its own, since peak memory is per process.
         done = [subprocess.run([sys.executable, "-c", _SKELETON_SCRIPT, str(path)],
                                capture_output=True, text=True, check=True).stdout.split()
                 for _ in range(2 if count < 200_000 else 1)]
@@ -279,7 +279,7 @@ def _scans(setting: Setting) -> list[Row]:
 
 
 def _reconstructed(path: Path, folder: Path, options: list[str]) -> tuple[float, dict[str, Any]]:
-    """Seconds of `limber reconstruct`, and what it tells."""
+    """Seconds of `limber reconstruct`, and its output."""
     started = time.perf_counter()
     run = subprocess.run(
         [sys.executable, "-m", "limber", "reconstruct", str(path), "-o", str(folder),
@@ -289,7 +289,7 @@ def _reconstructed(path: Path, folder: Path, options: list[str]) -> tuple[float,
 
 
 def _compared(path: Path, folder: Path) -> tuple[float, list[Row]]:
-    """Share of the points that the axes explain, and rows against what others found."""
+    """Fraction of the points that the axes explain, and rows against the results of others."""
     ours, table = read_swc(folder / "skeleton.swc"), []
     share = explained(read_points(folder / "cloud.ply").points, ours)
     if path.stem == "Tree_1":

@@ -1,4 +1,4 @@
-"""Dense crowns with known truth, and how much of a scan its skeleton explains."""
+"""Dense crowns with known truth, and the fraction of a scan that its skeleton explains."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -54,7 +54,7 @@ def axis_scores(truth: Skeleton, found: Skeleton, spacing: float, step: float = 
                 ) -> dict[str, float]:
     """Recall and precision of axis length, compared every ``step`` [m], and radii.
 
-    An axis is right where it lies within the true radius, or the points' spacing, of a true one.
+    An axis is correct if it is within the true radius, or the points' spacing, of a true one.
     ``thin``: recall where the true radius is under 20 mm.
     """
     there, here = Dense.of(truth, step=step), Dense.of(found, step=step)
@@ -94,19 +94,19 @@ def _crown_trial(seed: int, source: str) -> Numbers:
 
 
 def explained(points: np.ndarray, skeleton: Skeleton) -> float:
-    """Share of points no farther outside a branch than twice their own spacing."""
+    """Fraction of points no farther outside a branch than twice their own spacing."""
     _, residual = nearest_cylinders(skeleton, points)
     own = np.median(cKDTree(points).query(points, k=min(5, len(points)))[0][:, 1:], axis=1)
     return float((residual <= 2 * own).mean())
 
 
 def against_graph(path: Path, nodes: np.ndarray, parent: np.ndarray) -> str:
-    """Mean distances between our axes and those of a graph file in millimetres, each way.
+    """Mean distances between our axes and those of a graph file in millimetres, in both directions.
 
     Args:
         path: Lines ``v x y z`` and ``e i j``.
-        nodes: Ours in the file's frame [mm], shape [n, 3].
-        parent: Parents of ours, shape [n].
+        nodes: Our nodes in the file's frame [mm], shape [n, 3].
+        parent: Parents of our nodes, shape [n].
     """
     lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
     corner = np.array([row[1:4] for row in lines if row and row[0] == "v"], float)

@@ -13,7 +13,7 @@ def draw_reconstruction(path: Path, points: np.ndarray, skeleton: Skeleton,
     """Write a PNG with the cloud, the skeleton over it and the surface, from two sides.
 
     Args:
-        path: Where to.
+        path: Output file.
         points: The cloud in the branch's frame [m], shape [n, 3].
         skeleton: The skeleton.
         surface: The surface, or None.

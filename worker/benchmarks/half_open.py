@@ -1,8 +1,8 @@
-"""A cable to a robot of which one direction can be cut: connections stay, what is sent vanishes.
+"""A cable to a robot that can be cut in one direction: connections stay, sent data vanishes.
 
-The relay is a process of its own, ``python -m benchmarks.half_open ADDRESS ROBOT``, since a hold-up
-of its parent would be one of the robot. It takes directions to cut as lines on standard input and
-ends with it.
+The relay is a process of its own, ``python -m benchmarks.half_open ADDRESS ROBOT``, since a delay
+of its parent would delay the robot. It reads directions to cut as lines on standard input and ends
+with it.
 """
 
 import selectors
@@ -48,7 +48,7 @@ class Cable:
         self._process.stdout.close()
 
     def cut(self, direction: Direction) -> None:
-        """From now on what is sent in ``direction`` vanishes, also on new connections."""
+        """From now on, data sent in ``direction`` vanishes, also on new connections."""
         assert self._process.stdin is not None
         self._process.stdin.write(direction + "\n")
         self._process.stdin.flush()
@@ -98,7 +98,7 @@ class _Relay:
             if data and direction not in self._cut:
                 far.sendall(data)
         except ConnectionError:
-            # One of the two was closed: that is passed on.
+            # One of the two was closed: pass that on.
             data = b""
         if not data:
             for end in (near, far):

@@ -1,8 +1,8 @@
-"""Tells when the machine stood still: what a virtual robot then does is the machine's doing.
+"""Detects when the machine stalled: a virtual robot's faults then are due to the machine.
 
-A virtual machine whose host gives its processors to others stands still for tens of milliseconds,
-all its processes together. A robot's data is then older than the guard allows, and the arm is
-stopped, as it should be; of what was to be measured that says nothing.
+A virtual machine whose host gives its processors to others stalls for tens of milliseconds, with
+all its processes. A robot's data is then older than the guard allows, and the arm is stopped, as it
+should be. Such a run does not measure what was intended.
 """
 
 import os
@@ -17,10 +17,10 @@ from typing import TypeVar
 from limber.core.errors import LimberError
 
 HELD_UP_SECONDS = 0.03
-"""From here on a loop that may be silent for 50 ms can come to be: chosen."""
+"""Shortest stall that may silence a loop for 50 ms. Chosen."""
 _TOGETHER_SECONDS = 0.06
 _MEANWHILE_SECONDS = 10.0
-"""A failure is told at most so long after what made it: a loop of minutes has seen many pauses."""
+"""Longest delay of a failure after its cause: a loop of minutes has seen many stalls."""
 _MOST_AGAIN = 3
 _Result = TypeVar("_Result")
 
@@ -44,9 +44,9 @@ while True:
 
 
 class Witness:
-    """A process on each processor that wants to run every 1 ms before all others.
+    """A process on each processor that wakes every 1 ms before all others.
 
-    It notes when it could not, from 0.5 ms late on.
+    It records wake-ups that are at least 0.5 ms late.
     """
 
     def __init__(self) -> None:
@@ -69,16 +69,16 @@ class Witness:
         self.close()
 
     def longest(self, since: float) -> float:
-        """Return the longest stand-still [s] that ended after ``since`` [s, monotonic clock].
+        """Return the longest stall [s] that ended after ``since`` [s, monotonic clock].
 
-        Pieces that follow each other within the 60 ms in which a robot's data grows too old count
-        as one: a host takes its time away so.
+        Consecutive pieces within the 60 ms in which a robot's data grows too old count as one: a
+        host takes its time away like this.
         """
         return max(self._longest_of([one for one in seen if one[0] > since - _TOGETHER_SECONDS],
                                      since) for seen in map(tuple, self._seen))
 
     def lost(self, since: float, until: float) -> float:
-        """Return how long a processor stood still between two moments in all, at most [s]."""
+        """Return the largest total stall of a processor between two moments [s]."""
         return max(self._lost_of(tuple(seen), since, until) for seen in self._seen)
 
     @classmethod
@@ -108,25 +108,25 @@ class Witness:
 
 
 def _processors() -> list[list[str]]:
-    """Return the arguments of each watching process; one without, where none can be bound."""
+    """Return the arguments of each watching process; one without any if none can be bound."""
     if not hasattr(os, "sched_getaffinity"):
         return [[]]
     return [[str(processor)] for processor in sorted(os.sched_getaffinity(0))]
 
 
 class Voided:
-    """Runs that failed while the machine stood still; each is told, and done once more."""
+    """Runs that failed while the machine stalled; each is reported and repeated."""
 
     def __init__(self, witness: Witness):
         self._witness = witness
         self.count = 0
 
     def again(self, run: Callable[[], _Result], name: str) -> _Result:
-        """Return what ``run`` returns, doing it again where the machine held it up.
+        """Return what ``run`` returns; repeat it if the machine stalled.
 
         Raises:
-            AssertionError, LimberError: it failed and the machine did not stand still, or stood
-                still at every one of four tries.
+            AssertionError, LimberError: it failed and the machine did not stall, or stalled at
+                every one of four tries.
         """
         for _ in range(_MOST_AGAIN):
             began = time.monotonic()
@@ -143,10 +143,10 @@ class Voided:
         return run()
 
     def explains(self, since: float, until: float, late: float, name: str) -> bool:
-        """Return whether the machine stood still between two moments for as long as it was late.
+        """Return whether the machine stalled between two moments for at least the delay.
 
-        Its host takes a processor away in pieces, which count together. Where they explain it that
-        is told and counted: the run is to be done again.
+        Its host takes a processor away in pieces, which are added up. If they explain the delay, it
+        is reported and counted: the run is to be repeated.
         """
         lost = self._witness.lost(since, until)
         if lost < late:

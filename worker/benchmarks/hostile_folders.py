@@ -1,6 +1,6 @@
-"""What strangers may have done to a branch folder: names that lead out, links, pipes, noise.
+"""Possible attacks on a branch folder: names that lead out, links, pipes, noise.
 
-Each layout changes a good branch folder, two folders below a place with ``victim.txt`` files.
+Each layout changes a good branch folder, two folders below one with ``victim.txt`` files.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ def manifest(folder: Path) -> dict[str, Any]:
 
 
 def entry(content: bytes, stage: str = "estimate") -> dict[str, Any]:
-    """Return what a manifest says of a file with this content."""
+    """Return a manifest's entry for a file with this content."""
     return {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content), "stage": stage}
 
 
@@ -79,7 +79,7 @@ def _evil_stage(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _journal(folder: Path, rng: np.random.Generator, *, old: bool) -> None:
-    """An interrupted commit with an evil name in its manifest, or in that which it replaces."""
+    """An interrupted commit with an evil name in its manifest, or in the one it replaces."""
     name, content = _drawn(_NAMES, folder, rng), manifest(folder)
     pending = folder / ".commit"
     pending.mkdir()
@@ -92,7 +92,7 @@ def _journal(folder: Path, rng: np.random.Generator, *, old: bool) -> None:
 
 
 def _clash(folder: Path, rng: np.random.Generator) -> None:
-    """A file of a commit stands where the folder has a folder, or below one of its files."""
+    """A file of a commit is where the folder has a folder, or below one of its files."""
     pending, content = folder / ".commit", manifest(folder)
     for name in (("pulls", "plans", "frames")[int(rng.integers(3))], "mesh.vtu/x"):
         (pending / name).parent.mkdir(parents=True, exist_ok=True)
@@ -115,7 +115,7 @@ def _link(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _swept_link(folder: Path, rng: np.random.Generator) -> None:
-    """A link with the name of what a dead program left: it is swept, never followed."""
+    """A link with the name of a dead program's leftover: it is removed, never followed."""
     name = owned_name("stage-plan").replace(f"-{os.getpid()}-", "-999999999-")
     (folder / name).symlink_to(_drawn(_TARGETS, folder, rng))
     outside = folder.parent / name
@@ -127,7 +127,7 @@ def _swept_link(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _hard_link(folder: Path, rng: np.random.Generator) -> None:
-    """A second name of a victim's file, as an archive makes one on the disk where it is opened."""
+    """A hard link to a victim's file, as an archive creates when unpacked on the same disk."""
     place = folder / (".lock", ".run.lock", ".run.json", ".streams/pulls/p/robot.csv",
                       "report.html", ".streams/pulls/p/.robot.csv.lock", "pulls/p/note.txt",
                       "frames/to-goal.json")[int(rng.integers(8))]
@@ -154,7 +154,7 @@ def _special(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _value(folder: Path, rng: np.random.Generator) -> None:
-    """A value of the manifest is another: names, numbers, lists."""
+    """A value of the manifest is replaced: names, numbers, lists."""
     content = manifest(folder)
     place: Any = content
     while True:
@@ -168,7 +168,7 @@ def _value(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _listed_file(name: str, text: str, folder: Path, _rng: np.random.Generator) -> None:
-    """A file with a right checksum whose content names a file outside."""
+    """A file with a correct checksum whose content names a file outside."""
     content = manifest(folder)
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text(text.replace("{root}", str(folder.parents[2])))
@@ -177,7 +177,7 @@ def _listed_file(name: str, text: str, folder: Path, _rng: np.random.Generator) 
 
 
 def _deep(folder: Path, rng: np.random.Generator) -> None:
-    """Folders in folders until no path names the last, or a manifest nested as deeply."""
+    """Folders nested until no path names the last, or a manifest nested as deeply."""
     if rng.random() < 0.5:
         (folder / "branch.json").write_text('{"a":' * 100_000)
         return
@@ -205,4 +205,4 @@ LAYOUTS: dict[str, Layout] = {
     "masses": partial(_listed_file, "point_masses.json", '["../../victim.txt"]'),
     "a plan": partial(_listed_file, "plans/to-goal.json", '{"trees": "{root}/victim.txt"}'),
     "a recording's holder": partial(_listed_file, "pulls/p/robot.csv", "{root}/victim.txt\n")}
-"""What is done, by its name."""
+"""Attacks by name."""

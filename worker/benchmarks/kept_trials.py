@@ -1,4 +1,4 @@
-"""Trials of a campaign, kept as JSON lines as they are made: a stopped run goes on."""
+"""Trials of a campaign, kept as JSON lines as they are made: a stopped run continues."""
 
 import hashlib
 import json
@@ -19,11 +19,11 @@ Task = TypeVar("Task")
 
 @dataclass(frozen=True)
 class Numbers:
-    """What one trial gave: numbers by name.
+    """Result of one trial: numbers by name.
 
     Attributes:
-        part: Of the benchmark's table.
-        seed: Of all that was drawn.
+        part: Part of the benchmark's table.
+        seed: Seed of all random numbers.
         source: Digest of the sources; trials of other sources do not count.
         values: JSON has no number that is not finite: such a number is read back as infinite.
     """
@@ -42,7 +42,7 @@ class Numbers:
 def numbers_of(part: str, seeds: Iterable[int], work: Callable[[int], Numbers], source: str,
                kept: Path | None, budget: Budget, workers: int | None = 1,
                progress: Progress = SILENT, at_least: int = 1) -> list[Numbers]:
-    """Return the trials of a part by seed; :func:`go_on` says what is made and what is kept."""
+    """Return the trials of a part by seed; :func:`go_on` documents which are made and kept."""
     own = [each for each in read_trials(Numbers, kept) if each.part == part]
     return go_on(own, list(seeds), lambda trial: trial.seed, work, source, kept, budget, workers,
                  progress, at_least=at_least)
@@ -56,16 +56,16 @@ def go_on(kept_trials: list[Trial], tasks: list[Task], key: Callable[[Trial], Ta
 
     Args:
         kept_trials: From an earlier run; those of another ``source`` do not count.
-        tasks: What to do, the most important first.
+        tasks: Tasks, the most important first.
         key: Returns the task of a trial.
-        work: Makes the trial of a task, from what ``given`` made of it.
+        work: Makes the trial of a task, from the result of ``given``.
         source: Digest of the sources.
         kept: File to which new trials are appended, or None.
-        budget: For the new ones.
-        workers: How many at once; None: as many as there are cores.
+        budget: Time for the new ones.
+        workers: Number of parallel processes; None: the number of cores.
         progress: Called after each.
-        given: Turns the tasks that are left into what ``work`` takes.
-        at_least: So many are there in the end, whatever time is left.
+        given: Turns the remaining tasks into arguments of ``work``.
+        at_least: Least number of trials in the end, regardless of the time left.
     """
     wanted = set(tasks)
     known = {key(trial): trial for trial in kept_trials
@@ -79,10 +79,10 @@ def go_on(kept_trials: list[Trial], tasks: list[Task], key: Callable[[Trial], Ta
 
 
 def source_digest(packages: Iterable[str], *own: str | Path) -> str:
-    """Digest of what a trial depends on; one of other sources is not taken over.
+    """Digest of what a trial depends on; a trial of other sources is not reused.
 
     Args:
-        packages: Folders of ``limber`` whose sources count.
+        packages: Folders of ``limber`` that are part of the sources.
         own: Further files: those of the campaign itself.
     """
     import limber
@@ -94,7 +94,7 @@ def source_digest(packages: Iterable[str], *own: str | Path) -> str:
 
 
 def read_trials(kind: type[Trial], kept: Path | None) -> list[Trial]:
-    """Read the trials of a file, those of other sources too; a line cut off is left out."""
+    """Read the trials of a file, including those of other sources; a truncated line is left out."""
     if kept is None or not kept.is_file():
         return []
     trials = []
@@ -102,7 +102,7 @@ def read_trials(kind: type[Trial], kept: Path | None) -> list[Trial]:
         try:
             record = json.loads(line)
         except json.JSONDecodeError:
-            # The line that was being written when the run was stopped.
+            # The line being written when the run was stopped.
             continue
         trials.append(kind(**{key: tuple(value) if isinstance(value, list) else value
                               for key, value in record.items()}))

@@ -144,8 +144,8 @@ def _table(name: str, key: str, wanted: tuple[float, ...]) -> list[dict[str, flo
 def _under_end_moment(beam: Cantilever, moment: float) -> np.ndarray:
     """Return the displacement under a moment about y that turns with the end face.
 
-    Dead forces on the face would be another load, and an unstable one. The face is held, and
-    its place and turn are sought where it takes the moment and no force.
+    Dead forces on the face would be another load, and an unstable one. The face is held, and its
+    position and rotation are sought at which it takes the moment and no force.
     """
     model, face = beam.model(), replace(beam.end, mode="clamped")
     angle = moment * LENGTH / (YOUNG * beam.inertia)
@@ -311,7 +311,7 @@ def exactness_rows(setting: Setting) -> list[Row]:
 
 
 def vibration_row(_setting: Setting) -> list[Row]:
-    """1,000 undamped steps of a bent beam let go."""
+    """1,000 undamped steps of a released bent beam."""
     mesh, tip = short_beam()
     area, inertia = section(mesh)
     model = BranchModel(mesh, young=1e7, poisson=0.3, density=DENSITY, gravity=None,

@@ -1,4 +1,4 @@
-"""Other programs on the same cantilever, where their wheels are installed."""
+"""Other programs on the same cantilever, if their wheels are installed."""
 
 import time
 from importlib.util import find_spec
@@ -14,12 +14,12 @@ SKFEM = Asked("peer: scikit-fem, same mesh, linear elasticity (no large deflecti
 
 
 def felupe_row(_setting: Setting) -> list[Row]:
-    """Measure felupe, or say that it is not installed."""
+    """Measure felupe, or report that it is not installed."""
     return [_felupe_row() if find_spec("felupe") else _absent(FELUPE)]
 
 
 def skfem_row(_setting: Setting) -> list[Row]:
-    """Measure scikit-fem, or say that it is not installed."""
+    """Measure scikit-fem, or report that it is not installed."""
     return [_skfem_row() if find_spec("skfem") else _absent(SKFEM)]
 
 

@@ -36,7 +36,7 @@ SESSION = {"mode": "pinned", "gravity": False, "grasps": 2, "size": 62, "fields"
 
 @dataclass(frozen=True)
 class Branching:
-    """The bench's branch: what the notes' prototypes had, 0.6 m, 6 to 2 mm, curved, one fork."""
+    """The bench's branch, as in the notes' prototypes: 0.6 m, 6 to 2 mm, curved, one fork."""
 
     model: BranchModel
     weights: np.ndarray
@@ -61,7 +61,7 @@ class Errors:
 
     @property
     def is_small(self) -> bool:
-        """Whether position and energy are as near as asked where E is known."""
+        """Whether position and energy are as accurate as required where E is known."""
         return bool(np.median(self.position) <= 0.05 and self.position.max() <= 0.5
                     and np.median(self.energy) <= 0.1 and self.energy.max() <= 2)
 
@@ -110,7 +110,7 @@ CLAMPED_ROW = Asked("the same, clamped grasps (position and rotation given), kno
 
 
 def pinned_rows(setting: Setting) -> list[Row]:
-    """Measure pinned grasps and a session; the folder ``out`` gets the raw numbers as JSON."""
+    """Measure pinned grasps and a session; the raw numbers go to the folder ``out`` as JSON."""
     quick, progress = setting.quick, setting.progress
     branch = bench_branch()
     bench = GraspBench(branch, "pinned", setting.seed)
@@ -186,7 +186,7 @@ class GraspBench:
         return self.trainer.take(poses, young, known, progress=progress)
 
     def _generator(self) -> np.random.Generator:
-        """One that no earlier draw had."""
+        """A grasp that no earlier draw had."""
         self._draws += 1
         return np.random.default_rng([self._base, 53, self._draws])
 
@@ -215,7 +215,7 @@ def measure(reduced: ReducedModel, truth: Snapshots) -> Errors:
 
 
 def _pull(reduced: ReducedModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Half a second to a pose, half a second held: times and poses."""
+    """Times and poses: half a second to a pose, half a second held."""
     times = np.arange(61) / 60
     part = (1 - np.cos(np.pi * np.clip(2 * times, 0, 1))) / 2
     rest = reduced.grasp.rest_pose
@@ -223,7 +223,7 @@ def _pull(reduced: ReducedModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def brisk(reduced: ReducedModel, pose: np.ndarray) -> ReducedMotion:
-    """Move the reduced model through the pull, several times; the one of the least time."""
+    """Move the reduced model through the pull several times; return the fastest run."""
     times, poses = _pull(reduced, pose)
     runs = [simulate_reduced(reduced, poses=poses, times=times) for _ in range(5)]
     return min(runs, key=lambda run: np.median(run.step_seconds))
@@ -246,7 +246,7 @@ def moving(bench: GraspBench, reduced: ReducedModel, pose: np.ndarray,
 
 def run_session(bench: GraspBench, reduced: ReducedModel, snapshots: Snapshots,
                 seconds: float) -> tuple[str, bool]:
-    """Send poses at 60 Hz along a smooth path with one jump, and watch the frames come.
+    """Send poses at 60 Hz along a smooth path with one jump, and record the frames.
 
     Meanwhile the trainer compares with the full model, about once a second.
     """
@@ -289,7 +289,7 @@ def write_branch(path: Path, bench: GraspBench) -> Path:
 
 
 def _put_in_cache(path: Path, cache: Path, reduced: ReducedModel, snapshots: Snapshots) -> None:
-    """Let the session find the model that is there already instead of making one."""
+    """Let the session find the existing model instead of making one."""
     settings = SessionSettings(**SESSION)
     held = load_held(path, settings)
     grasp = held.loaded.marked_grasp("pinned")
@@ -299,7 +299,7 @@ def _put_in_cache(path: Path, cache: Path, reduced: ReducedModel, snapshots: Sna
 
 def _follow(session: InteractiveSession, goals: np.ndarray, seconds: float,
             ) -> tuple[list[float], int, int]:
-    """Delays of the frames seen, number of frames, number of moves without a frame of their own."""
+    """Delays of the received frames, number of frames, number of moves without their own frame."""
     path = _two_ways(goals, seconds)
     session.wait(session.move(path(0.0)), 30)
     sent: dict[int, float] = {}
@@ -315,7 +315,7 @@ def _follow(session: InteractiveSession, goals: np.ndarray, seconds: float,
 
 
 def _two_ways(goals: np.ndarray, seconds: float) -> Callable[[float], np.ndarray]:
-    """Return a pose over time: smoothly along goals, and half-way a jump to other goals."""
+    """Return a pose over time: a smooth path along goals, and half-way a jump to other goals."""
     from scipy.interpolate import CubicSpline
 
     middle, half = len(goals) // 2, seconds / 2

@@ -1,7 +1,7 @@
 """Mechanics against the clock.
 
-Times are processor seconds of this process, the least of several runs: other work on the machine
-disturbs them least. Ratios are taken within one run.
+Times are processor seconds of this process, the least of several runs, which other work on the
+machine affects least. Ratios are taken within one run.
 """
 
 import time
@@ -45,7 +45,7 @@ def bench_mesh(spacing: float) -> TetMesh:
 
 
 def _sized_mesh(tet_count: int) -> TetMesh:
-    """Return the branch with so many quadratic tetrahedra, or the fewest above."""
+    """Return the branch with this many quadratic tetrahedra, or the next larger number."""
     spacings = np.geomspace(0.15, 6, 24)
     low, high = 0, len(spacings) - 1
     meshes = {}
@@ -84,8 +84,8 @@ class Parts:
 def parts_of(model: BranchModel, count: int = 15) -> Parts:
     """Time assembly of force and stiffness, factorisation and solve.
 
-    One after the other as in an iteration, so that each finds in the caches what it finds there;
-    the least of each.
+    One after the other as in an iteration, so that each finds the caches in the same state; the
+    least of each.
     """
     equations = model.equations()
     zero = np.zeros_like(model.mesh.nodes)
@@ -105,7 +105,7 @@ def parts_of(model: BranchModel, count: int = 15) -> Parts:
 
 
 def cholmod_seconds(model: BranchModel) -> float:
-    """Return the least time [s] in which CHOLMOD factorises what the model has assembled."""
+    """Return the least time [s] in which CHOLMOD factorises the model's assembled matrix."""
     from limber.mechanics.linear.factor import CholmodFactor
 
     equations = model.equations()
@@ -116,7 +116,7 @@ def cholmod_seconds(model: BranchModel) -> float:
 
 
 def _stepping(model: BranchModel, count: int = 40) -> tuple[float, float]:
-    """Return processor seconds and iterations a converged step, dt 1/60, load at the tip."""
+    """Return processor seconds and iterations of a converged step, dt 1/60, load at the tip."""
     tip = int(model.mesh.nodes[:, 2].argmax())
     force = np.zeros_like(model.mesh.nodes)
     force[tip, 0] = 0.05

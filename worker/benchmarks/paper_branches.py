@@ -28,15 +28,15 @@ FRACTIONS = (0.2, 0.4, 0.6, 0.8)
 
 @dataclass(frozen=True)
 class PaperBranch:
-    """A row of the paper's table of estimated parameters, and a shape to go with it.
+    """A row of the paper's table of estimated parameters, and a matching shape.
 
     Attributes:
-        name: The paper's.
-        young: [Pa], shape [4].
+        name: Name in the paper.
+        young: Young's moduli [Pa], shape [4].
         poisson: Poisson's ratio.
-        length: [m].
-        radius: At base and tip [m].
-        bend: Turn of the axis from base to tip [rad].
+        length: Length [m].
+        radius: Radii at base and tip [m].
+        bend: Rotation of the axis from base to tip [rad].
     """
 
     name: str
@@ -48,7 +48,7 @@ class PaperBranch:
 
     @property
     def skeleton(self) -> Skeleton:
-        """An arc that leaves its plane a little, as a branch does."""
+        """An arc that leaves its plane a little, as in a real branch."""
         s = np.linspace(0.0, 1.0, 81)
         angle = self.bend * s
         tangent = np.column_stack([np.sin(angle), 0.3 * np.sin(angle) * s, np.cos(angle)])
@@ -65,7 +65,7 @@ class PaperBranch:
         return mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
 
     def truth(self) -> TrueBranch:
-        """The branch on its fine mesh, weightless: such moduli could not carry it."""
+        """The branch on its fine mesh, weightless: such moduli could not carry its weight."""
         skeleton = self.skeleton
         return TrueBranch(self.mesh(slice_length=1.3, sides=10), skeleton,
                           control_points(skeleton, FRACTIONS), FRACTIONS, np.array(self.young),
@@ -81,7 +81,7 @@ BRANCHES = (
 
 
 def exact_pull(branch: PaperBranch, number: int, frames: int = 100) -> Pull:
-    """One pull of the true branch without noise; ``number`` chooses its direction."""
+    """One pull of the true branch without noise; ``number`` selects its direction."""
     settings = VirtualPullSettings(
         young=branch.young, poisson=branch.poisson, frames=frames, position_noise=0.0,
         force_noise=0.0, reach=0.4, phase=2.1 * number + 0.3, seed=number)
@@ -89,10 +89,10 @@ def exact_pull(branch: PaperBranch, number: int, frames: int = 100) -> Pull:
 
 
 def measured(pull: Pull, seed: int, *, points: float = 1e-3, force: float = 0.02) -> Pull:
-    """Add noise: [m] to points, a share of its largest size to the force.
+    """Add noise: [m] to points, a fraction of its largest size to the force.
 
-    What the recording says of its noise stays 1 mm and 2 %: an estimator does not know that its
-    data are exact.
+    The noise that the recording states stays 1 mm and 2 %: an estimator does not know that its data
+    are exact.
     """
     rng = np.random.default_rng([seed, int(pull.name.rsplit("-", 1)[1])])
     peak = float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max())
@@ -107,7 +107,7 @@ def measured(pull: Pull, seed: int, *, points: float = 1e-3, force: float = 0.02
 
 
 class Bench:
-    """One branch's fitting mesh; fits pulls of it."""
+    """Fitting mesh of one branch; fits pulls of it."""
 
     def __init__(self, branch: PaperBranch, *, slice_length: float = 1.7, sides: int = 8):
         self.branch = branch
@@ -117,7 +117,7 @@ class Bench:
         self.model = BranchModel(self.mesh, young=1e7, poisson=0.35, density=900.0, gravity=None)
 
     def objective(self, pulls: list[Pull], settings: EstimateSettings) -> Objective:
-        """The objective that ``limber estimate`` would have."""
+        """The objective of ``limber estimate``."""
         forwards = [QuasiStaticForward(pull.name, self.model, self.weights, pull.entry,
                                        frames_of(pull), np.array(pull.entry.rest_points_m
                                                                  or self.points),

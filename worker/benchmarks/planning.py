@@ -1,10 +1,11 @@
 """Planning: on the paper's three arcs and three drawn forked branches, from rest and nine starts.
 
-Each branch is sampled and planned on as a user would. Costs and bounds are of the field; whether
-limits hold is asked of the full model. Nothing is left out: what failed is counted and told.
+Each branch is sampled and planned on as a user would. Costs and bounds are on the field; whether
+limits hold is checked on the full model. Nothing is left out: failures are counted and reported.
 
-With ``--out`` fields and trials are kept as they are made: the same ``--seed`` goes on with them.
-Starts are taken in turn over all branches, so that also a part of them speaks for all.
+With ``--out``, fields and trials are kept as they are made: a run with the same ``--seed``
+continues with them. Starts take turns over all branches, so that even a part of them represents
+all.
 """
 
 import json
@@ -48,7 +49,7 @@ from limber.reduced.model_cache import ReducedCache
 
 _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8), "%"),
            ("tip", "target position", 1e3, (1, 4), "mm"))
-"""Of a field at fresh poses: their name, in words, scale, median and 95 % asked, unit."""
+"""Errors of a field at fresh poses: name, description, scale, required median and 95 %, unit."""
 _TIMED_STARTS = 3  # of each branch, where only times are asked
 _Start = tuple[str, int, int]
 """Branch, number, seed."""
@@ -59,8 +60,8 @@ _Kept = TypeVar("_Kept", Trial, Detour, NearLimit, RegionGoal)
 class _Fresh:
     """Relative errors at fresh trusted poses of energy and force, of the tip [m], each shape [n].
 
-    There the branch is as the motion brings it: coming from the nearest sample; nan where it does
-    not come.
+    The branch's state there is the one that the motion gives, coming from the nearest sample; nan
+    if it does not arrive.
     """
 
     energy: np.ndarray
@@ -73,9 +74,9 @@ class _Fielded:
     """A branch with its field.
 
     Attributes:
-        seconds: Of sampling and fit [s].
+        seconds: Time of sampling and fit [s].
         all_seconds: The same with the fresh poses [s].
-        lost: Share of the samples' hull that is not trusted.
+        lost: Fraction of the samples' hull that is not trusted.
     """
 
     subject: Subject
@@ -88,11 +89,11 @@ class _Fielded:
 
 
 class _Run:
-    """What the parts of the table share: branches, and fields of as many as there was time for.
+    """Shared by the parts of the table: branches, and fields of as many as there was time for.
 
     Args:
-        setting: Of the part that asks.
-        share: Of the part's time that may go into fields that are not there yet.
+        setting: Setting of the calling part.
+        share: Fraction of the part's time for fields that do not exist yet.
     """
 
     def __init__(self, setting: Setting, share: float = 0.5):
@@ -110,13 +111,13 @@ class _Run:
 
     @property
     def largest(self) -> Subject:
-        """The forked branch of most tetrahedra."""
+        """The forked branch with the most tetrahedra."""
         return max(_forked(self.setting.seed, self.setting.at_most(3, 1)),
                    key=lambda one: one.model.mesh.tet_count)
 
     @cached_property
     def fielded(self) -> list[_Fielded]:
-        """Branches with fields, arcs and forked ones in turn, so that a few speak for all.
+        """Branches with fields, arcs and forked ones in turn, so that a few represent all.
 
         Raises:
             RuntimeError: no branch has a field.
@@ -174,7 +175,7 @@ def _forked(seed: int, count: int) -> list[Subject]:
 
 def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, fresh_seed: int,
              kept: Path, progress: Progress) -> _Fielded:
-    """Sample and fit, or read what an earlier part or run kept of the same branch."""
+    """Sample and fit, or read the result of an earlier part or run for the same branch."""
     if kept.is_file():
         known = EnergyField.read(kept)
         with np.load(kept) as file:
@@ -196,7 +197,7 @@ def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, fresh
 
 def _timed_field(model: GraspModel, settings: EnergySettings, progress: Progress,
                  ) -> tuple[Sampled, EnergyField, float]:
-    """Return samples, field, and the seconds that both took."""
+    """Return samples, field, and the time of both [s]."""
     began = time.perf_counter()
     sampled = sample_field(model, settings, progress=progress)
     known = fit_field(sampled.samples, sampled.energy_surface.pivot, sampled.energy_surface.radius)
@@ -205,7 +206,7 @@ def _timed_field(model: GraspModel, settings: EnergySettings, progress: Progress
 
 def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, settings: EnergySettings,
            count: int, seed: int, progress: Progress) -> tuple[_Fresh, float]:
-    """Return errors at ``count`` fresh trusted poses, and the share of the hull not trusted."""
+    """Return errors at ``count`` fresh trusted poses, and the fraction of the hull not trusted."""
     targets = sample_positions(model.reach, model.rest_position, 4 * count, sampled.energy_surface,
                                deflection=settings.deflection, seed=seed)
     targets = targets[known.region.height(targets) <= 0.0]
@@ -254,7 +255,7 @@ def _detour_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: 
 
 
 def _near_limits(setting: Setting) -> list[Row]:
-    """Limits near what is feasible, on all branches in turn, as many as there is time for."""
+    """Limits near the feasible ones, on all branches in turn, as many as there is time for."""
     run = _Run(setting)
     return near_rows(_planned(run, NearLimit, _near_limit_of, run.kept("near-limits"),
                               run.starts_of(lambda _: True, setting.at_most(34, 2))))
@@ -298,7 +299,7 @@ def _planned(run: _Run, kind: type[_Kept], work: Callable, kept: Path | None,
 
 
 def _sure(run: _Run) -> list[Sure]:
-    """Plan with confidence on each branch from rest, and try it on draws of the moduli."""
+    """Plan with confidence on each branch from rest, and test the plan on draws of the moduli."""
     setting, source, kept = run.setting, _source(), run.kept("sure")
     by_name = {one.subject.name: one for one in run.fielded}
     tasks = [(name, setting.seed) for name in by_name]
@@ -404,7 +405,7 @@ def _field_rows(setting: Setting) -> list[Row]:
 
 def _error_row(row: Asked, values: np.ndarray, scale: float, asked: tuple[float, float], unit: str,
                more: str = "") -> Row:
-    # A pose where the motion does not come is as wrong as can be.
+    # A pose where the motion does not arrive has the largest possible error.
     median, most = np.quantile(np.nan_to_num(scale * values, nan=np.inf), (0.5, 0.95),
                                method="higher")
     return Row(*row, f"{median:.2g} / {most:.2g} {unit}{more}",
@@ -484,7 +485,7 @@ def _sure_table(setting: Setting) -> list[Row]:
 
 
 def _field_time(setting: Setting) -> list[Row]:
-    """The cost of a field by itself: of the largest forked branch, on an idle machine."""
+    """The cost of a field alone: of the largest forked branch, on an idle machine."""
     largest = _Run(setting).largest
     _, known, seconds = _timed_field(largest.model, EnergySettings(seed=setting.seed, samples=300),
                                      setting.progress)
@@ -492,7 +493,7 @@ def _field_time(setting: Setting) -> list[Row]:
 
 
 def _reduced_time(setting: Setting) -> list[Row]:
-    """The cost of a field on a reduced model that was learnt before, and how good it is."""
+    """The cost of a field on a reduced model that was trained before, and its accuracy."""
     largest, progress = _Run(setting).largest, setting.progress
     settings = EnergySettings(seed=setting.seed, samples=300)
     with TemporaryDirectory() as folder:
@@ -513,7 +514,7 @@ def _reduced_time(setting: Setting) -> list[Row]:
 
 
 def _plan_time(setting: Setting) -> list[Row]:
-    """The times of plans by themselves, of three starts a branch."""
+    """The times of plans alone, of three starts per branch."""
     return _time_rows(_trials(_Run(setting), _TIMED_STARTS, None, limited=False))
 
 
@@ -571,5 +572,6 @@ PARTS = {
         for _, what, _, asked, unit in _ERRORS))),
     "field-time": Part(_field_time, 60, (_FIELD_ALONE,), alone=True),
     "plan-time": Part(_plan_time, 60, _TIME_ROWS, grows=True, alone=True)}
-"""The table, in order of importance; the last two only repeat times of others, for a machine that
-does nothing else."""
+"""The table, in order of importance; the last two only repeat timings of others, for an otherwise
+idle machine.
+"""

@@ -32,7 +32,7 @@ class Subject:
 
 
 def arcs() -> list[Subject]:
-    """Return the paper's branches: its moduli, too soft to stand under their own weight."""
+    """Return the paper's branches with its moduli, too soft to bear their own weight."""
     return [_arc(branch) for branch in BRANCHES]
 
 

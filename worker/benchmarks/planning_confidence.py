@@ -1,4 +1,4 @@
-"""Plans that shall keep a limit with a probability, against draws of Young's modulus."""
+"""Plans that must keep a limit with a probability, tested on draws of Young's modulus."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,9 @@ _NEIGHBOUR = -0.4  # correlation of neighbours, as fits have it
 _EVERY = 4  # pose of the motion is asked under each draw, and the one with most force
 _LOW = 0.6  # of the limit: a pose of less force breaks it under no likely draw
 _TIGHT = (0.5, 0.75, 0.9, 1.0)
-"""Where the limit lies between what the goal itself needs and what the motion without limit takes,
-each with the confidence: the first at which there is a plan."""
+"""Position of the limit between the force that the goal itself needs and the peak of the unlimited
+motion, each with the confidence: the first with a plan is used.
+"""
 SURE_ROW = Asked(f"force limit kept at --confidence {CONFIDENCE}, each draw on the full model",
                  "90 to 100 %")
 
@@ -32,9 +33,9 @@ class Sure:
     """One plan with a force limit kept at a confidence, and its draws.
 
     Attributes:
-        kept: Share of draws, each solved on the full model, that keep the limit.
-        before: The same by the risk that the plan for the estimate alone would have run.
-        tight: Of ``_TIGHT``, the limit's.
+        kept: Fraction of draws, each solved on the full model, that keep the limit.
+        before: The same by the risk of the plan for the estimate alone.
+        tight: Element of ``_TIGHT`` for the limit.
     """
 
     branch: str
@@ -78,7 +79,7 @@ def _planned(sure: Sure, subject: Subject, known: EnergyField, uncertain_part: Y
     """Return a plan with confidence under a force limit that binds, and the limit [N].
 
     Raises:
-        NoPathError: there is none under any of the limits that were tried.
+        NoPathError: there is none under any of the limits tried.
     """
     model = subject.model
     free = plan_motion(known, model, settings, workers=1)
@@ -107,7 +108,7 @@ def _planned(sure: Sure, subject: Subject, known: EnergyField, uncertain_part: Y
 def _likely_forces(
     uncertain_part: YoungUncertainty, subject: Subject, states: SolvedPoses
 ) -> np.ndarray:
-    """Return the force [N] that each state takes at most with the confidence, shape [n]."""
+    """Return the largest force [N] that each state takes with the confidence, shape [n]."""
     peak = states.force_sizes.max()
     found = uncertain_part.exposure(subject.model, ResolvedPath(
         states, states.take(np.arange(1)), np.empty((0, 3)), (), True), Limits(force=2.0 * peak))
@@ -115,7 +116,7 @@ def _likely_forces(
 
 
 def uncertainty_of(subject: Subject) -> YoungUncertainty:
-    """Return a posterior as an estimate's: the same deviation at each control point."""
+    """Return a posterior like an estimate's: the same deviation at each control point."""
     count = subject.shares.shape[1]
     near = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) == 1
     return YoungUncertainty(subject.shares, np.full(count, _DEVIATION),

@@ -1,4 +1,4 @@
-"""The paper's table: what a path 8.1 % longer than the shortest may save, and what it does save."""
+"""The paper's table: possible and actual savings of a path 8.1 % longer than the shortest."""
 
 import time
 from dataclasses import dataclass, field
@@ -30,9 +30,9 @@ DETOUR_ROWS = (*(Asked(
 
 @dataclass
 class Detour:
-    """What one start saves [%] against other paths, and by how many points at most more could be.
+    """Savings of one start [%] against other paths, and the most points by which they could grow.
 
-    ``branch``, ``seed`` and ``source`` (digest of the sources) say whose it is.
+    ``branch``, ``seed`` and ``source`` (digest of the sources) identify it.
     """
 
     number: int

@@ -1,8 +1,8 @@
 """Goals in regions of any size: balls, a second arm's reach, a camera's view; and unreachable ones.
 
-A region is drawn so that its border passes through where the tip can be: a share of the poses,
-20 to 80 % for large regions, lies inside. The start lies outside. The end is asked on the full
-model.
+A region is drawn so that its border passes through the reachable positions of the tip: a fraction
+of the poses, 20 to 80 % for large regions, is inside. The start is outside. The end is checked on
+the full model.
 """
 
 import time
@@ -23,7 +23,7 @@ from limber.robot.cell.cell import Cell
 from limber.stages.paths.plan_cell import places_in
 
 _KINDS = (0.005, 0.05, 0.3, 1.0, "second_arm", "in_view")
-"""Radii of balls [m], and what a cell gives."""
+"""Radii of balls [m], and regions that a cell gives."""
 _SHARES = (0.2, 0.8)
 _TRIES = 60
 _POSES = 400
@@ -38,10 +38,10 @@ GOAL_ROWS = (
 
 @dataclass
 class RegionGoal:
-    """What became of one goal.
+    """Result for one goal.
 
-    ``branch``, ``seed`` and ``source`` (digest of the sources) say whose it is; ``share`` of the
-    poses lies inside.
+    ``branch``, ``seed`` and ``source`` (digest of the sources) identify it; ``share`` is the
+    fraction of the poses inside.
     """
 
     number: int
@@ -58,7 +58,7 @@ class RegionGoal:
 
 def run_region_goal(model: GraspModel, known: EnergyField, number: int, seed: int, **whose: str,
                     ) -> RegionGoal:
-    """Draw a goal of a kind, plan to it from outside, and ask for one out of reach."""
+    """Draw a goal of a kind, plan to it from outside, and try one out of reach."""
     kind = _KINDS[number % len(_KINDS)]
     found = RegionGoal(number, seed=seed, kind=str(kind), **whose)
     generator = np.random.default_rng([seed, number])
@@ -105,7 +105,7 @@ def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
     outward /= np.linalg.norm(outward)
     common = {"inertia": False, "iterations": 500, "field_error": 20.0}
     if not isinstance(kind, str):
-        # Its border a little beyond a place that the tip comes to.
+        # Its border is a little beyond a position that the tip reaches.
         centre = place + (kind - min(0.5 * kind, 0.01)) * outward
         return PlanSettings(tip_goal=tuple(map(float, centre)), goal_tolerance=kind, **common), {}
     settings = PlanSettings(**{kind: True}, **common)
@@ -114,7 +114,7 @@ def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
 
 
 def _cell(kind: str, place: np.ndarray, turn: float, far: float) -> Cell:
-    """Return a cell whose second arm, or camera, is ``far`` [m] from a place, aside."""
+    """Return a cell with a second arm, or camera, ``far`` [m] sideways from a position."""
     aside = np.array([np.cos(turn), np.sin(turn), 0.0])
     stand = {"robot": {"model": "ur5e"}, "base": {"pose": (0.0,) * 6}}
     if kind == "second_arm":
@@ -131,7 +131,7 @@ def _cell(kind: str, place: np.ndarray, turn: float, far: float) -> Cell:
 
 
 def _refused(kind: float | str, known: EnergyField, model: GraspModel) -> str:
-    """Return why a goal out of reach is refused; empty where it is not."""
+    """Return why a goal out of reach is refused; empty if it is not."""
     place = known.tip(known.rest[None])[0] + [_FAR, 0.0, 0.0]
     settings, cell = _asked(kind, place[None], np.random.default_rng(0))
     if kind == "in_view":

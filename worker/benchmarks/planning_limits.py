@@ -1,8 +1,8 @@
-"""Limits near what is feasible, hopeless ones, and whether the stated errors hold.
+"""Limits near the feasible ones, infeasible ones, and whether the stated errors hold.
 
-A free path, solved on the full model, says which limits are feasible for sure: those that it keeps.
+A free path, solved on the full model, shows which limits are surely feasible: those that it keeps.
 Limits are drawn within 5 % of its peak. An accepted plan is solved again from rest at half the
-spacing; a proof that no path exists is false where the free path keeps the limit.
+spacing; a proof that no path exists is false if the free path keeps the limit.
 """
 
 import time
@@ -45,10 +45,10 @@ COVERED_ROW = Asked("stated 95 % errors at fresh poses: energy, force, strain, a
 
 @dataclass
 class NearLimit:
-    """What became of one problem.
+    """Result for one problem.
 
-    ``branch``, ``seed`` and ``source`` (digest of the sources) say whose it is. ``share`` is the
-    limit over the free path's peak; ``excess`` by how much the plan is over the limit.
+    ``branch``, ``seed`` and ``source`` (digest of the sources) identify it. ``share`` is the limit
+    over the free path's peak; ``excess`` by how much the plan is over the limit.
     """
 
     number: int
@@ -125,7 +125,7 @@ def _peaks(states: object) -> dict[str, float]:
 
 
 def near_rows(trials: list[NearLimit]) -> list[Row]:
-    """Return the rows of problems near what is feasible."""
+    """Return the rows of problems near the feasible limits."""
     good = [one for one in trials if not one.trouble]
     sure = [one for one in good if one.share > 1.0]
     proven = [one for one in sure if one.said == "proven"]
@@ -154,8 +154,9 @@ def near_rows(trials: list[NearLimit]) -> list[Row]:
 
 def coverage(model: GraspModel, known: EnergyField, count: int, seed: int,
              ) -> dict[str, tuple[int, int]]:
-    """Return of each quantity at how many of ``count`` fresh trusted poses the field says no more
-    too much than its stated 95 % error, and how many there were."""
+    """Return for each quantity at how many of ``count`` fresh trusted poses the field's
+    overestimate is within its stated 95 % error, and the number of poses.
+    """
     places = known.region.draw(count, np.random.default_rng(seed))
     with SolverPool(model, 1) as solvers:
         good, _ = solve_branch(solvers, places, progress=SILENT)
@@ -173,7 +174,7 @@ def coverage(model: GraspModel, known: EnergyField, count: int, seed: int,
 
 
 def covered_row(found: list[dict[str, tuple[int, int]]]) -> Row:
-    """Return the row of the stated errors, of several branches."""
+    """Return the row of the stated errors of several branches."""
     shares = {name: sum(one[name][0] for one in found) / max(sum(one[name][1] for one in found), 1)
               for name in found[0]}
     return Row(*COVERED_ROW, ", ".join(f"{name.replace('_', ' ')} {100 * share:.0f} %"

@@ -1,6 +1,6 @@
-"""The gentlest path by a way of its own: many bulges in sines, many starts, fine quadrature.
+"""The gentlest path by an independent method: many sine bulges, many starts, fine quadrature.
 
-It shares with the planner the field alone: no polyline, no penalty rounds, no grid.
+It shares only the field with the planner: no polyline, no penalty rounds, no grid.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ _PENALTY = 3e3  # on squared height above the sampled region, relative to the pa
 
 
 def best_cost(problem: GentleProblem, starts: int, seed: int) -> float:
-    """Return the least cost that was found; infinite if every path ends outside what is allowed."""
+    """Return the least cost found; infinite if every path ends outside the allowed region."""
     rng = np.random.default_rng([seed, 3])
     centre = problem.goal.centre(problem.energy_field)
     span = float(np.linalg.norm(centre - problem.start))

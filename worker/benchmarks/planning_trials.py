@@ -25,9 +25,9 @@ _OPTIMUM_STARTS = 3
 
 @dataclass
 class Trial:
-    """What one start gave; ``trouble`` where no path was found or the branch could not follow.
+    """Result of one start; ``trouble`` if no path was found or the branch could not follow.
 
-    ``branch``, ``seed`` and ``source`` (digest of the sources) say whose trial it is.
+    ``branch``, ``seed`` and ``source`` (digest of the sources) identify the trial.
     """
 
     number: int
@@ -62,8 +62,9 @@ class Trial:
 
 def run_trial(model: GraspModel, known: EnergyField, goal: GraspGoal, number: int, seed: int, *,
               limited: bool = True, **whose: str) -> Trial:
-    """Plan from rest (number 0) or from a random start, without limits and, where ``limited``, with
-    one that binds."""
+    """Plan from rest (number 0) or from a random start, without limits and, if ``limited``, with
+    one that binds.
+    """
     trial, began = Trial(number, seed=seed, **whose), time.perf_counter()
     settings = PlanSettings(seed=seed)
     try:
@@ -79,7 +80,7 @@ def run_trial(model: GraspModel, known: EnergyField, goal: GraspGoal, number: in
 
 def _measure(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndarray,
              goal: GraspGoal, settings: PlanSettings) -> tuple[EnergyField, np.ndarray]:
-    """Plan without limits; return the field that the plan ended with, and the path [n, 3]."""
+    """Plan without limits; return the field at the end of planning, and the path [n, 3]."""
     asked = settings.model_copy(update={"start": tuple(map(float, start)), "goal": goal.position,
                                         "goal_tolerance": goal.tolerance})
     motion = plan_motion(known, model, asked, workers=1)
@@ -116,7 +117,7 @@ def _measure(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndar
 
 def _with_limit(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndarray,
                 free: np.ndarray, settings: PlanSettings) -> None:
-    """Plan to the same end under a force halfway between what the ends need and the free peak."""
+    """Plan to the same end under a force halfway from the ends' largest to the free peak."""
     force = np.linalg.norm(known.force(resample(free, 0.002)), axis=1)
     ends = max(force[0], force[-1])
     cap = float(max(0.5 * (ends + force.max()), 1.1 * ends))
@@ -141,8 +142,9 @@ def _with_limit(trial: Trial, model: GraspModel, known: EnergyField, start: np.n
 
 
 def no_path_seconds(known: EnergyField, goal: GraspGoal) -> dict[str, tuple[float, str]]:
-    """Return how long it takes to say that no path exists under a force too low for any pose of the
-    goal, and behind a workspace that ends before it; and what was said instead, if anything."""
+    """Return the time to report that no path exists under a force too low for any pose of the goal,
+    and behind a workspace that ends before it; and what was reported instead, if anything.
+    """
     settings = PlanSettings(iterations=500)
     reached = goal_points(goal, known, known.limited())
     force = 0.5 * float(np.linalg.norm(known.force(reached), axis=1).min())

@@ -1,4 +1,4 @@
-"""Statics of a body whose boundary is moved: patch tests and made solutions."""
+"""Statics of a body with a moved boundary: patch tests and manufactured solutions."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A whole motion of the reduced model along a spline through poses: what benches compare."""
+"""A whole motion of the reduced model along a spline through poses, for comparison in benches."""
 
 import itertools
 import time
@@ -28,9 +28,10 @@ class ReducedMotion:
         times: [s], shape [frames].
         coordinates: Shape [frames, size]; displacements by ``ReducedModel.displacement_of``.
         strain_energy, kinetic_energy: [J], shape [frames].
-        reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], shape [frames, 3].
+        reaction_force, reaction_torque: Force and torque of the gripper on the branch [N, Nm],
+        shape [frames, 3].
         step_seconds: Wall time of each step [s].
-        iteration_count: Newton iterations in all.
+        iteration_count: Total Newton iterations.
     """
 
     converged: bool
@@ -52,12 +53,12 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
                      nodal_forces: np.ndarray | None = None,
                      settings: NewmarkSettings = _NEWMARK,
                      progress: Progress = SILENT) -> ReducedMotion:
-    """Move the grasp through poses in time; never raises for want of convergence.
+    """Move the grasp through poses in time; never raises for lack of convergence.
 
     Args:
-        poses: [m, rad], shape [frames, 6]; a cubic spline between, at rest in the beginning.
+        poses: [m, rad], shape [frames, 6]; a cubic spline between, at rest at the start.
         times: [s], ascending, shape [frames].
-        start: Default the equilibrium at the first pose.
+        start: By default the equilibrium at the first pose.
     """
     times, poses = np.asarray(times, float), np.asarray(poses, float)
     if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():

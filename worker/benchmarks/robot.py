@@ -44,7 +44,7 @@ _KINEMATICS = (
     Asked("kinematics against an independent library: position", "1e-9 m"),
     Asked("poses with another number of inverse solutions than the library's", "0"))
 _STOP_SECONDS = {125: 0.012, 500: 0.006}
-"""Asked [s], by the controller's rate [Hz]."""
+"""Required time [s], by the controller's rate [Hz]."""
 _PATH = Asked("following a path at 30 mm/s: distance from it, worst", "1 mm")
 
 
@@ -95,9 +95,9 @@ def _kinematics(setting: Setting) -> list[Row]:
 
 @dataclass(frozen=True)
 class _Stop:
-    """One stop for a force: when it came and how far the arm went on.
+    """One stop for a force: its time and how far the arm moved on.
 
-    ``since`` and ``until`` [s, monotonic clock]: between them the force came and the stop.
+    ``since`` and ``until`` [s, monotonic clock]: the force and the stop came between them.
     """
 
     latency: float
@@ -107,10 +107,10 @@ class _Stop:
 
 
 def _stop_time(setting: Setting, voided: Voided, model: str) -> list[Row]:
-    """From the step at which the force goes over the limit until the stop command has come.
+    """From the step at which the force exceeds the limit until the stop command arrives.
 
-    An FT300 tells its force every 10 ms, which is part of it. A stop that was late by no more
-    than the machine stood still meanwhile is done again, and told with its time.
+    An FT300 sends its force every 10 ms, which is included. A stop delayed by no more than the
+    machine stalled meanwhile is repeated, and reported with its time.
     """
     rate = 125 if model == "ur5" else 500
     asked = _STOP_SECONDS[rate]
@@ -207,7 +207,7 @@ def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(FAU
     least, most = (size(map(len, runs.values())) for size in (min, max))
     each = f"{least} to {most} runs of {len(runs)} of {len(names)} faults; " if len(
         names) > 1 else ""
-    # What did not come to its turn is not known to be good.
+    # A case that was not run is not known to be good.
     is_met = False if failed else True if len(runs) == len(names) else None
     return [Row(*_faults_asked(_faults_told(names)), f"{total - failed} of {total}; {each}"
                 f"slowest standstill {slowest:.2f} s{voided}", is_met, total)]
@@ -222,7 +222,7 @@ def _is_failed(run: dict) -> bool:
 
 
 def _fault_runs(name: str, setting: Setting, voided: Voided, at_least: int) -> list[dict]:
-    """Provoke a fault as often as there is time for: its standstill [s], or how it failed."""
+    """Provoke a fault as often as there is time for: its standstill time [s], or how it failed."""
     seed, source = setting.seed + list(FAULTS).index(name), source_digest(
         ("robot",), __file__, robot_faults.__file__)
     robot: VirtualRobot | None = None
@@ -254,7 +254,7 @@ def _fault_runs(name: str, setting: Setting, voided: Voided, at_least: int) -> l
 
 
 def _watched(run: Callable[[Setting, Voided], list[Row]]) -> Callable[[Setting], list[Row]]:
-    """Return a part that is told when the machine stood still."""
+    """Return a part that is notified when the machine stalled."""
     def measured(setting: Setting) -> list[Row]:
         with Witness() as witness:
             return run(setting, Voided(witness))
@@ -275,7 +275,7 @@ PARTS = {
     "loops": Part(_watched(partial(closed_loops, address=_ADDRESS)), 240, LOOP_ROWS, grows=True),
     "stream": Part(partial(recorded_stream, address=_ADDRESS), LEAST_STREAM_S, STREAM_ROWS,
                    grows=True)}
-"""The table, in order of importance; ``--only`` also knows each fault by itself."""
+"""The table, in order of importance; ``--only`` also accepts each fault alone."""
 PARTS |= {f"fault:{name}".replace(" ", "-"): Part(
     _watched(partial(_faults, names=(name,))), 15, (_faults_asked(name),), grows=True, alone=True)
     for name in FAULTS}

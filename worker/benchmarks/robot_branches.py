@@ -1,7 +1,7 @@
-"""The virtual robot with random branches in its gripper: forces as predicted, slip, break.
+"""The virtual robot with random branches in its gripper: predicted forces, slip, break.
 
-Young's modulus is known here, so that what differs is mesh, grasp, arm and sensor alone; what an
-estimate adds is measured by the closed loop (:mod:`limber.cli.closed_loop`).
+Young's modulus is known here, so that differences come from mesh, grasp, arm and sensor alone; the
+closed loop (:mod:`limber.cli.closed_loop`) measures the contribution of an estimate.
 """
 
 import tempfile
@@ -34,13 +34,14 @@ from limber.store.loading import load_grasp_model, load_skeleton
 
 FRACTION = 0.85
 # So short that a solution of the virtual branch takes tens of milliseconds: over one that takes
-# half a second its force is led on too far, and it is not the prediction that is measured.
+# half a second its force is extrapolated too far, and that error, not the prediction's, is
+# measured.
 _LENGTH_M = 0.4
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
 _WITHIN = 0.95
 _PACKAGES = ("robot", "mechanics", "stages", "geometry")
 _OFF_N = 0.5
-"""From here on the virtual branch itself was off, by its own word: chosen."""
+"""Self-reported error above which the virtual branch itself was off. Chosen."""
 
 FOLLOWED_ROWS = (
     Asked("force within 5 % of the peak or the interval, least share of a branch's path", "95 %"),
@@ -86,7 +87,7 @@ def _write_mesh(path: Path, mesh, young: np.ndarray) -> None:
 
 
 def _plan_sideways(branch: Branch, push: np.ndarray) -> None:
-    """Write the way on which a growing force across it takes the branch: it stretches nothing."""
+    """Write the path of the branch under an increasing force across it: it stretches nothing."""
     model = load_grasp_model(branch, gravity=True)
     state, rows = model.rest, []
     for number, part in enumerate(np.linspace(0, _PEAK_N, 9)):
@@ -100,7 +101,7 @@ def _plan_sideways(branch: Branch, push: np.ndarray) -> None:
 
 
 def followed_paths(setting: Setting, voided: Voided, address: str) -> list[Row]:
-    """Follow a path with random branches: force as predicted, where the arm went."""
+    """Follow a path with random branches: predicted force, and the arm's path."""
     source = source_digest(_PACKAGES, __file__)
     seeds = range(setting.seed, setting.seed + setting.at_most(10, 1))
     trials = [each.values for each in numbers_of("branches", seeds, partial(
@@ -120,7 +121,7 @@ def followed_paths(setting: Setting, voided: Voided, address: str) -> list[Row]:
 
 
 def _follow_trial(seed: int, source: str, voided: Voided, address: str) -> Numbers:
-    """One branch's path: how well the force was predicted, or why it did not end."""
+    """One branch's path: accuracy of the predicted force, or why it did not end."""
     try:
         result, off = voided.again(partial(_followed, seed, address), f"seed {seed}")
     except (AssertionError, LimberError) as error:
@@ -136,7 +137,7 @@ def _follow_trial(seed: int, source: str, voided: Voided, address: str) -> Numbe
 
 def _followed(seed: int, address: str) -> tuple[dict, float]:
     result, off = _executed(seed, address)
-    # A machine that stands still solves the virtual branch too late: its force is then not one.
+    # A machine that stalls solves the virtual branch too late: its force is then invalid.
     assert result["force_within_share"] >= _WITHIN or off <= _OFF_N, (
         f"within {result['force_within_share']:.3f}, the virtual branch was {off:.2f} N off")
     return result, off
@@ -150,10 +151,10 @@ def _executed(seed: int, address: str,
 
 def _executed_in(folder: Path, seed: int, address: str,
                  fault: Callable[[VirtualRobot], None] | None) -> tuple[dict, float]:
-    """Execute the path armed; with ``fault`` done to the robot once the force is up.
+    """Execute the path armed; ``fault`` acts on the robot once the force is up.
 
     Returns:
-        What `execute` told, and by how much the virtual branch's force was led on wrongly [N].
+        Output of `execute`, and the extrapolation error of the virtual branch's force [N].
     """
     branch, young = random_branch(folder / "random.branch", seed)
     cell = standing_at(branch, address, fraction=FRACTION, back=ApproachEntry().distance_m,
@@ -180,7 +181,7 @@ def _executed_in(folder: Path, seed: int, address: str,
 
 def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event,
            fault: Callable[[VirtualRobot], None] | None) -> None:
-    """Note how far the virtual branch was off; do the fault once the force is up."""
+    """Record the virtual branch's error; provoke the fault once the force is up."""
     while not ended.wait(0.2):
         state = robot.state
         largest[0] = max(largest[0], state.get("extrapolation_error_n", 0.0))
@@ -197,7 +198,7 @@ LOST_ROW = Asked("branch slips, branch breaks while it is led: stop for the lost
 
 
 def lost_branches(setting: Setting, voided: Voided, address: str) -> list[Row]:
-    """The branch slips in the grip, or breaks, while it is led: the arm stands and says so."""
+    """The branch slips in the grip, or breaks, while it is moved: the arm stops and reports it."""
     source, kinds = source_digest(_PACKAGES, __file__), len(FAULTS_OF_BRANCHES)
     tasks = range(kinds * setting.seed, kinds * (setting.seed + setting.at_most(20, 1)))
     trials = numbers_of("lost", tasks, partial(
@@ -205,7 +206,7 @@ def lost_branches(setting: Setting, voided: Voided, address: str) -> list[Row]:
         setting.kept / "robot.jsonl", setting.budget, progress=setting.progress)
     failed = [each.values["failed"] for each in trials if each.values["failed"]]
     names = {FAULTS_OF_BRANCHES[each.seed % kinds][0] for each in trials}
-    # A fault that did not come to its turn is not known to be noticed.
+    # A fault that was not run is not known to be noticed.
     is_met = False if failed else True if len(names) == kinds else None
     return [Row(*LOST_ROW, f"{len(trials) - len(failed)} of {len(trials)} ("
                 f"{', '.join(sorted(names))}){voided}", is_met, len(trials))]
@@ -225,12 +226,12 @@ def _loss_trial(task: int, source: str, voided: Voided, address: str) -> Numbers
 
 
 def _stop_for_loss(seed: int, address: str, fault: Callable[[VirtualRobot], None]) -> str:
-    """Return what was told of the stop.
+    """Return the report of the stop.
 
     Raises:
-        AssertionError: it went on.
-        LimberError: another reason than the lost force, or before it: the fault was not what
-            stopped it.
+        AssertionError: it did not stop.
+        LimberError: the reason is not the lost force, or came before it: the fault did not cause
+            the stop.
     """
     done = []
 

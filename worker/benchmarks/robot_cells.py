@@ -1,4 +1,4 @@
-"""A cell whose virtual robot stands with its gripper on a branch, and that robot."""
+"""A cell whose virtual robot has its gripper on a branch, and that robot."""
 
 import json
 from pathlib import Path
@@ -21,9 +21,9 @@ GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 
 def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: float = 0.92,
                 back: float = 0.0, grip_seconds: float = 1.0, **limits: float) -> Cell:
-    """Return a cell in which the home pose has the gripper at a place of the branch.
+    """Return a cell in which the home pose has the gripper at a position on the branch.
 
-    It stands ``back`` [m] before it, against its way of approach.
+    It is ``back`` [m] before it, against its direction of approach.
     """
     skeleton = load_skeleton(branch)
     point = skeleton.point_at(fraction)
@@ -52,7 +52,7 @@ def sideways(branch: Branch, fraction: float = 0.92) -> np.ndarray:
 
 def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
                   young: tuple[float, ...] = ()) -> VirtualRobot:
-    """Return a virtual robot in whose gripper the true branch of a folder comes."""
+    """Return a virtual robot with the true branch of a folder in its gripper."""
     truth = load_truth(branch, VirtualPullSettings(young=young))
     setting = BranchSetting.of_truth(truth, cell, folder / "truth.vtu")
     path = folder / "setting.json"

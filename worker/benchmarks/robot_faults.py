@@ -1,4 +1,4 @@
-"""Faults of a robot while it moves: each ends in standstill and a report, or it is a failure."""
+"""Faults of a robot while it moves: each must end in standstill and a report."""
 
 import os
 import signal
@@ -27,13 +27,13 @@ _START_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a fault led to.
+    """Result of a fault.
 
     Attributes:
-        report: What the user is told.
-        standstill_s: From the fault until the arm stood still, by its own state; NaN where the
+        report: Message to the user.
+        standstill_s: From the fault until the arm was at standstill, by its own state; NaN if the
             robot itself is gone.
-        way_m: What the tool still moved.
+        way_m: Distance that the tool still moved.
     """
 
     report: str
@@ -72,7 +72,7 @@ ENDS_ROBOT = ("controller killed",)
 
 
 def _another_program(address: str) -> None:
-    """Send a program to the controller, as a second client does: it takes the first's place."""
+    """Send a program to the controller, as a second client does: it replaces the first."""
     with socket.create_connection((address, SCRIPT_PORT), 2.0) as other:
         other.sendall(b"def another():\n  sync()\nend\n")
         time.sleep(0.1)
@@ -95,21 +95,21 @@ def straight(robot: VirtualRobot, way: tuple[float, float, float], speed: float 
 
 
 def tared(link: RobotLink) -> None:
-    """Tare the sensor as soon as the robot tells how it stands."""
+    """Tare the sensor as soon as the robot reports its state."""
     link.wait_for_samples()
     link.tare(_TARE_READINGS / link.facts["rate_hz"])
 
 
 def set_off(robot: VirtualRobot, link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:
-    """Tare, begin a trajectory, and return the robot's state when the arm is at its speed.
+    """Tare, start a trajectory, and return the robot's state when the arm is at full speed.
 
     Raises:
-        AssertionError: it does not come to that speed; the reason is that of the stop.
+        AssertionError: it does not reach that speed; the reason is that of the stop.
     """
     tared(link)
     link.start(trajectory)
     wanted = _AT_SPEED * trajectory.greatest_speeds[0]
-    # A machine with much else to do begins the motion later.
+    # A busy machine starts the motion later.
     given_up = time.monotonic() + _START_SECONDS
     while np.linalg.norm((state := robot.state)["tool_speed"][:3]) < wanted:
         if time.monotonic() > given_up:
@@ -120,7 +120,7 @@ def set_off(robot: VirtualRobot, link: RobotLink, trajectory: Trajectory) -> dic
 
 
 def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) -> Outcome:
-    """Move the robot, provoke a fault on the way, and watch it from its own side.
+    """Move the robot, provoke a fault during the motion, and watch it from the robot's side.
 
     Raises:
         AssertionError: it did not come to a standstill, or nothing was reported.
@@ -154,7 +154,7 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
 
 
 def restored(robot: VirtualRobot) -> None:
-    """Bring a robot back to where a fault found it, as a person at its pendant would."""
+    """Restore a robot after a fault, as a person at its pendant would."""
     for action, values in (("silent", False), ("delay", 0.0), ("frozen_sensor", False),
                            ("sensor_nan", False), ("clock_jump", 0.0), ("slider", 1.0),
                            ("outputs", 0)):

@@ -1,4 +1,4 @@
-"""The closed loop on random branches: what `limber demo --robot` does, many times."""
+"""The closed loop on random branches: `limber demo --robot`, many times."""
 
 import shutil
 import tempfile
@@ -23,7 +23,7 @@ _PACKAGES = ("cli", "robot", "planning", "estimation", "mechanics", "stages")
 
 @dataclass(frozen=True)
 class _Loop:
-    """One loop: what it found, or the error that ended it; and of which sources it was."""
+    """One loop: its result, or the error that ended it; and the sources' digest."""
 
     seed: int
     source: str
@@ -43,10 +43,10 @@ LOOP_ROWS = (
 
 
 def closed_loops(setting: Setting, voided: Voided, address: str) -> list[Row]:
-    """Go around with as many random branches as there is time for.
+    """Run the loop on as many random branches as there is time for.
 
-    Folders stay where the user named one; loops that were made before with these seeds and
-    sources are taken over.
+    Folders stay in the user's folder, if named; loops made before with these seeds and sources are
+    reused.
     """
     source, kept = source_digest(_PACKAGES, __file__), setting.kept / "loops.jsonl"
     seeds = [setting.seed + number for number in range(setting.at_most(10, 1))]
@@ -62,7 +62,7 @@ def _once(seed: int, source: str, address: str, out: Path | None, progress: Prog
         folder = Path(place, "loop") if out is None else out / f"loop-{seed}"
 
         def run() -> dict[str, Any]:
-            # Of a run that was stopped in the middle.
+            # Files of a run that was stopped in the middle.
             shutil.rmtree(folder, ignore_errors=True)
             return ClosedLoop(folder, seed, address, progress=progress).run()
         try:

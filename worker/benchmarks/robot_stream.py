@@ -1,4 +1,4 @@
-"""A recording at 500 Hz for minutes, ended by kill -9: what of it is there afterwards."""
+"""A recording at 500 Hz for minutes, ended by kill -9: what is recovered afterwards."""
 
 import os
 import signal
@@ -33,10 +33,9 @@ STREAM_ROWS = (
 
 
 def recorded_stream(setting: Setting, address: str) -> list[Row]:
-    """Record with `limber record`, kill it, and take over what is left.
+    """Record with `limber record`, kill it, and recover the data.
 
-    With less time than the 600 s that were asked for it records as long as it may; that can fail,
-    but not pass.
+    With less than the required 600 s, it records as long as it may; that can fail, but not pass.
     """
     seconds = 8.0 if setting.quick else min(_ASKED_S, setting.budget.remaining - _AROUND_S)
     seed = setting.seed
@@ -49,7 +48,7 @@ def recorded_stream(setting: Setting, address: str) -> list[Row]:
             try:
                 begin, memory, grown, killed = _watched(robot, process, seconds)
             finally:
-                # A driver of its own ends with its pipe.
+                # A separate driver process that ends with its pipe.
                 process.kill()
                 process.wait()
             lost_by_robot = robot.state["lost_seconds"]
@@ -90,8 +89,9 @@ def _started(branch: Branch, path: Path) -> subprocess.Popen:
 
 def _watched(robot, process: subprocess.Popen, seconds: float,
              ) -> tuple[float, int, int, float | None]:
-    """Return the clock when it began to move, memory after a tenth of the time and how it has grown
-    since, and the clock of the kill; None where the recording ended before."""
+    """Return the clock when it began to move, memory after a tenth of the time and its growth
+    since, and the clock of the kill; None if the recording ended before.
+    """
     end = time.monotonic() + _LONGEST_S
     while np.linalg.norm(robot.state["tool_speed"][:3]) < _BEGUN_M_S:
         if process.poll() is not None or time.monotonic() > end:

@@ -1,6 +1,6 @@
-"""Generated scans for the bench `scans`: the truth, the points as a file has them, how to read it.
+"""Generated scans for the bench `scans`: the truth, the points in file form, reader settings.
 
-Seeds are fresh in each run of the bench; what is easy or hard about a case is drawn from its seed.
+Seeds are fresh in each run of the bench; the difficulties of a case are drawn from its seed.
 """
 
 from dataclasses import dataclass, field
@@ -20,13 +20,13 @@ class ScanCase:
     """One scan with truth.
 
     Attributes:
-        name: Of its files.
-        seed: What it was made from.
+        name: Name of its files.
+        seed: Seed of the case.
         truth: True axes and radii in the file's frame [m].
-        points: As the file has them [m], shape [n, 3].
-        volume: Of the true branch [m^3]; None where it was not computed.
-        settings: What the user would say beside the file's name.
-        leaf: Which points lie on leaves, shape [n]; None where there are none.
+        points: Points in the file's frame and unit [m], shape [n, 3].
+        volume: Volume of the true branch [m^3]; None if it was not computed.
+        settings: Settings that the user would give besides the file's name.
+        leaf: Whether each point is on a leaf, shape [n]; None if there are none.
     """
 
     name: str
@@ -67,7 +67,7 @@ def one_sided_case(seed: int, noise: float = 0.001) -> ScanCase:
 
 
 def gap_case(seed: int) -> ScanCase:
-    """A ball of 20 to 80 mm without points on the main axis; of odd seeds around a fork."""
+    """A gap of 20 to 80 mm without points on the main axis; for odd seeds around a fork."""
     rng = np.random.default_rng([seed, 2])
     branch = branch_of(seed, gap_count=0, fork_count=int(rng.integers(1, 6)),
                        view=("round", "one-sided")[int(rng.integers(2))])
@@ -87,10 +87,10 @@ def gap_case(seed: int) -> ScanCase:
 
 
 def single_view_case(seed: int) -> ScanCase:
-    """What a depth camera 0.7 to 1.2 m away sees: a reading a pixel, noise growing with depth.
+    """View of a depth camera 0.7 to 1.2 m away: one reading per pixel, noise growing with depth.
 
     The file is in the camera's frame (x right, y down, z forward). Pixels at edges fly: some of
-    their readings lie between the branch and what would be behind it.
+    their readings are between the branch and a background behind it.
     """
     rng = np.random.default_rng([seed, 3])
     branch = branch_of(seed, gap_count=0, occlusion=0.0, unevenness=0.0, noise=0.0,
@@ -120,7 +120,7 @@ def _depth_image(points: np.ndarray, pitch: float, rng: np.random.Generator) -> 
     _, first = np.unique(pixel[order], axis=0, return_index=True)
     which = order[first]
     depth, pixel = points[which, 2], pixel[which]
-    # As a stereo camera has it: errors grow with the square of the depth, together over patches.
+    # As with a stereo camera: errors grow with the square of the depth, jointly over patches.
     patch = rng.normal(size=(40, 3)) * 60.0
     waves = np.sin(np.column_stack([pixel * pitch, depth]) @ patch.T
                    + rng.uniform(0, 2 * np.pi, 40)).mean(axis=1) * np.sqrt(2 * 40)

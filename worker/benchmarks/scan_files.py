@@ -27,12 +27,12 @@ SCANS = {"coffeetree_branch/branch.xyz": {}, "aRchi_tree_1/Tree_1.ply": {},
          "tomato_maize/maize_03-13.ply": {"unit": "mm"}}
 AS_IT_IS = "as it is"
 CHANGES = (AS_IT_IS, "half", "turn", "shuffle", "shift", "unit")
-"""What is done to a scan, the most telling first."""
+"""Changes to a scan, the most informative first."""
 _LEAFY = {"unexplained": 1.0, "leave_out": True, "leaves": "cut"}
 
 
 def changes(cloud: Cloud, settings: dict, seed: int) -> dict[str, tuple[Cloud, dict]]:
-    """The same scan in another unit, moved, turned about its up, shuffled, and half of it."""
+    """The same scan in another unit, moved, rotated about its vertical, shuffled, and halved."""
     rng = np.random.default_rng(seed)
     points = cloud.points
     unit = settings.get("unit", "m")
@@ -52,10 +52,10 @@ def changes(cloud: Cloud, settings: dict, seed: int) -> dict[str, tuple[Cloud, d
 
 @dataclass
 class ScanRun:
-    """What one scan gave, as it is or changed; ``failure`` where it was not reconstructed.
+    """Result of one scan, original or changed; ``failure`` if it was not reconstructed.
 
-    ``seed`` drew the change and the generated scans; ``source`` (digest of the sources) says what
-    code it was. ``off_points`` is the share of :func:`off_any_point`. The intervals are those that
+    ``seed`` drew the change and the generated scans; ``source`` (digest of the sources) identifies
+    the code. ``off_points`` is the fraction of :func:`off_any_point`. The intervals are those that
     the result states.
     """
 
@@ -72,12 +72,12 @@ class ScanRun:
     seconds: float = 0.0
 
     def off(self, other: "ScanRun") -> float:
-        """How far length or volume are off another run's, whichever is farther."""
+        """Difference of length or volume from another run's, whichever is larger."""
         return max(abs(self.length_m / other.length_m - 1),
                    abs(self.volume_m3 / other.volume_m3 - 1))
 
     def agrees(self, other: "ScanRun") -> bool:
-        """Whether the stated intervals of both runs meet, of length and of volume."""
+        """Whether the stated intervals of both runs overlap, of length and of volume."""
         return all(max(low, other_low) <= min(high, other_high) for (low, high), (
             other_low, other_high) in (
                 (self.length_interval_m, other.length_interval_m),
@@ -89,13 +89,13 @@ REAL_ROW = Asked("real scans: tube length more than a radius off any point, brid
 
 
 def same_tree_asked(names: str) -> Asked:
-    """What the row of a scan, or of all, measures."""
+    """Measure of the row of one scan, or of all."""
     return Asked(f"{names} in another unit, shifted, turned, shuffled; halved: length and volume",
                  "3 %; 10 %; no crash")
 
 
 def same_tree_rows(setting: Setting, only: str | None = None) -> list[Row]:
-    """Length and volume of each changed scan against the scan itself; ``only``: of one scan."""
+    """Length and volume of each changed scan against the scan itself; ``only``: for one scan."""
     names = [Path(name).stem for name in SCANS] if DATA.is_dir() else []
     names = [only] if only else ["round", "one-sided", *(names[:1] if setting.quick else names)]
     runs = _runs(setting, [(name, change) for change in CHANGES for name in names])
@@ -119,7 +119,7 @@ def same_tree_rows(setting: Setting, only: str | None = None) -> list[Row]:
 
 
 def _runs(setting: Setting, tasks: list[tuple[str, str]]) -> list[ScanRun]:
-    """Scans as they are or changed, as many as there is time for, those kept included."""
+    """Original or changed scans, as many as there is time for, including those kept."""
     kept, source = setting.kept / "files.jsonl", source_digest(("geometry",), __file__,
                                                                  scan_cases.__file__)
     seed = 1000 * setting.seed
@@ -167,7 +167,7 @@ def _run(run: ScanRun, cloud: Cloud, settings: dict, out: Path | None) -> ScanRu
 
 
 def real_rows(setting: Setting) -> list[Row]:
-    """Share of tube length more than a radius off any point, bridges aside."""
+    """Fraction of tube length more than a radius off any point, bridges excluded."""
     if not DATA.is_dir():
         return [Row(*REAL_ROW, "not measured: no ../shared/data", None, 0)]
     names = [Path(name).stem for name in SCANS]
@@ -181,7 +181,7 @@ def real_rows(setting: Setting) -> list[Row]:
 
 
 def off_any_point(made: Reconstruction) -> float:
-    """Share of the axes' length whose surface is more than a radius from all points."""
+    """Fraction of the axes' length whose surface is more than a radius from all points."""
     skeleton = made.meshed.skeleton
     here = Dense.of(skeleton, step=0.25 * float(np.median(skeleton.radius)))
     distance, _ = cKDTree(made.cloud.points).query(here.points)

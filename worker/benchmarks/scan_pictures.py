@@ -1,4 +1,4 @@
-"""A picture of each case of the bench `scans`: truth, scan, what was found and in which state."""
+"""A picture of each case of the bench `scans`: truth, scan, found axes and their states."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ _STATES = ("measured", "limited", "interpolated", "unresolved", "bridged")
 
 
 def draw_case(path: Path, case: ScanCase, found: Skeleton, scored: dict[str, float]) -> None:
-    """Write a PNG: the truth in green, the found axes coloured by their state, from two sides."""
+    """Write a PNG: the truth in green, the found axes coloured by state, from two sides."""
     import matplotlib
 
     matplotlib.use("Agg")

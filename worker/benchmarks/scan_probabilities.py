@@ -1,10 +1,10 @@
-"""Fits the probabilities that skeletons state to what came out on generated scans with truth.
+"""Fits the probabilities that skeletons state to the outcomes on generated scans with truth.
 
 ``python -m benchmarks.scan_probabilities --first SEED --count N --out DIR`` reconstructs N scans of
-each kind of the bench `scans` with no twig dropped, keeps the skeletons in DIR (a stopped run goes
-on), and fits the logistic coefficients of :mod:`limber.geometry.skeleton.confidence`: by
-likelihood, slopes held to their sign and weakly to 0. The fit to each half of the scans is held
-against the other half in tenths of the stated probability, as the bench does.
+each kind of the bench `scans` with no twig dropped, keeps the skeletons in DIR (a stopped run
+continues), and fits the logistic coefficients of :mod:`limber.geometry.skeleton.confidence`: by
+likelihood, slopes held to their sign and weakly to 0. The fit to each half of the scans is compared
+with the other half in tenths of the stated probability, as the bench does.
 """
 
 import argparse
@@ -41,7 +41,7 @@ _FIT_KINDS = tuple(kind for kind in KINDS if kind != "leafy")
 
 @dataclass
 class Skeletonised:
-    """A case's skeleton is in ``KIND_SEED.csv``; here is the rest that its evidence needs."""
+    """A case's skeleton is in ``KIND_SEED.csv``; this holds the rest of its evidence."""
 
     kind: str
     seed: int
@@ -56,8 +56,9 @@ class Outcomes:
     """Evidence and outcomes of many scans, row by row.
 
     Attributes:
-        twig, twig_there: Of side runs, shapes [k, 5] and [k].
-        node, node_there, length: Of a sample of places on runs that are there.
+        twig, twig_there: Evidence and outcome of side runs, shapes [k, 5] and [k].
+        node, node_there, length: The same of a sample of places on runs that are there, and their
+        length.
         half: 0 or 1 by the scan's seed, for twigs and nodes.
     """
 
@@ -83,7 +84,7 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float]:
 
 def collect(first: int, count: int, out: Path, kinds: Sequence[str] = _FIT_KINDS,
             ) -> list[Skeletonised]:
-    """Skeletons of ``count`` seeds of each kind, those that ``out`` has included."""
+    """Skeletons of ``count`` seeds of each kind, including those in ``out``."""
     kept, source = out / "skeletons.jsonl", case_source()
     known = {(one.kind, one.seed): one for one in read_trials(Skeletonised, kept)
              if one.source == source}
@@ -126,7 +127,7 @@ def outcomes(done: list[Skeletonised], out: Path) -> Outcomes:
 
 
 def _there(truth: Skeleton, found: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which runs are there; and of places on the axes whether they lie in true wood, and where."""
+    """Which runs are there; for places on the axes, whether they are in true wood, and where."""
     _, right = fork_matches(truth, found)
     true_forks = found.forks()[right]
     runs = found.runs()
@@ -140,7 +141,7 @@ def _there(truth: Skeleton, found: Skeleton) -> tuple[np.ndarray, np.ndarray, np
 
 
 def fitted(evidence_rows: np.ndarray, there: np.ndarray, signs: tuple[int, ...]) -> np.ndarray:
-    """Constant and slopes of a logistic with the least mean loss."""
+    """Constant and slopes of a logistic function with the least mean loss."""
     system = np.column_stack([np.ones(len(there)), evidence_rows])
     side = np.where(there, 1.0, -1.0)
 
@@ -155,7 +156,7 @@ def fitted(evidence_rows: np.ndarray, there: np.ndarray, signs: tuple[int, ...])
 
 
 def bins(stated: np.ndarray, there: np.ndarray) -> str:
-    """Of each tenth of the stated probability: what was said, what was, of how many."""
+    """For each tenth of the stated probability: stated mean, actual mean, and count."""
     place = np.minimum((10 * stated).astype(int), 9)
     return "; ".join(
         f"{k / 10:.1f}: said {100 * stated[place == k].mean():.0f}, were "
@@ -165,7 +166,7 @@ def bins(stated: np.ndarray, there: np.ndarray) -> str:
 
 def tell(name: str, rows: np.ndarray, there: np.ndarray, half: np.ndarray,
          signs: tuple[int, ...]) -> None:
-    """Print the coefficients, and how the fit to one half holds on the other."""
+    """Print the coefficients, and the accuracy of the fit to one half on the other."""
     odds = fitted(rows, there, signs)
     print(f"{name}: {len(there)}, {100 * there.mean():.1f} % there; odds "
           f"({', '.join(f'{value:.2f}' for value in odds)})")

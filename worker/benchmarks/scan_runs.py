@@ -1,4 +1,4 @@
-"""Cases of the bench `scans` run as a user runs them, side by side, and their scores by kind."""
+"""Cases of the bench `scans`, run in parallel as a user runs them, and their scores by kind."""
 
 import json
 import tempfile
@@ -41,9 +41,9 @@ _FAR = 4.0  # radii from an axis to the nearest node of the mesh, from which tha
 
 @dataclass
 class CaseRun:
-    """What one case gave: its scores, or why it was not reconstructed.
+    """Result of one case: its scores, or why it was not reconstructed.
 
-    ``source`` (digest of the sources) says what code it was.
+    ``source`` (digest of the sources) identifies the code.
     """
 
     kind: str
@@ -74,7 +74,7 @@ class Outcomes:
         return np.array([score[key] for score in self.scores])
 
     def forks(self) -> tuple[str, float, float]:
-        """As text, and the shares found and false."""
+        """As text, with the fractions found and false."""
         wanted, found, false = (int(self.column(key).sum()) for key in (
             "forks", "forks_found", "forks_false"))
         wanted = max(wanted, 1)
@@ -93,9 +93,9 @@ def outcomes(setting: Setting, counts: dict[str, int]) -> dict[str, Outcomes]:
     """Reconstruct and score cases of each kind in turn, as many as there is time for.
 
     Args:
-        setting: Pictures of every case go to its ``out``; cases that other parts or an earlier run
-            kept are not done again.
-        counts: How many of each kind at most.
+        setting: Pictures of every case go to its ``out``; cases kept from other parts or an earlier
+            run are not repeated.
+        counts: Most cases of each kind.
     """
     kept, source = setting.kept / "cases.jsonl", case_source()
     first = 1000 * setting.seed
@@ -123,7 +123,7 @@ def case_source() -> str:
 
 
 def measured(kind: str, seed: int, out: Path | None) -> CaseRun:
-    """One case; its picture goes to ``out``."""
+    """One case; its picture is written to ``out``."""
     case, began, source = KINDS[kind](seed), time.perf_counter(), case_source()
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -152,7 +152,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     aligned = read_cylinders(branch / "skeleton.csv")
     found = aligned.moved(Alignment.model_validate(manifest["alignment"]).undo(aligned.nodes))
     seen = seen_part(case.truth, case.points)
-    # Wood that no point shows is in no mesh; it is told beside.
+    # Wood without points is in no mesh; it is reported separately.
     shown = cylinder_volume(seen) / cylinder_volume(case.truth)
     scored = score(seen, found)
     scored |= {"seed": case.seed, "left_out": result["left_out_twigs"], "shown": shown,
@@ -168,12 +168,12 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
 
 
 def held(interval: list[float], value: float) -> bool:
-    """Whether an interval holds a true value."""
+    """Whether an interval contains a true value."""
     return interval[0] <= value <= interval[1]
 
 
 def unsaid_length(aligned: Skeleton, branch: Path) -> float:
-    """Length of axes [m] that is neither near the mesh nor on a branch named as left out."""
+    """Length of axes [m] that is neither near the mesh nor on a branch reported as left out."""
     masses = branch / "point_masses.json"
     named = {mass["branch"] for mass in json.loads(masses.read_text()) if "branch" in mass} if (
         masses.is_file()) else set()

@@ -1,4 +1,4 @@
-"""What the bench `scans` asks of a reconstruction whose truth is known."""
+"""Requirements of the bench `scans` on a reconstruction with known truth."""
 
 from dataclasses import dataclass
 
@@ -13,13 +13,13 @@ _STEP = 0.001  # [m] between the places on the axes that are compared
 
 @dataclass(frozen=True)
 class Dense:
-    """Places on a skeleton's axes, a millimetre apart: each stands for as much length.
+    """Points on a skeleton's axes, a millimetre apart; each represents the same length.
 
     Attributes:
-        points: Where [m], shape [n, 3].
-        radius: Of the axis there [m], shape [n].
+        points: Positions [m], shape [n, 3].
+        radius: Radius of the axis there [m], shape [n].
         low, high: The nodes before and after, shape [n] each.
-        share: Of the way from ``low`` to ``high``, shape [n].
+        share: Fraction of the distance from ``low`` to ``high``, shape [n].
     """
 
     points: np.ndarray
@@ -31,7 +31,7 @@ class Dense:
     @classmethod
     def of(cls, skeleton: Skeleton, chain: np.ndarray | None = None, step: float = _STEP,
            ) -> "Dense":
-        """Of the whole skeleton, or of one ``chain`` of nodes from the root outwards."""
+        """Points of the whole skeleton, or of one ``chain`` of nodes from the root outwards."""
         low = skeleton.parent[1:] if chain is None else chain[:-1]
         high = np.arange(1, skeleton.node_count) if chain is None else chain[1:]
         length = np.linalg.norm(skeleton.nodes[high] - skeleton.nodes[low], axis=1)
@@ -46,10 +46,10 @@ class Dense:
 
 
 def seen_part(truth: Skeleton, points: np.ndarray) -> Skeleton:
-    """The truth as far as a scan shows it: ends beyond the last point near them are cut off.
+    """The part of the truth that a scan shows: ends beyond the last point near them are cut off.
 
-    A stretch between points is asked for, whatever its length; what lies past all points is not,
-    nor is a twig none of whose own points were seen: those of its carrier do not show its foot.
+    A stretch between points is required, whatever its length. Wood beyond all points is not, nor is
+    a twig without points of its own: its carrier's points do not show its base.
     """
     run, distance = truth.branch[nearest_cylinders(truth, points)[0]], np.full(
         truth.node_count, np.inf)
@@ -77,9 +77,9 @@ def cylinder_volume(skeleton: Skeleton) -> float:
 
 
 def fork_matches(truth: Skeleton, found: Skeleton) -> tuple[int, np.ndarray]:
-    """How many forks were found, and which of the found forks are true ones, shape [forks].
+    """Number of forks found, and whether each found fork is a true one, shape [forks].
 
-    A fork is found within three radii of the true one, each once.
+    A fork counts as found within three radii of the true one, each only once.
     """
     got = found.forks()
     right = np.zeros(len(got), bool)
@@ -129,12 +129,12 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
 
 
 def doubled(found: Skeleton, here: Dense, near: np.ndarray) -> np.ndarray:
-    """Which places lie on a run that for the most part is where its carrier is: none of its own.
+    """Which places are on a run that mostly coincides with its carrier: not a run of its own.
 
     Args:
-        found: The skeleton.
-        here: Its places.
-        near: The nearest true place of each.
+        found: The found skeleton.
+        here: Places on it.
+        near: The nearest true place to each.
     """
     run, twice = found.branch[here.high], np.zeros(len(near), bool)
     for number, members in enumerate(found.runs()[1:], start=1):
@@ -144,7 +144,7 @@ def doubled(found: Skeleton, here: Dense, near: np.ndarray) -> np.ndarray:
 
 
 def _told_nodes(stated: np.ndarray, right: np.ndarray, branch: np.ndarray) -> list[list[float]]:
-    """Of each tenth of stated probabilities: length, sum stated, sum right, and branches."""
+    """For each tenth of stated probabilities: length, sum stated, sum correct, and branches."""
     place = np.minimum((10 * stated).astype(int), 9)
     return [[float(np.bincount(place, values, 10)[k]) for values in (
         np.ones(len(place)), stated, right.astype(float))]
@@ -152,7 +152,7 @@ def _told_nodes(stated: np.ndarray, right: np.ndarray, branch: np.ndarray) -> li
 
 
 def points_on_axes(points: np.ndarray, truth: Skeleton, found: Skeleton) -> float:
-    """Share of points [m], shape [n, 3], that lie on a found axis and on no true one."""
+    """Fraction of points [m], shape [n, 3], that are on a found axis and on no true one."""
     there, here = Dense.of(truth), Dense.of(found)
     distance, place = cKDTree(here.points).query(points)
     away, near = cKDTree(there.points).query(points)
@@ -161,9 +161,9 @@ def points_on_axes(points: np.ndarray, truth: Skeleton, found: Skeleton) -> floa
 
 
 def main_axis_error(truth: Skeleton, found: Skeleton) -> float:
-    """Farthest that the way to the true main tip is off the true main axis, in its radii.
+    """Largest distance of the path to the true main tip from the true main axis, in its radii.
 
-    Both ways: what was found must lie on the true axis, and the true axis on what was found.
+    In both directions: the found axis must be on the true axis, and the true one on the found one.
     """
     main = truth.runs()[0]
     axis = Dense.of(truth, main)

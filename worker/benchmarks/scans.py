@@ -1,6 +1,6 @@
-"""What the issue on real scans asked: `reconstruct` as a user calls it, on fresh seeds each run.
+"""Requirements on real scans: `reconstruct` as a user calls it, on fresh seeds each run.
 
-With ``--out`` every case is drawn as well.
+With ``--out``, every case is also drawn.
 """
 
 from collections.abc import Callable
@@ -22,8 +22,9 @@ _BINOMIAL = 1.96  # standard deviations of a share of few, that its row tells be
 
 @dataclass(frozen=True)
 class View:
-    """Limits for scans of one view: shares of forks found and false, centreline failures of 60,
-    median radius error, worst volume error. None: all is only reported."""
+    """Limits for scans of one view: fractions of forks found and false, centreline failures of 60,
+    median radius error, worst volume error. None: only reported.
+    """
 
     name: str
     limits: tuple[float, float, int, float, float] | None = None
@@ -50,7 +51,7 @@ LEAFY_ROW = Asked("leafy plants: stems recalled / right; leaf points on stems",
 
 
 def noise_asked(kind: str) -> tuple[Asked, ...]:
-    """What is asked of one-sided scans with more noise."""
+    """Requirements for one-sided scans with more noise."""
     name = f"one-sided, noise {kind}"
     return (Asked(f"{name}: radius bias", "under 8 %"),
             Asked(f"{name}: stated sigma covers the error", "88-99 %"),
@@ -58,7 +59,7 @@ def noise_asked(kind: str) -> tuple[Asked, ...]:
 
 
 def probability_asked(name: str) -> tuple[Asked, ...]:
-    """What is asked of stated probabilities; ``name`` says of which cases."""
+    """Requirements for stated probabilities; ``name`` identifies the cases."""
     return tuple(Asked(f"stated probability of {what}{name} against outcome, 10 bins",
                        "within 10 points (and the binomial error)") for what in ("forks", "nodes"))
 
@@ -116,7 +117,7 @@ def _root_rows(views: list[Outcomes]) -> list[Row]:
 
 
 def gap_rows(gaps: Outcomes) -> list[Row]:
-    """Whether the main axis goes on over gaps."""
+    """Whether the main axis continues across gaps."""
     if not gaps.scores:
         return _nothing((GAP_ROW,), gaps)
     off = gaps.column("main_axis_radii")
@@ -126,9 +127,9 @@ def gap_rows(gaps: Outcomes) -> list[Row]:
 
 
 def probability_rows(name: str, kinds: list[Outcomes]) -> list[Row]:
-    """Stated probabilities of forks and of nodes against how often they are there, in tenths.
+    """Stated probabilities of forks and of nodes against their actual frequency, in tenths.
 
-    Nodes are counted by length; how many branches they lie on says how sure their share is.
+    Nodes are counted by length; the number of their branches gives the certainty of their fraction.
     """
     forks = np.array([told for one in kinds for score in one.scores
                       for told in score["told_forks"]], float).reshape(-1, 2)
@@ -143,7 +144,7 @@ def probability_rows(name: str, kinds: list[Outcomes]) -> list[Row]:
 
 
 def _probability_row(asked: Asked, bins: np.ndarray, cases: int) -> Row:
-    """Of each tenth: count, sum stated, sum right, number of independent ones."""
+    """For each tenth: count, sum stated, sum correct, number of independent ones."""
     texts, good, worst = [], True, 0.0
     for low, (count, stated, right, members) in enumerate(bins):
         if count == 0:
@@ -185,7 +186,7 @@ def _leafy_rows(leafy: Outcomes) -> list[Row]:
 
 
 def _nothing(rows: tuple[Asked, ...], one: Outcomes) -> list[Row]:
-    """The rows of cases of which none was reconstructed; none where there was no case."""
+    """The rows of cases of which none was reconstructed; none if there was no case."""
     return [Row(*asked, f"none reconstructed: {'; '.join(one.failed[:3])}", False, one.count)
             for asked in rows] if one.count else []
 
@@ -204,7 +205,7 @@ def _told(setting: Setting, kinds: tuple[str, ...],
 
 def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, ...],
           seconds: float = 30.0) -> Part:
-    """The part of one kind of case."""
+    """The part for one kind of case."""
     return Part(partial(_told, kinds=(kind,), rows=lambda done: rows(done[kind])), seconds, gives,
                 grows=True)
 
@@ -225,7 +226,7 @@ PARTS = {
     "probabilities": Part(partial(_told, kinds=tuple(_COUNTS), rows=_probabilities), 30, (
         *probability_asked(""), *probability_asked(LEAFY)), grows=True),
     "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
-"""The table, in order of importance; ``--only`` also knows one scan of the same tree's row."""
+"""The table, in order of importance; ``--only`` also accepts one scan of the same tree's row."""
 PARTS |= {f"same-tree:{name}": Part(
     partial(same_tree_rows, only=name), 60, (same_tree_asked(name),), grows=True, alone=True)
     for name in (Path(file).stem for file in SCANS)}

@@ -1,10 +1,10 @@
-"""The recorded silicone beam, as a user brings it in: Young's modulus from a hung weight.
+"""The recorded silicone beam, as a user imports it: Young's modulus from a hung weight.
 
 Surface to branch folder, recording to pull, pull to modulus, modulus to other loads: the stages
-behind ``limber mesh``, ``import-pull``, ``estimate`` and ``predict``, nothing of its own. What is
-given here is what a user gives: density, Poisson's ratio, where markers and load are.
+behind ``limber mesh``, ``import-pull``, ``estimate`` and ``predict``, nothing else. The inputs
+given here are those of a user: density, Poisson's ratio, positions of markers and load.
 
-Other loads are predicted; how well is measured on recordings of the same form, simulated on a
+Other loads are predicted; the accuracy is measured on recordings of the same form, simulated on a
 finer mesh of another kind.
 """
 
@@ -44,13 +44,13 @@ TIPS = slice(0, 3)
 
 @dataclass(frozen=True)
 class BeamResult:
-    """What a recording gives.
+    """Result of a recording.
 
     Attributes:
-        young: [Pa].
-        interval: 95 %, mesh included [Pa].
+        young: Young's modulus [Pa].
+        interval: 95 % interval, mesh included [Pa].
         sensor, mesh: Relative standard deviations by cause.
-        measured_drop, simulated_drop: Mean of the tip markers, downwards [m].
+        measured_drop, simulated_drop: Mean drop of the tip markers, downwards [m].
     """
 
     young: float
@@ -62,12 +62,12 @@ class BeamResult:
 
 
 def in_scan(points: np.ndarray) -> np.ndarray:
-    """Take points of the beam's frame [m] to that of ``beam.stl`` [m]: long axis z, y up."""
+    """Transform points of the beam's frame [m] to that of ``beam.stl`` [m]: long axis z, y up."""
     return np.asarray(points)[..., [1, 2, 0]] + [0.0, 0.0, SIZE_M[0]]
 
 
 def made_branch(folder: Path) -> Path:
-    """The branch folder of ``beam.stl``, clamped at its far face; beside it the marker table."""
+    """The branch folder of ``beam.stl``, clamped at its far face, with the marker table."""
     branch = folder / "beam.branch"
     mesh_surface(FOLDER / "beam.stl", branch, MeshSurfaceSettings(
         unit="mm", up=(0.0, 1.0, 0.0), root=(15.0, 15.0, 0.0), poisson=POISSON,
@@ -79,7 +79,7 @@ def made_branch(folder: Path) -> Path:
 
 
 def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> BeamResult:
-    """Bring a recording in and estimate one modulus from it."""
+    """Import a recording and estimate one modulus from it."""
     x, y, z = in_scan(LOAD_POINT_M)
     pull = import_pull(branch, recording, name, ImportSettings(
         nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
@@ -96,8 +96,9 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
 
 
 def creep() -> float:
-    """By which part of it the given recording's drop still grows, from the fourth last second to
-    the last: the swing has died out by then."""
+    """Fraction by which the given recording's drop still grows, from the fourth last second to the
+    last: the swing has died out by then.
+    """
     table = np.loadtxt(RECORDING, delimiter=",", skiprows=1)
     left, tips = table[-1, 0] - table[:, 0], table[:, 1:10].reshape(-1, 3, 3)
     moved = np.linalg.norm(tips - tips[0], axis=2).mean(axis=1)
@@ -105,16 +106,16 @@ def creep() -> float:
 
 
 def predicted_drop(branch: Path, name: str, load: float) -> float:
-    """Mean drop of the tip markers [m] that the branch folder's estimate foretells for a load."""
+    """Mean drop of the tip markers [m] that the branch folder's estimate predicts for a load."""
     found = predict(branch, PredictSettings(pull=name, weight=load))
     return float(np.mean(np.array(found["drops_m"])[TIPS]))
 
 
 def simulated_recording(path: Path, young: float, load: float, seed: int) -> float:
-    """Write a recording as the given one is, of a beam of known modulus; return its true drop [m].
+    """Write a recording like the given one, of a beam of known modulus; return its true drop [m].
 
-    Markers sit up to 1 mm beside their nominal places, the capture frame is turned, the beam is
-    let go after 0.4 s and swings.
+    Markers are up to 1 mm beside their nominal positions, the capture frame is rotated, the beam is
+    released after 0.4 s and swings.
     """
     rng = np.random.default_rng(seed)
     mesh = box_mesh((16, 5, 5))
@@ -134,14 +135,14 @@ def simulated_recording(path: Path, young: float, load: float, seed: int) -> flo
 
 
 def box_mesh(cells: tuple[int, int, int] = (12, 4, 4)) -> TetMesh:
-    """Quadratic tetrahedra of the beam: bricks cut in six; the clamped face is marked."""
+    """Quadratic tetrahedra of the beam: bricks cut into six; the clamped face is marked."""
     axes = [np.linspace(low, low + size, count + 1) for low, size, count in
             zip((-SIZE_M[0], 0.0, 0.0), SIZE_M, cells, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     number = np.arange(len(nodes)).reshape([count + 1 for count in cells])
     corner = [number[i:cells[0] + i, j:cells[1] + j, k:cells[2] + k].ravel()
               for i, j, k in np.ndindex(2, 2, 2)]
-    # Kuhn's subdivision: along the diagonal from corner 000 to 111, alike in every brick.
+    # Kuhn's subdivision: along the diagonal from corner 000 to 111, the same in every brick.
     paths = [(0, 4, 6, 7), (0, 4, 5, 7), (0, 2, 6, 7), (0, 2, 3, 7), (0, 1, 5, 7), (0, 1, 3, 7)]
     tets = np.concatenate([np.column_stack([corner[c] for c in path]) for path in paths])
     mesh = TetMesh(nodes, tets).oriented().quadratic()
@@ -164,7 +165,7 @@ def edge_load(mesh: TetMesh) -> Grasp:
 
 def drop(young: float, load: float, *, poisson: float = POISSON,
          cells: tuple[int, int, int] = (12, 4, 4)) -> float:
-    """Static drop of the tip markers [m] under a load [N], on bricks of ``cells`` cut in six."""
+    """Static drop of the tip markers [m] under a load [N], on bricks of ``cells`` cut into six."""
     mesh = box_mesh(cells)
     model = BranchModel(mesh, young=young, poisson=poisson, density=DENSITY, gravity=GRAVITY)
     state = solve_static(model, grasp=edge_load(mesh), grasp_force=(0.0, 0.0, -load)).require()

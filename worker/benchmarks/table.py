@@ -1,4 +1,4 @@
-"""The table that every benchmark prints: measure, asked, measured, met, count."""
+"""The table that every benchmark prints: measure, required, measured, met, count."""
 
 import argparse
 import datetime
@@ -25,9 +25,9 @@ from limber.core.progress import SILENT, BarSink, Progress
 NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans", "viewport",
          "worker")
 NOT_SHOWN = "not shown"
-"""What a row says for which there was no time, or nothing to measure it with."""
+"""Entry of a row without time, or without anything to measure it with."""
 _FEW = 20
-"""So many intervals at least are judged: of fewer, one that misses is more than 5 %."""
+"""Least number of intervals that is judged: of fewer, one miss is more than 5 %."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Row:
     """One line of the table.
 
     Attributes:
-        measure: What is measured.
-        asked: The limit that the issue set.
-        measured: What came out.
-        met: None where nothing was asked, or where it could not be measured.
-        count: How many trials the row stands on: seeds, files, runs; 0 where it is not shown.
+        measure: Name of the measure.
+        asked: The limit set by the issue.
+        measured: The result.
+        met: None if nothing was required, or if it could not be measured.
+        count: Number of trials behind the row: seeds, files, runs; 0 if it is not shown.
     """
 
     measure: str
@@ -50,7 +50,7 @@ class Row:
 
 
 class Asked(NamedTuple):
-    """What a row measures, and its limit: known before anything is measured."""
+    """Measure and limit of a row: known before anything is measured."""
 
     measure: str
     asked: str
@@ -62,15 +62,15 @@ class Asked(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """How a part is measured.
+    """Settings for measuring a part.
 
     Attributes:
-        seed: From which all is drawn.
+        seed: Base seed of all draws.
         quick: Fewer trials, smaller cases.
         budget: Time of the part.
-        progress: Called as it goes.
+        progress: Called during the work.
         kept: Folder where trials are kept; parts of one run and runs of one ``--out`` share it.
-        out: Folder for pictures and raw numbers, or None where the user named none.
+        out: Folder for pictures and raw numbers, or None if the user named none.
     """
 
     seed: int
@@ -81,7 +81,7 @@ class Setting:
     out: Path | None = None
 
     def at_most(self, count: int, quick: int) -> int:
-        """Return how many trials to take if the time allows."""
+        """Return the number of trials to take if the time allows."""
         return quick if self.quick else count
 
     def seeds(self, count: int, quick: int, first: int = 0) -> range:
@@ -90,7 +90,7 @@ class Setting:
         return range(start, start + self.at_most(count, quick))
 
     def generator(self, *which: int) -> np.random.Generator:
-        """Return a generator of the base seed; ``which`` keeps those of parts apart."""
+        """Return a generator of the base seed; ``which`` separates those of parts."""
         return np.random.default_rng([self.seed, *which])
 
 
@@ -100,11 +100,11 @@ class Part:
 
     Attributes:
         run: Measures it.
-        seconds: About what the least of it takes on two cores [s]: all of it, or one trial where
-            it grows. It is not begun with less.
-        gives: Its rows: one that ``run`` does not return is not shown.
-        grows: It takes trials as long as its budget lasts.
-        alone: Measured only where ``--only`` names it.
+        seconds: Approximate time of the least of it on two cores [s]: all of it, or one trial if it
+            grows. It is not started with less.
+        gives: Its rows; one that ``run`` does not return is listed as not shown.
+        grows: Whether it takes trials as long as its budget lasts.
+        alone: Whether it is measured only if ``--only`` names it.
     """
 
     run: Callable[[Setting], list[Row]]
@@ -161,7 +161,7 @@ def rows_of(parts: dict[str, Part], setting: Setting, only: Sequence[str] = (),
     """Measure parts in their order, within the setting's budget.
 
     Returns:
-        The rows of all chosen parts, and how many of them come from parts that failed.
+        The rows of all chosen parts, and the number of rows from failed parts.
     """
     chosen = only or [name for name, part in parts.items() if not part.alone]
     table: list[Row] = []
@@ -186,10 +186,10 @@ def rows_of(parts: dict[str, Part], setting: Setting, only: Sequence[str] = (),
 
 
 def allowance(part: Part, later: Sequence[Part], remaining: float) -> float | None:
-    """Return the time [s] of a part, or None where the least of it does not fit.
+    """Return the time [s] of a part, or None if the least of it does not fit.
 
-    The least of each later part that still fits, the most important first, is set aside. Parts
-    that grow share evenly what is left over.
+    The least time of each later part that still fits, the most important first, is set aside. Parts
+    that grow divide the rest evenly.
     """
     spare, growing = remaining - part.seconds, 1
     if spare < 0:
@@ -202,9 +202,9 @@ def allowance(part: Part, later: Sequence[Part], remaining: float) -> float | No
 
 
 def share_met(share: float, count: int, low: float, high: float) -> bool | None:
-    """Whether a share of ``count`` intervals lies in an asked range, or None: they are too few.
+    """Whether the fraction of ``count`` intervals is in a required range; None: too few.
 
-    A share above ``high`` says nothing where a single miss would bring it below.
+    A fraction above ``high`` is inconclusive if a single miss would bring it below.
     """
     if count < _FEW or (share > high and count * (1 - high) < 1):
         return None
@@ -212,7 +212,7 @@ def share_met(share: float, count: int, low: float, high: float) -> bool | None:
 
 
 def _tried(name: str, part: Part, setting: Setting) -> list[Row]:
-    """The rows of a part, in what it gives; none where it failed, which is printed."""
+    """The rows of a part, including those not shown; none if it failed, which is printed."""
     try:
         found = part.run(setting)
     except Cancelled:
@@ -238,7 +238,7 @@ def _measured(parts: dict[str, Part], options: argparse.Namespace, budget: Budge
 
 
 def _record(options: argparse.Namespace, rows: Sequence[Row]) -> dict[str, object]:
-    """The table with what a reader needs to place it: when, of which code, from which seed."""
+    """The table with its context: date, code, seed."""
     done = subprocess.run(["git", "rev-parse", "--short=10", "HEAD"], cwd=Path(__file__).parent,
                           capture_output=True, text=True, check=False)
     return {"bench": options.name, "date": datetime.date.today().isoformat(),

@@ -1,4 +1,4 @@
-"""Estimates against truths drawn anew: what was asked of them, what comes out."""
+"""Estimates against newly drawn truths: required and measured."""
 
 from functools import partial
 
@@ -79,20 +79,20 @@ def _cell_rows(asked: tuple[Asked, ...], trials: list[Trial], limit: float) -> l
 
 
 def _half_widths(trial: Trial) -> np.ndarray:
-    """Of 95 % intervals of log E by a trial's bound, shape [4]."""
+    """Half widths of 95 % intervals of log E by a trial's bound, shape [4]."""
     return 1.96 * np.sqrt(np.diag(np.array(trial.bound, float)))
 
 
 def _efficient(bounds: list[tuple]) -> str:
     """Median, in percent, of the worst E error of estimates that attain Cramer-Rao bounds.
 
-    What is known beforehand is in the bounds as in the fit: they hold on the average over truths
-    drawn from the fit's prior. The field's form is drawn from less than that here. Estimates then
-    come between this and the same with that form known, which no fit comes below, and their
-    intervals hold more often than they say.
+    Prior knowledge is in the bounds as in the fit: they hold on average over truths drawn from the
+    fit's prior. Here the field's form is drawn from a narrower range. Estimates are then between
+    this bound and the one with that form known, which no fit beats, and their intervals contain the
+    truth more often than they state.
 
     Args:
-        bounds: Covariance of log E of each trial, shape [4, 4]; a kept one has None where there is
+        bounds: Covariance of log E of each trial, shape [4, 4]; a kept one has None if there is
             none.
     """
     covariance = np.array(bounds, float)

@@ -1,4 +1,4 @@
-"""Estimates of a hung beam: over meshes, from the real recording, and drops under other loads."""
+"""Estimates of a hung beam: across meshes, from the real recording, and drops under other loads."""
 
 import tempfile
 from functools import partial
@@ -32,12 +32,12 @@ from limber.store import Branch
 
 SWING_MESH = (6, 2, 2)
 MESHES = (SWING_MESH, (9, 3, 3), (12, 4, 4))
-"""Bricks along and across the beam, each cut in six quadratic tetrahedra."""
+"""Bricks along and across the beam, each cut into six quadratic tetrahedra."""
 OTHERS_PA = ((264e3, 264e3), (264e3, 295e3), (283e3, 283e3))
-"""Of the real beam, by three other programs; one of them gives a range."""
+"""Modulus of the real beam, by three other programs; one of them gives a range."""
 OTHER_LOADS_N = (0.2, 1.0)
 LEAST_SAG = 0.01
-"""Of the length: what sags less shows no modulus to 5 % in markers of 0.2 mm."""
+"""Least sag over the length: a smaller one gives no modulus to 5 % with markers of 0.2 mm."""
 
 
 BEAM_ROWS = (
@@ -97,7 +97,7 @@ def _bricks(folder: Path, cells: tuple[int, int, int]) -> Branch:
 
 def _imported(branch: Branch, recording: Path, name: str,
               motion: Literal["quasi_static", "swing"] = "quasi_static") -> None:
-    """Bring a recording of the hung beam in."""
+    """Import a recording of the hung beam."""
     beam, places = silicone_beam, branch.folder.parent / "places.csv"
     rows = [f"{label},{x:.6f},{y:.6f},{z:.6f}"
             for label, (x, y, z) in zip(beam.LABELS, beam.NOMINAL_M, strict=True)]
@@ -157,12 +157,12 @@ def sag_row(setting: Setting) -> list[Row]:
 
 
 def _sag_trial(seed: int, source: str) -> Numbers:
-    """Error of E and whether its interval holds the truth, or why there is no estimate."""
+    """Error of E and whether its interval contains the truth, or why there is no estimate."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             error, is_held = _sagging(Path(folder), np.random.default_rng([seed, 42]))
         except Cancelled:
-            # Stopped from outside: no trial.
+            # Stopped from outside: not a trial.
             raise
         except LimberError as refusal:
             return Numbers("sag", seed, source, {"refused": str(refusal)[:80]})
@@ -170,9 +170,9 @@ def _sag_trial(seed: int, source: str) -> Numbers:
 
 
 def _sagging(folder: Path, rng: np.random.Generator) -> tuple[float, bool]:
-    """Relative error of E, and whether its interval holds the truth, of one drawn beam.
+    """Relative error of E, and whether its interval contains the truth, of one drawn beam.
 
-    Density and hung masses are weighed to 1 %; Poisson's ratio is a book's.
+    Density and hung masses are weighed to 1 %; Poisson's ratio is a textbook value.
     """
     while (sag := _drawn_sag(folder, rng)) is None:
         pass
@@ -194,7 +194,7 @@ def _sagging(folder: Path, rng: np.random.Generator) -> tuple[float, bool]:
 
 def _drawn_sag(folder: Path, rng: np.random.Generator,
                ) -> tuple[float, MeshSurfaceSettings, np.ndarray, np.ndarray] | None:
-    """Modulus, what is known of the beam, markers, and how they sag [m]; None: it hardly sags."""
+    """Modulus, known properties of the beam, markers, and their sag [m]; None: it hardly sags."""
     young = float(np.exp(rng.uniform(*np.log([3e8, 4e9]))))
     density, poisson = rng.uniform(500, 1100), float(np.clip(rng.normal(0.35, 0.05), 0.2, 0.47))
     table = _drawn_table(folder / "beam.csv", rng)
@@ -212,7 +212,7 @@ def _drawn_sag(folder: Path, rng: np.random.Generator,
 
 
 def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
-    """A level axis that bends aside a little, six sections, masses at two of them."""
+    """A level axis that bends sideways a little, six sections, masses at two of them."""
     share = np.linspace(0, 1, 6)
     length, width = rng.uniform(400, 800), rng.uniform(12, 30)
     height = width * rng.uniform(0.5, 1.6)
@@ -227,7 +227,7 @@ def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
 
 
 def real_row(_setting: Setting) -> list[Row]:
-    """Both moduli of the given recording against those that other programs found."""
+    """Both moduli of the given recording against the results of other programs."""
     if not silicone_beam.RECORDING.is_file():
         return [Row(*REAL_ROW, "the recording is not here", None, 0)]
     found, swung = _of_the_recording()
@@ -244,10 +244,10 @@ def real_row(_setting: Setting) -> list[Row]:
 
 
 def _why_not_at_rest(young: float, measured: float) -> str:
-    """Why a modulus that other programs found need not be in the static interval, in words.
+    """Why a modulus from other programs need not be in the static interval, in words.
 
-    Silicone creeps: what hangs still is softer than what swings. 264 kPa (263,824 Pa) is what the
-    data's authors found, for the place of rest too; what lies above belongs to the swing.
+    Silicone creeps: it is softer at rest than in swing. The data's authors found 264 kPa (263,824
+    Pa), also for the rest position; larger values belong to the swing.
     """
     drop = silicone_beam.drop(young, silicone_beam.LOAD_N)
     return (f"; {young / 1e3:.0f} is not one of the beam at rest: it would drop by "
@@ -256,7 +256,7 @@ def _why_not_at_rest(young: float, measured: float) -> str:
 
 
 def swing_row(_setting: Setting) -> list[Row]:
-    """Whether the swing of the given recording tells the modulus that its rest tells."""
+    """Whether the swing of the given recording gives the same modulus as its rest position."""
     if not silicone_beam.RECORDING.is_file():
         return [Row(*SWING_ROW, "the recording is not here", None, 0)]
     found, swung = _of_the_recording()
@@ -267,8 +267,9 @@ def swing_row(_setting: Setting) -> list[Row]:
 
 
 def _of_the_recording() -> tuple[BeamResult, dict[str, Any]]:
-    """Its place of rest, on the mesh of its surface, and its swing, on coarse bricks: quick, and
-    corrected by what they are too stiff by."""
+    """Its rest position, on the mesh of its surface, and its swing, on coarse bricks: fast, and
+    corrected by their excess stiffness.
+    """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         (folder / "swing").mkdir()

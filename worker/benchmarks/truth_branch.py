@@ -1,8 +1,8 @@
-"""Branches whose truth is drawn anew each time, and what a real cell would record of them.
+"""Branches with a newly drawn truth, and what a real cell would record of them.
 
-The truth lives on a finer mesh than the fit; its Young's modulus runs otherwise between the
-control points than the fit takes it to; its Poisson's ratio and density are not those given to the
-fit. The cell has a sensor with gain, zero and drift, and gripper and camera a little off.
+The truth uses a finer mesh than the fit. Its Young's modulus varies between the control points
+differently than the fit assumes; its Poisson's ratio and density are not those given to the fit.
+The cell has a sensor with gain, zero and drift, and gripper and camera are slightly off.
 """
 
 from dataclasses import dataclass, replace
@@ -31,12 +31,12 @@ FRACTIONS = (0.2, 0.4, 0.6, 0.8)
 GRAVITY = (0.0, 0.0, -9.80665)
 FORMS = ("straight", "monotone", "wavy")
 STATES, FRAMES = 16, 100
-"""Solutions along a pull of the truth, and frames recorded of it (a spline through the former)."""
+"""Solutions along a pull of the truth, and its recorded frames (a spline through the former)."""
 LEVELS_OFF = 0.1
-"""Part of the length over which a monotone modulus goes on beyond the outer control points."""
+"""Fraction of the length over which a monotone modulus continues beyond outer control points."""
 POSITION_NOISE_M, FORCE_NOISE = 1e-3, 0.02
 POISSON, DENSITY = 0.35, 900.0
-"""What the fit is told."""
+"""Inputs given to the fit."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Truth:
 
     Attributes:
         branch: Shape, and Young's modulus at the control points.
-        form: How the modulus runs between them; out of FORMS.
-        poisson, density: True ones.
-        model: On the fine mesh.
+        form: Form of the modulus between them; one of FORMS.
+        poisson, density: True values.
+        model: Model on the fine mesh.
     """
 
     branch: PaperBranch
@@ -62,7 +62,7 @@ class Truth:
 
 
 def drawn_truth(rng: np.random.Generator) -> Truth:
-    """Draw a branch of wood, as long and thick as the paper's, softer outwards as those are."""
+    """Draw a branch of wood, as long and thick as the paper's, and softer outwards like those."""
     length = rng.uniform(0.45, 0.75)
     root = rng.uniform(6e-3, 10e-3)
     ratios = np.clip(rng.normal(-0.9, 0.5, 3), -2.0, 0.0)
@@ -80,7 +80,7 @@ def drawn_truth(rng: np.random.Generator) -> Truth:
 
 def log_field(form: str, mesh: TetMesh, branch: PaperBranch, rng: np.random.Generator,
               ) -> np.ndarray:
-    """Log E of the tetrahedra: through the moduli at the control points, otherwise than in a fit.
+    """Log E of the tetrahedra: through the moduli at the control points, different from a fit's.
     """
     nodes = branch.skeleton.nodes
     along = np.linalg.norm(mesh.centroids[:, None] - nodes[None], axis=2).argmin(axis=1) / (
@@ -94,14 +94,14 @@ def log_field(form: str, mesh: TetMesh, branch: PaperBranch, rng: np.random.Gene
     inside = PchipInterpolator(places, values)
     slopes = inside.derivative()(places[[0, -1]])
     before, after = np.maximum(places[0] - along, 0), np.maximum(along - places[-1], 0)
-    # It goes on as it ran, and levels off: straight on, a base came out at 50 GPa.
+    # It continues its slope and levels off: continued linearly, a base reached 50 GPa.
     beyond = LEVELS_OFF * (slopes[1] * (1 - np.exp(-after / LEVELS_OFF))
                            - slopes[0] * (1 - np.exp(-before / LEVELS_OFF)))
     return inside(np.clip(along, places[0], places[-1])) + beyond
 
 
 def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0) -> Pull:
-    """What happens in one pull, without any error of measurement; its force turns by ``turn``."""
+    """One pull without measurement errors; its force is rotated by ``turn``."""
     branch = truth.branch
     skeleton, mesh = branch.skeleton, truth.model.mesh
     point = skeleton.point_at(choice.fraction)
@@ -127,7 +127,7 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0)
 
 
 def recorded(pull: Pull, cell: CellErrors, rng: np.random.Generator) -> Pull:
-    """What the cell records of a pull: its own errors, the sensor's drifting zero, and noise."""
+    """The cell's recording of a pull: its own errors, the sensor's drifting zero, and noise."""
     seen = cell.recorded(pull, rng)
     peak = float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max())
     wrenches, positions = seen.wrenches.copy(), seen.observations.positions

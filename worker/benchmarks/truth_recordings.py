@@ -1,7 +1,7 @@
-"""Bad recordings, each through the commands that a user runs: exit code 2 or 3, and the reason.
+"""Bad recordings, each through a user's commands: exit code 2 or 3, and the reason.
 
-A branch of one modulus is hung with a weight and filmed; what can be wrong with such a recording is
-made wrong, one thing at a time.
+A branch of one modulus is hung with a weight and filmed; possible faults of such a recording are
+introduced, one at a time.
 """
 
 import contextlib
@@ -32,17 +32,17 @@ GRAVITY = (0.0, 0.0, -9.80665)
 LABELS = ("tip1", "tip2", "tip3", "base1", "base2")
 PLACES = ((80, (0.0, 0.012, 0.0)), (70, (0.0, -0.014, 0.0)), (60, (0.012, 0.0, 0.01)),
           (4, (0.015, 0.0, 0.0)), (8, (0.0, 0.02, 0.0)))
-"""Of the markers: beside which node of the axis, and where beside it [m]."""
+"""Positions of the markers: the node of the axis, and the offset from it [m]."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A branch folder, and what a camera saw of the branch under its weight.
+    """A branch folder, and a camera's recording of the branch under its weight.
 
     Attributes:
-        folder: Of all files.
-        nominal: The markers' places on the branch [m], shape [5, 3].
-        grasp: Where the weight hangs [m].
+        folder: Folder of all files.
+        nominal: Positions of the markers on the branch [m], shape [5, 3].
+        grasp: Position of the hung weight [m].
         times: [s], shape [n].
         seen: Markers in the camera's frame [m], shape [n, 5, 3].
     """
@@ -71,7 +71,7 @@ def bad_recordings_row(setting: Setting) -> list[Row]:
             code, told = run(rig)
             if code not in (2, 3) or not all(word in told for word in words):
                 wrong.append(f"{name}: exit {code}, {told[:60]!r}")
-    # What did not come to its turn is not known to be refused.
+    # A case that was not run is not known to be refused.
     is_met = False if wrong else True if count == len(CASES) + 1 else None
     return [Row(*BAD_RECORDINGS, f"{count - len(wrong)} of {count} as asked"
                 + "".join(f"; {each}" for each in wrong), is_met, count)]
@@ -105,7 +105,7 @@ def _imported(rig: Rig, *, seen: np.ndarray | None = None, labels: tuple[str, ..
               nominal: np.ndarray | None = None, grasp: np.ndarray | None = None,
               times: np.ndarray | None = None, weight: float = WEIGHT,
               own_weight: bool = True) -> tuple[int, str]:
-    """Write a recording and bring it in as a user does; the exit code and all that was said."""
+    """Write a recording and import it as a user does; return the exit code and all output."""
     seen = rig.seen if seen is None else seen
     write_stream(rig.folder / "swing.csv", Stream(
         rig.times if times is None else times, seen.reshape(len(seen), -1),
@@ -165,7 +165,7 @@ def _nothing_moves(rig: Rig) -> tuple[int, str]:
 
 
 def _not_identified(rig: Rig) -> tuple[int, str]:
-    """Slow, led by its path, without force: soft and stiff look alike."""
+    """Slow, driven by its path, without force: soft and stiff look alike."""
     still = np.zeros((len(rig.times), 6))
     still[:, :3] = rig.grasp + np.linspace(0, 1, len(rig.times))[:, None] * [0.05, 0.0, 0.0]
     write_stream(rig.folder / "robot.csv", Stream(rig.times, still, (
@@ -181,7 +181,7 @@ def _not_identified(rig: Rig) -> tuple[int, str]:
 
 
 def _in_another_unit(rig: Rig) -> tuple[int, str]:
-    """A weight in the wrong unit: no modulus is as large as it asks for."""
+    """A weight in the wrong unit: no modulus is as large as it requires."""
     code, told = _imported(rig, weight=4e6, own_weight=False)
     if code:
         return code, told
@@ -202,6 +202,6 @@ CASES: tuple[tuple[str, tuple[str, ...], Callable[[Rig], tuple[int, str]]], ...]
     ("nothing that gives the scale", ("soft or stiff",), _not_identified),
     ("a load in another unit", ("another unit",), _in_another_unit),
 )
-"""What is wrong, words that the message has, and how it is made."""
+"""The fault, words in the message, and the function that makes it."""
 BAD_RECORDINGS = Asked("bad recordings: " + ", ".join(name for name, _, _ in CASES),
                        "exit 2 or 3 with the reason")

@@ -1,7 +1,7 @@
-"""From a scan to moduli as a user goes: generate, reconstruct, import a pull, estimate.
+"""From a scan to moduli like a user: generate, reconstruct, import a pull, estimate.
 
-The pull is of the true branch, in a cell with all its errors; the scan is noisier than a laser's.
-A refusal counts as right where it says what the scan lacks.
+The pull is of the true branch, in a cell with all its errors; the scan is noisier than a laser's. A
+refusal counts as correct if it states what the scan lacks.
 """
 
 import json
@@ -38,11 +38,11 @@ from limber.store.loading import load_mesh, load_skeleton
 
 VIEWS = ("round", "one-sided")
 NOISE_M = (1e-3, 3e-3)
-"""Of the scan's points, least and most."""
+"""Noise of the scan's points, least and most."""
 YOUNG_PA = (1e9, 5e9)
 """Mean modulus of a branch, least and most: wood, as in the other trials."""
 LACKS = ("scan", "cloud", "point")
-"""A refusal that helps names one of these."""
+"""A helpful refusal names one of these."""
 
 
 @dataclass(frozen=True)
@@ -50,17 +50,17 @@ class ScanTrial:
     """One branch from scan to moduli.
 
     Attributes:
-        seed: Of all that is drawn.
+        seed: Seed of all draws.
         view: How it was scanned.
-        noise: Of the scan's points [m].
+        noise: Noise of the scan's points [m].
         errors: Relative errors of the moduli; empty: there is no estimate.
-        covered: Whether each interval holds the truth.
+        covered: Whether each interval contains the truth.
         widths: Half widths of the intervals in log E.
-        bending_covered: Whether each interval of E I holds the truth.
+        bending_covered: Whether each interval of E I contains the truth.
         bending_widths: Half widths of the intervals in log E I.
         refusal: Why there is no estimate.
-        seconds: Of all.
-        source: Digest of the sources; another one's trials are not taken over.
+        seconds: Total time.
+        source: Digest of the sources; trials of other sources are not reused.
     """
 
     seed: tuple[int, ...]
@@ -95,7 +95,7 @@ def scan_row(setting: Setting) -> list[Row]:
 
 
 def coverage_row(trials: list[ScanTrial]) -> Row:
-    """How many intervals hold the truth, and whether refusals help."""
+    """Number of intervals that contain the truth, and whether refusals help."""
     fitted = [each for each in trials if not each.refusal]
     refused = [each.refusal for each in trials if each.refusal]
     mute = [text for text in refused if not any(word in text for word in LACKS)]
@@ -113,7 +113,7 @@ def coverage_row(trials: list[ScanTrial]) -> Row:
 
 
 def bending_row(trials: list[ScanTrial]) -> Row:
-    """How many intervals of E I hold the truth, and how wide they are beside those of E."""
+    """Number of intervals of E I that contain the truth, and their width relative to those of E."""
     fitted = [each for each in trials if not each.refusal]
     if not fitted:
         return Row(*BENDING_ROW, "no estimate", False, len(trials))
@@ -137,7 +137,7 @@ def scan_trial(seed: tuple[int, ...], source: str = "") -> ScanTrial:
         try:
             found = _estimated(Path(temporary), made, rng)
         except Cancelled:
-            # Stopped from outside: no trial.
+            # Stopped from outside: not a trial.
             raise
         except LimberError as error:
             refusal = str(error)
@@ -153,7 +153,7 @@ def scan_trial(seed: tuple[int, ...], source: str = "") -> ScanTrial:
 
 
 def _compared(interval: list, truth: np.ndarray) -> tuple[tuple[bool, ...], tuple[float, ...]]:
-    """Whether each interval holds its truth, and their half widths in the log."""
+    """Whether each interval contains its truth, and their half widths in the log."""
     low, high = np.log(np.array(interval, float)).T
     log_truth = np.log(truth)
     return (tuple(((low <= log_truth) & (log_truth <= high)).tolist()),

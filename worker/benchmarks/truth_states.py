@@ -1,5 +1,6 @@
-"""States that are what they are said to be: swings keep their energy, bad states are doubted, and
-what reduced models and live updates give is the full fit's."""
+"""Validity of states: swings keep their energy, bad states are flagged, and reduced models and live
+updates agree with the full fit.
+"""
 
 import tempfile
 import time
@@ -40,7 +41,7 @@ QUICK_ROWS = (
 
 
 def swing_row(setting: Setting) -> list[Row]:
-    """An undamped beam let go from aside, in the default step of 1/60 s."""
+    """An undamped beam released from a deflection, in the default step of 1/60 s."""
     mesh, tip = short_beam()
     model = BranchModel(mesh, young=_YOUNG, poisson=0.3, density=DENSITY, gravity=None,
                         damping=RayleighDamping(0.0, 0.0))
@@ -63,7 +64,7 @@ def swing_row(setting: Setting) -> list[Row]:
 
 def _pulled_aside(model: BranchModel, tip: Grasp, direction: np.ndarray,
                   amplitude: float) -> np.ndarray:
-    """Return the state [m] under a force that brings the tip aside by a part of the length."""
+    """Return the state [m] under a force that moves the tip aside by a fraction of the length."""
     from scipy.optimize import brentq
 
     length = np.ptp(model.mesh.nodes[:, 2])
@@ -126,7 +127,7 @@ def _doubted(off: np.ndarray, energy: np.ndarray, flagged: np.ndarray, milliseco
 
 
 def quick_rows(setting: Setting) -> list[Row]:
-    """A new pull on a basis that is there; a pull followed while it goes on."""
+    """A new pull on an existing basis; a pull followed while it continues."""
     branch, rng = BRANCHES[1], setting.generator(13)
     # About 2,500 quadratic tetrahedra.
     bench = Bench(branch, slice_length=0.95, sides=10)

@@ -1,12 +1,11 @@
 """Trials of estimates against a truth: error, interval, and the bound that no interval undercuts.
 
-The Cramer-Rao bound is that of the trial's own problem: the Fisher information of all that was
-measured, taken at the truth, in all that is not known (moduli, form of their field, Poisson's
-ratio, density, every error of the cell, the course of the force), with what is known of each
-beforehand.
+The Cramer-Rao bound is that of the trial's own problem: the Fisher information of all measurements,
+taken at the truth, in all unknowns (moduli, form of their field, Poisson's ratio, density, every
+error of the cell, the course of the force), with the prior knowledge of each.
 
-The first pull is made where anyone would make one, near the tip; further ones where
-`limber suggest-pull` says after the estimate from those before, as users are told to.
+The first pull is at the obvious position, near the tip; further ones where `limber suggest-pull`
+suggests after the estimate from those before, as the documentation advises.
 """
 
 import time
@@ -49,9 +48,9 @@ from limber.stages.pulls.suggest_pull import SuggestPullSettings
 SETTINGS = EstimateSettings(hold_out=False)
 FIRST_PULL, FIRST_TURN = PullChoice(0.92, 0.0, 0.4), 2.0
 MOST_STRAIN = 0.02
-"""Of pulls that are suggested: the first strains the branches by 1.4 to 1.9 %."""
+"""Largest strain of suggested pulls: the first strains the branches by 1.4 to 1.9 %."""
 FORM_MISFIT = 0.1
-"""What is left between the true field and the fit's nearest one, in log E: about so much."""
+"""Remaining difference between the true field and the fit's nearest one, in log E: approximate."""
 
 
 @dataclass(frozen=True)
@@ -59,18 +58,18 @@ class Trial:
     """One fit of a drawn branch in a drawn cell.
 
     Attributes:
-        seed: Of all that was drawn.
-        form: Of the true field.
+        seed: Seed of all random numbers.
+        form: Form of the true field.
         errors: Relative errors of the moduli, shape [4].
-        covered: Whether each 95 % interval holds the truth, shape [4].
+        covered: Whether each 95 % interval contains the truth, shape [4].
         widths: Half widths of the intervals in log E, shape [4].
         bound: Covariance of log E by the Cramer-Rao bound, shape [4, 4].
         bound_of_known_form: The same if the form of the field were known.
-        variance_factor: Mean squared residual over the stated.
-        converged: Of the optimiser.
-        seconds: Of the fit.
-        message: Why there is no result; empty: there is one.
-        source: Digest of the sources; another one's trials are not taken over.
+        variance_factor: Mean squared residual over the stated variance.
+        converged: Whether the optimiser converged.
+        seconds: Time of the fit.
+        message: Why there is no result; empty if there is one.
+        source: Digest of the sources; trials of other sources are not reused.
     """
 
     seed: tuple[int, ...]
@@ -104,7 +103,7 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
             pulls.append(recorded(exact_pull(truth, len(pulls), choice), cell, rng))
             found = _estimated(pulls, subject, settings)
     except Cancelled:
-        # Stopped from outside: no trial.
+        # Stopped from outside: not a trial.
         raise
     except LimberError as error:
         return Trial(seed, truth.form, seconds=time.perf_counter() - started, message=str(error),
@@ -123,7 +122,7 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
 
 
 def _estimated(pulls: list[Pull], subject: Subject, settings: EstimateSettings) -> Estimate:
-    """What `limber estimate` finds, its mesh's stiffness corrected, or its refusal."""
+    """Result of `limber estimate`, its mesh's stiffness corrected, or its refusal."""
     found = fit_branch(pulls, subject, settings, log=EvaluationLog(None, ""))
     require_result(found)
     judge_model(found, subject, pulls[0].entry.grasp, settings, axes=None, cloud=None)
@@ -132,7 +131,7 @@ def _estimated(pulls: list[Pull], subject: Subject, settings: EstimateSettings) 
 
 def _suggested(found: Estimate, pulls: list[Pull], subject: Subject,
                settings: EstimateSettings) -> PullChoice:
-    """The most telling pull that `limber suggest-pull` finds after an estimate."""
+    """The most informative pull that `limber suggest-pull` finds after an estimate."""
     written = summary(found, settings) | details(found, subject, pulls)
     offered = suggest(subject, found.values, Known.estimated(plain(written)),
                       Cell.of(pulls[-1]), SuggestPullSettings().fractions,
@@ -141,7 +140,7 @@ def _suggested(found: Estimate, pulls: list[Pull], subject: Subject,
 
 
 def fitting_subject(truth: Truth) -> Subject:
-    """The branch as a user has it: a coarser mesh, a book's density and Poisson's ratio."""
+    """The user's branch: a coarser mesh, textbook density and Poisson's ratio."""
     branch = truth.branch
     return _subject(branch.mesh(slice_length=3.0, sides=8), truth, POISSON, DENSITY)
 
@@ -149,8 +148,8 @@ def fitting_subject(truth: Truth) -> Subject:
 def bounds(truth: Truth, objective: Objective, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     """Covariances of log E by the Cramer-Rao bound, each of shape [4, 4]; no link helps them.
 
-    With the form of the field as little known as the fit takes it to be, and with it known: no fit
-    that knows as little of the cell comes below the latter, however forms are drawn.
+    With the form of the field as little known as the fit assumes, and with it known: no fit that
+    knows as little of the cell beats the latter, however forms are drawn.
     """
     objective = objective.with_space(objective.space.linked(()))
     evaluation = objective.evaluate(objective.space.pack(true_values(truth, subject)),
@@ -164,8 +163,8 @@ def bounds(truth: Truth, objective: Objective, subject: Subject) -> tuple[np.nda
 
 
 def true_values(truth: Truth, subject: Subject) -> Values:
-    """The truth in a fit's terms: how far moduli are told depends on the form of the field too,
-    which is taken as near to the true one as the fit's field comes.
+    """The truth in a fit's terms: the information about moduli depends on the form of the field
+    too, which is taken as near to the true one as the fit's field comes.
     """
     values = Values(truth.young, truth.poisson, truth.density)
     nearest = cKDTree(truth.model.mesh.centroids).query(subject.mesh.centroids)[1]

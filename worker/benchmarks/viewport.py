@@ -1,4 +1,4 @@
-"""The viewport's table: what the add-on costs inside Blender.
+"""The viewport's table: cost of the add-on inside Blender.
 
 In the Blender of LIMBER_BLENDER, else in the bpy package; without a window, so nothing is drawn.
 """
@@ -34,7 +34,7 @@ _UNDO = Asked("undo and redo, random sequences", "state consistent, no crash")
 
 
 def _probed(setting: Setting, part: str) -> dict[str, Any]:
-    """What one part of the probe says, by measure; empty where Blender did not start."""
+    """Results of one part of the probe, by measure; empty if Blender did not start."""
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         return _measured(Path(place), setting, part)
 
@@ -87,7 +87,7 @@ def _grab_rows(setting: Setting) -> list[Row]:
     found = _probed(setting, "grab")
     return [
         _row(found, "grab", _GRAB[0], "poses",
-             # The rest of the time other programs had the processor.
+             # Other programs had the processor for the rest of the time.
              lambda m: (f"{m['median_ms']:.2f} / {m['high_ms']:.2f} ms (of the processor "
                         f"{m['own_median_ms']:.2f} / {m['own_high_ms']:.2f})",
                         m["median_ms"] <= 1 and m["high_ms"] <= 2)),
@@ -129,7 +129,7 @@ def _undo_rows(setting: Setting) -> list[Row]:
 
 def _row(found: dict[str, Any], name: str, asked: Asked, count: str | None,
          judged: Callable[[dict[str, Any]], tuple[str, bool]]) -> Row:
-    """The row of a measure; ``count`` names the number that says how many trials it has."""
+    """The row of a measure; ``count`` names the number that gives its trials."""
     numbers = found.get(name)
     if numbers is None or "error" in numbers:
         return Row(*asked, "could not be measured", None, 0)

@@ -1,9 +1,9 @@
-"""What the viewport's table measures inside Blender: this file runs in its Python, without limber.
+"""Probe of the viewport's table inside Blender: this file runs in its Python, without limber.
 
     blender -b --factory-startup --python viewport_probe.py -- SETTINGS.json
     python viewport_probe.py -- SETTINGS.json            (with the bpy package)
 
-Prints one JSON line a measure. Times are of the calls: without a window nothing is drawn.
+Prints one JSON line per measure. Times are of the calls: without a window nothing is drawn.
 """
 
 import importlib
@@ -93,7 +93,7 @@ def import_points(path: Path) -> None:
 
 
 def grab_loop(branch: Path, count: int) -> None:
-    """Poses streamed to a session at 60 Hz; what Blender's side does with each answer."""
+    """Poses streamed to a session at 60 Hz, and Blender's handling of each answer."""
     sessions, meshes, branches = part("session"), part("bridge.meshes"), part("branches")
     bpy.ops.limber.open_result(directory=str(branch))
     surface = branches.find_surface(bpy.context.scene)
@@ -137,8 +137,9 @@ def _who(held, number: int, start: np.ndarray) -> str:
 
 
 def _streamed(held, surface, meshes, number, start, count):
-    """Time of a loop on Blender's side, its processor's share of it, and from a pose to the mesh
-    that shows it, each [s]."""
+    """Time of a loop on Blender's side, its processor's fraction of it, and from a pose to the mesh
+    that shows it, each [s].
+    """
     ours, own, waits, sent = [], [], [], {}
     shown = held.frame().sequence
     for step in range(count):
@@ -167,7 +168,7 @@ def _streamed(held, surface, meshes, number, start, count):
 
 
 def job_memory(count: int) -> None:
-    """Jobs that say a little and end, one after the other."""
+    """Jobs that print a little and end, one after the other."""
     jobs = part("jobs")
     program = "import json; print(json.dumps({'progress': 0.5})); print(json.dumps({'status': 1}))"
     before = _memory_mb()
@@ -183,7 +184,7 @@ def job_memory(count: int) -> None:
 
 
 def undo_sequences(branch: Path, cloud: Path, count: int, seed: int, seconds: float) -> None:
-    """Random actions with undo and redo between them: each state comes back as it was."""
+    """Random actions with undo and redo between them: each state is restored exactly."""
     wrong, steps, done, end = [], 0, 0, time.monotonic() + seconds
     for sequence in range(count):
         if done and time.monotonic() > end:
@@ -220,7 +221,7 @@ def _act(name: str, branch: Path, cloud: Path, rng: np.random.Generator) -> None
     skeleton = branches.find_skeleton(bpy.context.scene)
     surface = branches.find_surface(bpy.context.scene)
     if name == "open" and surface is None:
-        # What the worker would be asked for each time stands in a file here.
+        # A file here replaces the worker's answer to each request.
         part("scene").show_branch(bpy.context.scene, part("scene_data").read_scene_data(
             branch.with_suffix(".npz")))
     elif name == "colour" and surface is not None:
@@ -243,7 +244,7 @@ def _act(name: str, branch: Path, cloud: Path, rng: np.random.Generator) -> None
 
 
 def _state() -> str:
-    """Objects, what is coloured by what, settings, nodes: as a text that can be compared."""
+    """Objects, colouring, settings, nodes: as a text that can be compared."""
     limber = bpy.context.scene.limber
     things = sorted((thing.name, len(thing.data.vertices) if thing.type == "MESH" else 0)
                     for thing in bpy.context.scene.objects)
@@ -268,7 +269,7 @@ def _until(ready, seconds: float, fail: bool = True):
 
 
 def _memory_mb() -> float:
-    """Memory of this process that is not shared [MB]."""
+    """Private memory of this process [MB]."""
     fields = Path("/proc/self/statm").read_text().split()
     return (int(fields[1]) - int(fields[2])) * os.sysconf("SC_PAGE_SIZE") / 2**20
 

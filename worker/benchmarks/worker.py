@@ -1,6 +1,6 @@
 """The worker's table: mutated files, start-up times, exports bent in other programs, ringing.
 
-Times are those of this computer under its load at the moment: ``--only two-cores`` wants it quiet.
+Times are those of this computer under its load at the moment: ``--only two-cores`` needs it idle.
 """
 
 import subprocess
@@ -40,7 +40,7 @@ _START_UP_SECONDS = {("--help",): 0.3, ("doctor",): 2.0}
 
 
 def _harmful(setting: Setting) -> Path:
-    """Where files go that did harm."""
+    """Folder for files that did harm."""
     return setting.kept / "harmful"
 
 
@@ -90,7 +90,7 @@ def _fuzzed(setting: Setting, names: tuple[str, ...] = tuple(READERS)) -> list[R
     if len(names) == 1:
         return table
     bad, total = (sum(getattr(each, what) for each in found.values()) for what in ("bad", "total"))
-    # A reader that did not come to its turn is not known to be good.
+    # A reader that was not run is not known to be good.
     is_met = False if bad else True if len(found) == len(names) else None
     return [Row(*_FUZZED, f"{bad} ({len(found)} of {len(names)} readers)", is_met, total), *table]
 
@@ -111,6 +111,6 @@ PARTS = {
     "kills": Part(killed, 90, (KILLS_ROW,), grows=True),
     "dask": Part(on_dask, 120, DASK_ROWS, grows=True),
     "two-cores": Part(speed_up, 120, (SPEED_UP_ROW,), grows=True)}
-"""The table, in order of importance; ``--only`` also knows the fuzz of one reader."""
+"""The table, in order of importance; ``--only`` also accepts the fuzz of one reader."""
 PARTS |= {f"fuzz:{name}": Part(partial(_fuzzed, names=(name,)), 10, (_fuzz_asked(name),),
                                grows=True, alone=True) for name in READERS}

@@ -20,7 +20,7 @@ def _mcap(template: Path, folder: Path) -> list[Path]:
 
 
 def _bag(_template: Path, path: Path) -> Any:
-    """A bag up to the pull that is made of it."""
+    """A bag, up to the pull made from it."""
     from limber.recordings.bags.bag_pull import pull_of_bag
     from limber.recordings.bags.bag_reader import read_bag
     from limber.recordings.settings import ImportSettings
@@ -63,7 +63,7 @@ def _recorded_bag(template: Path, kind: str) -> Path:
 
 
 def _ros1(message: Any, types: Any) -> Any:
-    """A message as ROS 1 has it: its header counts as well."""
+    """A message as in ROS 1: its header counts as well."""
     parts = {part.name: getattr(message, part.name) for part in dataclasses.fields(message)
              if part.name != "__msgtype__"}
     kind = message.__msgtype__

@@ -79,7 +79,7 @@ def on_dask(setting: Setting) -> list[Row]:
 
 
 def _fitting(setting: Setting, folder: Path, at_most: int, times: float) -> int:
-    """How many branches fit where each takes ``times`` its time alone, at least 2: one is timed."""
+    """Number of branches that fit if each takes ``times`` its time alone; at least 2, one timed."""
     trial = folder / "timed"
     trial.mkdir()
     started = time.perf_counter()
@@ -119,7 +119,7 @@ def make_scans(folder: Path, count: int, seed: int) -> None:
 
 
 def write_jobs(folder: Path, name: str, stages: str) -> Path:
-    """Write ``NAME.toml``, which runs ``stages`` on the folder's scans and puts all into NAME."""
+    """Write ``NAME.toml``, which runs ``stages`` on the folder's scans and writes to NAME."""
     path = folder / f"{name}.toml"
     path.write_text(f'out = "{name}"\n[[job]]\nscans = ["scan-*.ply"]\n{stages}')
     return path

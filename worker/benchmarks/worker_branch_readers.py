@@ -1,5 +1,5 @@
-"""Readers of the files of a branch folder: each is put into a copy of one with its checksums set
-right, as somebody would who wants to do harm; then whatever shows or computes with it is called.
+"""Readers of the files of a branch folder: each file is put into a copy of one with its checksums
+corrected, as an attacker would do; then every function that shows it or computes with it is called.
 """
 
 import json
@@ -22,10 +22,10 @@ class Reader:
     """One kind of file that others may have written.
 
     Attributes:
-        kind: How files are changed: ``text``, ``json``, ``npz``, ``binary``.
+        kind: Kind of mutation: ``text``, ``json``, ``npz``, ``binary``.
         make: Writes good files into a folder, from a template branch; returns them.
         read: Reads a file; gets the template as well.
-        may_lack: NaN is a word for "not measured" there.
+        may_lack: Whether NaN stands for "not measured" there.
     """
 
     kind: str
@@ -116,7 +116,7 @@ def _sampled(branch: Branch) -> Any:
 
 
 def _estimated(branch: Branch) -> Any:
-    """An estimate as the report tells it, and as `limber predict` takes it up to its solve."""
+    """An estimate as in the report, and as `limber predict` uses it up to its solve."""
     from limber.estimation.estimate_file import read_estimate
     from limber.results.report.report_tables import (
         cause_rows,
@@ -160,7 +160,7 @@ _TARGETS = {"format_version": 1, "targets": [
 
 
 def _search_file(template: Path, folder: Path) -> list[Path]:
-    """What a search of the template's cloud would have come to, with a bit of everything."""
+    """A possible search result of the template's cloud, with a bit of everything."""
     from limber.geometry.cloud.leaves import Leaf
     from limber.geometry.io.clouds import read_points
     from limber.geometry.io.skeletons import read_skeleton
@@ -180,7 +180,7 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
 
 
 def _searched(branch: Branch) -> Any:
-    """A search as reconstruct takes it over: moved, told, and matched with points."""
+    """A search as reconstruct reuses it: moved, reported, and matched with points."""
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
 
     found = FoundSkeleton.read(branch.path("scan_skeleton.npz")).result

@@ -2,7 +2,7 @@
 
 A file of the fuzz is a command line as a JSON list; ``{branch}`` stands for a copy of the template,
 ``{out}`` for an empty folder, ``{in}`` for a folder with inputs. The command runs in the reading
-process, and must end with one of the exit codes that are documented, in words.
+process. It must end with one of the documented exit codes, and a message.
 """
 
 import contextlib
@@ -39,7 +39,8 @@ _LINES: dict[str, list[list[str]]] = {
                ["status", "{in}/jobs.toml"], ["batch", "{in}/jobs.toml"],
                ["robot", "check", "{in}/cell.toml"]]}
 """Commands that take well under ten seconds with the values here. None moves a robot, or removes
-what is not its own: `limber cache` does."""
+files other than its own; `limber cache` does.
+"""
 _CODES = (0, 2, 3, 4, 130)
 _OWN = ("--json", "--progress", "--help", "--help-all", "--schema", "-o", "--data", "--clear")
 
@@ -102,7 +103,7 @@ def _run(template: Path, path: Path) -> Any:
 
 
 def _filled(word: str, template: Path, place: Path) -> str:
-    """A word with its places filled; those are made when they are first named."""
+    """A word with its placeholders filled; their files are made when they are first named."""
     if "{branch}" in word and not (place / "a.branch").exists():
         shutil.copytree(template, place / "a.branch")
     if "{in}" in word and not (place / "in").exists():

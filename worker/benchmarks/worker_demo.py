@@ -1,4 +1,4 @@
-"""What a newcomer meets: the size of the set-up, how long `limber demo` takes, what it finds."""
+"""A newcomer's first run: size of the installation, time of `limber demo`, its results."""
 
 import importlib.metadata
 import json

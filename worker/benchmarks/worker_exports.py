@@ -1,4 +1,4 @@
-"""Exported branches in the programs they are for, bent and swung against our own elements."""
+"""Exported branches in their target programs, bent and swung, compared with our own elements."""
 
 import shutil
 import subprocess
@@ -27,12 +27,12 @@ from limber.results.exports.usd import as_deformable
 
 _LINKS = 30
 _SHARE = 0.01
-"""Of the main path's length that the tip is bent by, about."""
+"""Approximate bending of the tip, as a fraction of the main path's length."""
 
 
 @dataclass(frozen=True)
 class Bent:
-    """What one program says: tip's displacement [m], shape [3], and first frequency [Hz]."""
+    """Result of one program: tip's displacement [m], shape [3], and first frequency [Hz]."""
 
     tip: np.ndarray
     frequency: float
@@ -58,7 +58,7 @@ def exported(setting: Setting) -> list[Row]:
 
 
 def _bent(seed: int, source: str) -> Numbers:
-    """How far each program is apart from our elements, for one generated branch."""
+    """Difference of each program from our elements, for one generated branch."""
     found = {}
     branch = generate_branch(seed)
     mesh = mesh_skeleton(branch.skeleton, ReconstructSettings(), SILENT).mesh
@@ -108,13 +108,13 @@ def bent_here(model: BranchModel, node: int, load: np.ndarray) -> Bent:
 
 
 def bent_as_usd(model: BranchModel, node: int, load: np.ndarray) -> Bent:
-    """What stands in the USD file, bent here: no program that bends it runs without a GPU."""
+    """Content of the USD file, bent here: no program that bends it runs without a GPU."""
     return bent_here(as_deformable(model, node).model, node, load)
 
 
 def bent_in_mujoco(model: BranchModel, skeleton: Skeleton, tip: np.ndarray, load: np.ndarray,
                    links: int = _LINKS) -> Bent | None:
-    """Links on springs; None where MuJoCo is not installed."""
+    """Links on springs; None if MuJoCo is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -152,7 +152,7 @@ def bent_in_mujoco(model: BranchModel, skeleton: Skeleton, tip: np.ndarray, load
 
 
 def bent_in_calculix(model: BranchModel, node: int, load: np.ndarray) -> Bent | None:
-    """The same tetrahedra in CalculiX; None where ``ccx`` is not on the PATH."""
+    """The same tetrahedra in CalculiX; None if ``ccx`` is not on the PATH."""
     program = shutil.which("ccx")
     if program is None:
         return None

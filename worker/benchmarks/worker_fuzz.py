@@ -1,7 +1,7 @@
 """Mutated files given to every reader, in a process that may crash, hang or run out of memory.
 
-``python -m benchmarks.worker_fuzz TEMPLATE`` is that process: on each line of its input stand a
-reader's name and a file; it answers with one line of JSON.
+``python -m benchmarks.worker_fuzz TEMPLATE`` is that process: each line of its input has a reader's
+name and a file; it answers with one line of JSON.
 """
 
 import json
@@ -33,11 +33,11 @@ _WORDS = ("read", "refused", "traceback", "not finite", "hang", "memory", "crash
 
 @dataclass
 class Outcomes:
-    """What became of the files of one reader.
+    """Results for the files of one reader.
 
     Attributes:
-        counts: Word to number of files.
-        examples: The first troubles: word, file kept, message.
+        counts: Number of files by outcome word.
+        examples: The first failures: word, file kept, message.
     """
 
     counts: Counter = field(default_factory=Counter)
@@ -56,7 +56,7 @@ def fuzz(names: list[str], setting: Setting, template: Path, keep: Path) -> dict
     """Give mutated files to readers, each as many as there is time for.
 
     Returns:
-        What became of them, by reader; files that did harm are moved to ``keep``.
+        Results by reader; files that did harm are moved to ``keep``.
     """
     found: dict[str, Outcomes] = {}
     keep.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ def _fuzzed(name: str, child: "_Child", setting: Setting, template: Path, place:
     reader, outcomes = READERS[name], Outcomes()
     originals = reader.make(template, place)
     rng = setting.generator(*name.encode())
-    # Each original once at least.
+    # Each original at least once.
     for index in setting.budget.seeds(0, setting.at_most(200, 20), at_least=len(originals)):
         original = originals[index % len(originals)]
         content = mutated(original.read_bytes(), reader.kind, rng)
@@ -110,7 +110,7 @@ class _Child:
         self._process.stdin.write(f"{name}\t{file}\n")
         self._process.stdin.flush()
         started, spent = time.monotonic(), self._processor_seconds()
-        # Of the processor, since others compute beside it; one that waits does not use any.
+        # Processor time, since other programs run beside it; a waiting reader does not use any.
         while (self._processor_seconds() - spent < MOST_SECONDS
                and time.monotonic() - started < _LONGEST_WAIT):
             try:
@@ -177,7 +177,7 @@ def _outcome(reader: Reader, template: Path, file: Path) -> tuple[str, str]:
 
 
 def _not_finite(value: Any, may_lack: bool, place: str = "result", depth: int = 0) -> str:
-    """Where a number is infinite, or not a number where none may lack; or nothing."""
+    """Where a number is infinite, or NaN where it must not be; or an empty text."""
     if depth > 6:
         return ""
     if isinstance(value, float | np.floating):

@@ -1,9 +1,9 @@
 """Branch folders from strangers that try to read, write or remove files outside themselves.
 
-Each is made in a place of its own, with files of a victim around it; then every command that opens
-a branch folder is called on it in this process. A snapshot of the whole place, the folder itself
-excepted, is compared before and after; the victim's words may stand in nothing that was written,
-and no command may end with a trace or need over ten seconds.
+Each is made in a folder of its own, with files of a victim around it; then every command that opens
+a branch folder is called on it in this process. A snapshot of everything except the branch folder
+itself is compared before and after. The victim's words must not be in any output, and no command
+may end with a traceback or take over ten seconds.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ _LONGEST_WAIT = 120
 
 
 def hostile(setting: Setting, template: Path) -> list[Row]:
-    """Two rows: what was touched outside, and what ended in a trace or took too long."""
+    """Two rows: files touched outside, and commands that ended in a traceback or took too long."""
     touched: list[str] = []
     failed: list[str] = []
     opened = Counter()
@@ -95,7 +95,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _called(arguments: list[str]) -> tuple[int, str]:
-    """Call one command; return its exit code and what is wrong, or an empty text."""
+    """Call one command; return its exit code and the fault, or an empty text."""
     begun, told = time.process_time(), io.StringIO()
     signal.signal(signal.SIGALRM, _waited)
     signal.alarm(_LONGEST_WAIT)
@@ -113,7 +113,7 @@ def _called(arguments: list[str]) -> tuple[int, str]:
 
 
 class _Waits(BaseException):
-    """A command waits, as for a pipe that nobody writes to."""
+    """A command waits, for example for a pipe that nobody writes to."""
 
 
 def _waited(_signal: int, _frame: object) -> None:
@@ -121,8 +121,9 @@ def _waited(_signal: int, _frame: object) -> None:
 
 
 def _written(folder: Path) -> int:
-    """Open, run a stage and append to a stream, as a Python program does, once the add-on has read
-    what its panels show."""
+    """Open, run a stage and append to a stream, as a Python program does, after the add-on has read
+    the data of its panels.
+    """
     addon_module("branch_folder").read_record(folder)
     addon_module("live_force").read(folder)
     try:
@@ -142,8 +143,9 @@ def _written(folder: Path) -> int:
 
 
 def snapshot(place: Path, folder: Path) -> dict[str, tuple]:
-    """Return what stands at ``place`` outside ``folder`` and the commands' outputs: by name the
-    kind, mode, size, time and content."""
+    """Return the entries at ``place`` outside ``folder`` and the commands' outputs: by name the
+    kind, mode, size, time and content.
+    """
     found = {}
     for at, folders, files in os.walk(place):
         here = Path(at)
@@ -161,7 +163,7 @@ def snapshot(place: Path, folder: Path) -> dict[str, tuple]:
 
 
 def differences(before: dict[str, tuple], after: dict[str, tuple]) -> list[str]:
-    """Return what was made, removed or changed between two snapshots."""
+    """Return the files made, removed or changed between two snapshots."""
     return [f"{path} was {'made' if path not in before else 'removed' if path not in after else ''}"
             f"{'changed' if path in before and path in after else ''}"
             for path in sorted(before.keys() | after.keys())
@@ -169,7 +171,7 @@ def differences(before: dict[str, tuple], after: dict[str, tuple]) -> list[str]:
 
 
 def _secrets(out: Path) -> list[str]:
-    """Return the outputs in which a victim's words stand, and remove all outputs."""
+    """Return the outputs that contain a victim's words, and remove all outputs."""
     found = []
     for path in sorted(out.iterdir()):
         if path.suffix == ".zip" and zipfile.is_zipfile(path):

@@ -43,7 +43,7 @@ def _flipped(path: Path, rng: np.random.Generator) -> None:
 
 
 def _of_another_numba(path: Path, _rng: np.random.Generator) -> None:
-    """An index as another version writes it, whole and with its checksum; code goes."""
+    """An index as another version writes it, complete and with its checksum; code is removed."""
     if path.suffix != ".nbi":
         path.unlink()
         return
@@ -88,7 +88,7 @@ def kernels(setting: Setting, template: Path) -> list[Row]:
 
 
 def _predicted(folder: Path, kept: Path) -> tuple[dict, str]:
-    """What `limber predict` finds with these kernels, without its time; and what it says."""
+    """Result of `limber predict` with these kernels, without its time; and its output."""
     done = subprocess.run(
         [sys.executable, "-m", "limber", "predict", str(folder), "--weight", "0.1", "--json"],
         env=os.environ | {"NUMBA_CACHE_DIR": str(kept)}, check=False, capture_output=True,
@@ -101,7 +101,7 @@ def _predicted(folder: Path, kept: Path) -> tuple[dict, str]:
 
 
 def _own_folders(source: Path) -> set[str]:
-    """Names of the folders of the kernels that `limber predict` imports, of this very Limber."""
+    """Names of the folders of the kernels that `limber predict` imports, of this Limber."""
     import limber.stages.moduli.predict
     import limber.store.loading  # noqa: F401
 

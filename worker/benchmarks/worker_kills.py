@@ -1,6 +1,6 @@
-"""Kill -9 of a batch with its workers, or of one worker, at random moments; then it goes on.
+"""Kill -9 of a batch with its workers, or of one worker, at random moments; then it continues.
 
-A stopped campaign goes on as well: with ``--out`` and ``--seed`` the kills that were made count.
+A stopped campaign continues as well: with ``--out`` and ``--seed`` the earlier kills count.
 """
 
 import contextlib
@@ -38,10 +38,10 @@ wind = [3.0, 0.0, 0.0]
 
 @dataclass(frozen=True)
 class Kill:
-    """What came of one: ``moment`` is the share of an undisturbed run's time.
+    """Result of one kill: ``moment`` is the fraction of an undisturbed run's time.
 
-    ``found`` are the entries that were stored when it fell, ``redone`` those of them that the next
-    run made once more; ``apart`` the files that differ from an undisturbed run's.
+    ``found`` are the entries stored at the kill, ``redone`` those of them that the next run made
+    again; ``apart`` the files that differ from an undisturbed run's.
     """
 
     number: int
@@ -61,9 +61,9 @@ _BRANCHES = 2
 
 
 def killed(setting: Setting) -> list[Row]:
-    """Random moments, each in a new run of a batch of two branches, which then goes on to its end.
+    """Random moments, each in a new run of a batch of two branches, which then continues.
 
-    Only those count at which the batch was still running; those that an earlier run made count too.
+    Only kills while the batch was still running count; those of an earlier run count too.
     """
     sources = source_digest(("store", "batch", "core", "stages", "geometry"), __file__)
     kept, kills = setting.kept / "kills.jsonl", setting.at_most(30, 3)
@@ -117,7 +117,7 @@ def _kill(folder: Path, number: int, seed: int, sources: str, whole: float,
         _end([family[int(rng.integers(len(family)))]])
     else:
         _end([process.pid, *family])
-    # One whose worker was killed goes on to its own end first.
+    # A batch whose worker was killed first continues to its own end.
     stored = _entries(out)
     process.wait()
     code = start_batch(jobs, 1, "--retry-failed").wait()
@@ -148,7 +148,7 @@ def _end(processes: Sequence[int]) -> None:
 
 
 def _entries(out: Path) -> dict[tuple[str, str], str]:
-    """When each stored entry was made."""
+    """Time at which each stored entry was made."""
     return {(branch, key): f"{entry['finished']} {entry['seconds']}"
             for branch, manifest in manifests(out).items()
             for key, entry in manifest["stages"].items()}

@@ -18,7 +18,7 @@ from limber.geometry.settings import ReconstructSettings
 
 _LIMITS = {15_000: (3.0, None), 100_000: (8.0, None), 1_000_000: (45.0, None),
            5_000_000: (150.0, 2.5), 50_000_000: (900.0, 4.0)}
-"""Points: processor time [s], and peak memory [GB] if that was asked."""
+"""Points: processor time [s], and peak memory [GB] if required."""
 _QUICK = 1_000_000  # points
 _LENGTH, _OFF = 1.29, 0.03  # of the branch [m], and what a result may be off
 _PIECES, _PIECES_SECONDS = 2000, 20.0
@@ -51,7 +51,7 @@ LARGE_ROWS = (SMALL_ROW, *map(_size_asked, _LIMITS), PIECES_ROW)
 
 
 def large(setting: Setting) -> list[Row]:
-    """Small scans, then larger and larger ones, as far as the time goes."""
+    """Small scans, then larger and larger ones, as far as time allows."""
     found = [_small(setting)]
     counts = [count for count in _LIMITS if not setting.quick or count <= _QUICK]
     for count in setting.budget.items(counts):
@@ -114,7 +114,7 @@ def _write(path: Path, count: int, rng: np.random.Generator) -> None:
 
 
 def _in_pieces(setting: Setting) -> Row:
-    """Clumps of six points strewn in a box: no tree, but it must be told so in time."""
+    """Clumps of six points strewn in a box: not a tree, which must be reported in time."""
     rng = setting.generator(1)
     centres = rng.uniform(-0.5, 0.5, (_PIECES, 1, 3))
     points = (centres + rng.normal(scale=1e-3, size=(_PIECES, 6, 3))).reshape(-1, 3)

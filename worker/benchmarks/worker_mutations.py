@@ -1,4 +1,4 @@
-"""Files changed at random, as damage, malice and slips do: bytes, lines, numbers, units, titles."""
+"""Files changed at random, as by damage, malice and slips: bytes, lines, numbers, units, titles."""
 
 import io
 import json
@@ -41,7 +41,7 @@ def mutated(content: bytes, kind: str, rng: np.random.Generator) -> bytes:
 def _bytes_changed(content: bytes, rng: np.random.Generator) -> bytes:
     if not content:
         return b"\0"
-    # Headers are short, and what stands there does the most harm.
+    # Headers are short, and changes there do the most harm.
     near = int(rng.integers(min(len(content), 400))) if rng.random() < 0.6 else int(
         rng.integers(len(content)))
     way = rng.integers(5)
@@ -100,7 +100,7 @@ def _scaled(text: str, factor: float) -> str:
 
 
 def _column_scaled(content: bytes, rng: np.random.Generator) -> bytes:
-    """One column in another unit, of another sign, constant, or exchanged with another."""
+    """One column in another unit, with the other sign, constant, or exchanged with another."""
     text = content.decode("latin-1")
     lines = text.split("\n")
     sign = max(",;\t ", key=lines[len(lines) // 2].count)
@@ -122,7 +122,7 @@ def _column_scaled(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _title_changed(content: bytes, rng: np.random.Generator) -> bytes:
-    """A word of the first line is another title, or unit."""
+    """A word of the first line is replaced by another title, or unit."""
     first, end, rest = content.partition(b"\n")
     words = [part for part in first.replace(b";", b",").split(b",") if part]
     if not words:
@@ -150,7 +150,7 @@ def _numbers_scaled(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _word_changed(content: bytes, rng: np.random.Generator) -> bytes:
-    """A command line with another value, a word less or twice, or a further option."""
+    """A command line with another value, a word removed or repeated, or a further option."""
     from benchmarks.worker_command_lines import with_further_option
 
     try:

@@ -1,6 +1,6 @@
-"""Every reader of files that others may have written: good files of each kind, and who reads them.
+"""Every reader of files that others may have written: good files of each kind, and their readers.
 
-Those of a branch folder stand in :mod:`benchmarks.worker_branch_readers`, bags in
+Those of a branch folder are in :mod:`benchmarks.worker_branch_readers`, bags in
 :mod:`benchmarks.worker_bag_readers`.
 """
 
@@ -331,7 +331,7 @@ def _commands(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_commands(_template: Path, path: Path) -> Any:
-    """What a session does with lines: each is a command, or is answered with an error."""
+    """A session's input lines: each is a command, or is answered with an error."""
     from limber.session.protocol import Lines, NotUnderstood, parse_command
 
     understood = []
@@ -370,7 +370,7 @@ def addon_module(name: str) -> Any:
 
 
 def _addon_read(module: str, function: str, _template: Path, path: Path) -> Any:
-    """What the add-on reads; its own word for a refusal is ValueError."""
+    """Readers of the add-on; they refuse with ValueError."""
     try:
         return getattr(addon_module(module), function)(path)
     except ValueError as error:
@@ -388,7 +388,7 @@ def _scene_file(template: Path, folder: Path) -> list[Path]:
 
 
 def _matlab_73(template: Path, folder: Path) -> list[Path]:
-    """The cylinder model as Matlab saves it in version 7.3: HDF5 behind a header of its own."""
+    """The cylinder model as Matlab saves it in version 7.3: HDF5 behind its own header."""
     import h5py
     from scipy.io import loadmat
 
@@ -414,7 +414,7 @@ def _rtde(_template: Path, folder: Path) -> list[Path]:
 
 
 def _log(_template: Path, path: Path) -> Any:
-    """A robot's log up to the pull that is made of it."""
+    """A robot's log, up to the pull made from it."""
     from limber.recordings.robot_tables import is_robot_table, robot_stream
     from limber.recordings.tables import read_table, split_title
 

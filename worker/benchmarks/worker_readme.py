@@ -1,4 +1,4 @@
-"""Every command that the README shows, run as it stands, on files made for it."""
+"""Every command in the README, run unchanged on files made for it."""
 
 import re
 import shlex
@@ -15,7 +15,7 @@ from benchmarks.table import Asked, Row, Setting
 
 README = Path(__file__).parents[2] / "README.md"
 _AT_A_ROBOT = ("virtual-robot", "robot", "record", "execute")
-"""They want a controller and a cell; `scripts/bench robot` has them."""
+"""They need a controller and a cell; `scripts/bench robot` has them."""
 _SECONDS = 600
 _BEAM_MM = (30.0, 30.0, 120.0)
 _YOUNG_PA, _DENSITY, _LOAD_N = 3e5, 1070.0, 0.51
@@ -32,7 +32,7 @@ README_ROW = Asked("commands of the README, run as they stand", "all")
 
 
 def run_readme(setting: Setting) -> list[Row]:
-    """Run them one after the other in one folder; what each needs is made before it."""
+    """Run them one after the other in one folder; the inputs of each are made before it."""
     lines = shown_commands(README.read_text(encoding="utf-8"))
     chosen = [line for line in lines if shlex.split(line)[1] not in _AT_A_ROBOT]
     failed, count = [], 0
@@ -85,7 +85,7 @@ def _beam(folder: Path, _seed: int) -> None:
 
 
 def _swing(folder: Path, _seed: int) -> None:
-    """Markers on a cantilever that is let down with a weight on it, by the theory of beams."""
+    """Markers on a cantilever lowered with a weight on it, by beam theory."""
     width, _, length = 1e-3 * np.array(_BEAM_MM)
     bending = _YOUNG_PA * width**4 / 12
     spread, at = _DENSITY * 9.81 * width**2, 0.1
@@ -118,4 +118,4 @@ def _ring(folder: Path, _seed: int) -> None:
 _MADE_BEFORE: dict[str, Callable[[Path, int], None]] = {
     "reconstruct scan.ply": _scan, "import-pull apple.branch": _recording, "mesh beam.stl": _beam,
     "import-pull beam.branch": _swing, "vibration apple.branch": _ring}
-"""What a command needs, by how it begins."""
+"""Inputs of a command, by its first words."""

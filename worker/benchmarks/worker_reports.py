@@ -1,7 +1,7 @@
-"""Files as public reports and other programs have them: read with the right value, or not.
+"""Files as in public reports and from other programs: read with the right value, or not.
 
-Those of ``shared/data/reports`` are read where they stand beside the checkout; of each kind two
-more are drawn here. And one good file, read again and again on a machine busy with other work.
+Those of ``shared/data/reports`` are read in their folder beside the checkout; two more of each kind
+are drawn here. In addition, one good file is read repeatedly on a busy machine.
 """
 
 import os
@@ -105,7 +105,7 @@ def _has_markers(first: list[list[float]], path: Path) -> bool:
 
 
 _HEADERS = (
-    # name, titles, separator, order of the axes, columns before and behind, metres per unit
+    # name, titles, separator, order of the axes, columns before and after, metres per unit
     ("01 pandas.csv", ",x,y,z", ",", "xyz", ("{k}",), (), 1.0),
     ("01 words.csv", '"","x","y","z"', ",", "xyz", ("p{k}",), (), 1.0),
     ("02 blanks.csv", "X;Y;Z;Return Number [1]", ";", "xyz", (), ("1",), 1.0),
@@ -253,7 +253,7 @@ def _others(rng: np.random.Generator, folder: Path) -> Iterator[Case]:
 
 
 def _busy(setting: Setting, folder: Path) -> Row:
-    """Read one LAZ file with the least right to a processor, as often as the time allows."""
+    """Read one LAZ file with the lowest processor priority, as often as the time allows."""
     import laspy
 
     path = folder / "busy.laz"

@@ -1,4 +1,4 @@
-"""Young's modulus from how generated branches ring, against what they were made of."""
+"""Young's modulus from the ringing of generated branches, against the true one."""
 
 from dataclasses import replace
 from functools import partial
@@ -19,13 +19,13 @@ from limber.stages.moduli.vibration import VibrationSettings, young_of
 
 _DENSITY, _POISSON, _YOUNG = 800.0, 0.35, 1e9
 _EACH = 10
-"""Trials a geometry."""
+"""Trials per geometry."""
 _FINER = 0.7
 """Spacing of the truth's mesh over that of the estimate's."""
 _NOISE = 0.05
-"""Of the record's largest reading."""
+"""Noise as a fraction of the record's largest reading."""
 _PERIODS, _READINGS = 25, 40
-"""Of the record; readings a period."""
+"""Periods in the record; readings per period."""
 
 
 RINGING_ROW = Asked("modulus of generated branches from a noisy swing: covered by the 95 % "
@@ -81,7 +81,7 @@ def _model(skeleton: Skeleton, spacing: float, young: float, density: float) -> 
 
 
 def _record(modes: Modes, node: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Times and two channels: a pluck of the tip, seen there as way or as acceleration."""
+    """Times and two channels: a pluck of the tip, observed as displacement or as acceleration."""
     frequencies = modes.frequencies
     times = np.arange(0, _PERIODS / frequencies[0], 1 / (_READINGS * frequencies[0]))
     pluck = rng.normal(size=3)

@@ -17,7 +17,7 @@ def _points() -> np.ndarray:
 
 
 def _ptx(_template: Path, folder: Path) -> list[Path]:
-    """Two scans, with a direction that saw nothing."""
+    """Two scans, with a direction without a return."""
     path, head = folder / "scan.ptx", "60\n1\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n"
     matrix = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0.5 0 0 1\n"
     rows = "".join(f"{x} {y} {z} 0.25 9 8 7\n" for x, y, z in _points()[1:]) + "0 0 0 0.5 0 0 0\n"
@@ -26,7 +26,7 @@ def _ptx(_template: Path, folder: Path) -> list[Path]:
 
 
 def _e57(_template: Path, folder: Path) -> list[Path]:
-    """One scan of plain numbers and one of scaled ones, each in a file of its own."""
+    """One scan of plain numbers and one of scaled ones, each in its own file."""
     plain = "".join(f'<cartesian{axis} type="Float"/>' for axis in "XYZ")
     scaled = "".join(f'<cartesian{axis} type="ScaledInteger" minimum="-32768" maximum="32767" '
                      'scale="1e-4"/>' for axis in "XYZ")
@@ -59,7 +59,7 @@ def _sealed(content: bytes) -> bytes:
 
 
 def _read_e57(_template: Path, path: Path) -> Any:
-    """Read a file whose checksums are made to fit: what a fuzz changes shall reach the reader."""
+    """Read a file with its checksums corrected, so that a fuzz's changes reach the reader."""
     from limber.geometry.io.clouds import read_points
 
     raw = path.read_bytes()

@@ -1,4 +1,5 @@
-"""The Python interface: what ``import limber`` gives, a verb for each command and its typed result.
+"""The Python interface: the contents of ``import limber``, with a typed result for each command.
 
-It calls the stages as the command line does, and they write the same files. Nothing calls it.
+It calls the stages as the command line does, and they write the same files. No other module calls
+it.
 """

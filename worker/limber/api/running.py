@@ -1,4 +1,4 @@
-"""Running a stage for a Python user: progress, warnings, and messages in a Python user's words."""
+"""Running a stage for a Python user: progress, warnings, and messages with Python names."""
 
 import contextlib
 import re
@@ -19,7 +19,7 @@ from limber.stages.registry import StageDescription, stage_description
 
 _STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
 _OPTION = re.compile(r"`limber [^`]*`|(?<![\w-])--(no-)?([a-z][a-z0-9]*(?:-[a-z0-9]+)*)")
-"""An option in a message, or a whole command line, which stays as it is."""
+"""An option in a message, or a whole command line, which stays unchanged."""
 _lock = threading.Lock()
 _hidden: list[types.ModuleType] = []
 """The user's script, once for each stage that runs."""
@@ -34,16 +34,16 @@ def run_stage(name: str, given: Mapping[str, Any], *, quiet: bool) -> tuple[str,
     """Run a stage in this process.
 
     Args:
-        name: The stage's.
-        given: Its inputs, settings and options by name; arrays may stand for lists.
+        name: Name of the stage.
+        given: Its inputs, settings and options by name; arrays are accepted for lists.
         quiet: Show no progress.
 
     Returns:
-        The name of its entry in the branch's manifest, empty where it makes none; and what its
-        command prints with ``--json``, from ``warnings`` on.
+        The name of its entry in the branch's manifest, empty if it makes none; and the output of
+        its command with ``--json``, from ``warnings`` on.
 
     Raises:
-        InputError: a name is not known, or a value is refused. LimberError: as the stage does.
+        InputError: a name is not known, or a value is refused. LimberError: as for the stage.
     """
     told: list[str] = []
     stage = stage_description(name)
@@ -69,7 +69,7 @@ def _models(stage: StageDescription, given: Mapping[str, Any],
 
 
 def _users_level() -> int:
-    """How many calls lie between the function that asks and the line that called a verb."""
+    """Number of calls between the function that asks and the line that called a verb."""
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and frame.f_globals["__name__"].startswith("limber."):
         frame, level = frame.f_back, level + 1
@@ -79,7 +79,7 @@ def _users_level() -> int:
 @contextlib.contextmanager
 def script_run_once() -> Iterator[None]:
     """Keep the processes that a stage starts from importing the user's script: that would run it
-    again, and they need nothing of it.
+    again, and they do not need it.
     """
     with _lock:
         _hidden.append(_hidden[0] if _hidden else sys.modules["__main__"])
@@ -95,7 +95,7 @@ def script_run_once() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _sink(title: str, quiet: bool) -> Iterator[Sink | None]:
-    """What shows progress: a bar in a terminal, a line in a notebook, nothing elsewhere."""
+    """The progress display: a bar in a terminal, a line in a notebook, none elsewhere."""
     if quiet:
         yield None
     elif "ipykernel" in sys.modules:
@@ -110,7 +110,7 @@ def _sink(title: str, quiet: bool) -> Iterator[Sink | None]:
 
 @contextlib.contextmanager
 def in_python_words() -> Iterator[None]:
-    """Let the messages of errors name keyword arguments where they name options."""
+    """Make error messages name keyword arguments instead of options."""
     try:
         yield
     except LimberError as error:

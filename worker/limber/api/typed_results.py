@@ -1,4 +1,4 @@
-"""What the verbs return: frozen results with units, that print, draw and become tables.
+"""The results of the verbs: frozen, with units; they print, draw and become tables.
 
 Arrays are read-only. ``table()`` gives columns by name, as ``pandas.DataFrame(...)`` takes them;
 ``plot()`` gives a figure of matplotlib, which a notebook shows and ``savefig`` writes.
@@ -31,10 +31,10 @@ _MOST_PRINTED = 7  # values in one line; a notebook's table has them all
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Result:
-    """What a stage came to.
+    """Result of a stage.
 
     Attributes:
-        values: What its command prints with ``--json``, in SI units that the names carry.
+        values: The output of its command with ``--json``, in SI units that the names contain.
 
     >>> limber.open("a.branch").results["reconstruct"].values["watertight"]
     True
@@ -44,12 +44,12 @@ class Result:
 
     @classmethod
     def read(cls, branch: Folder, key: str, values: Mapping[str, Any]) -> "Result":
-        """Return the result of an entry ``key`` of a branch's manifest, its files with it."""
+        """Return the result of an entry ``key`` of a branch's manifest, including its files."""
         return cls(MappingProxyType({**values}))
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the stage warned of."""
+        """The warnings of the stage."""
         return tuple(self.values.get("warnings", ()))
 
     def _shown(self) -> dict[str, str]:
@@ -99,13 +99,13 @@ class Pull(Result):
     """A recording of force and motion.
 
     Attributes:
-        name: Of the pull.
+        name: Name of the pull.
         times: [s], shape [n].
-        poses: Of the grasp: position [m], rotation vector [rad], shape [n, 6].
-        forces: Of the gripper on the branch [N], shape [n, 3]; NaN where not measured.
+        poses: Poses of the grasp: position [m], rotation vector [rad], shape [n, 6].
+        forces: Forces of the gripper on the branch [N], shape [n, 3]; NaN if not measured.
         torques: Likewise [N m], shape [n, 3].
-        marker_times: [s], shape [k]; empty where there are no markers.
-        markers: Positions of the observed points [m], shape [k, points, 3]; NaN where not observed.
+        marker_times: [s], shape [k]; empty if there are no markers.
+        markers: Positions of the observed points [m], shape [k, points, 3]; NaN if not observed.
 
     >>> pull = limber.open("a.branch").pulls["pull-1"]
     >>> pull.table()["fx_n"].shape == pull.times.shape
@@ -159,11 +159,11 @@ class Estimate(Result):
 
     Attributes:
         young: At the control points [Pa], shape [K].
-        interval: Its 95 % interval [Pa], shape [K, 2]; NaN where an end is open.
-        bending_stiffness: E times the second moment of area, mean over each control point's part of
-            the branch [N m^2], shape [K]; NaN in a folder of an earlier version.
-        bending_interval: Its 95 % interval [N m^2], shape [K, 2]: narrower than that of E where the
-            scan leaves the radius open.
+        interval: Its 95 % interval [Pa], shape [K, 2]; NaN if an end is open.
+        bending_stiffness: E times the second moment of area, mean over each control point's section
+            of the branch [N m^2], shape [K]; NaN in a folder of an earlier version.
+        bending_interval: Its 95 % interval [N m^2], shape [K, 2]: narrower than that of E if the
+            scan leaves the radius uncertain.
         fractions: Positions of the control points on the main path, 0 base to 1 tip, shape [K].
         control_points: [m], branch frame, shape [K, 3].
         poisson: Poisson's ratio.
@@ -227,13 +227,14 @@ class Simulation(Result):
     """A simulated motion, frame by frame.
 
     Attributes:
-        name: Of its files.
+        name: Name of its files.
         times: [s], shape [n].
         energies: Strain energy [J], shape [n].
         kinetic_energies: [J], shape [n].
-        forces: Of the gripper on the branch [N], shape [n, 3].
+        forces: Forces of the gripper on the branch [N], shape [n, 3].
         strains: Largest principal strain in the branch, shape [n].
-        positions: Of the surface's vertices [m], shape [n, vertices, 3], single precision.
+        positions: Positions of the surface's vertices [m], shape [n, vertices, 3], single
+        precision.
         converged: Whether the branch followed to the end.
 
     >>> bent = limber.open("a.branch").simulate(move=(0.005, 0, 0), kind="static", duration=0.1)
@@ -284,17 +285,17 @@ class Simulation(Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Load(Result):
-    """What wind, snow, fruit or a cut do to the branch.
+    """Effects of wind, snow, fruit or a cut on the branch.
 
     Attributes:
-        sag: How far the tip comes down [m].
+        sag: Downward displacement of the tip [m].
         sag_interval: Its 95 % interval [m], shape [2]; NaN if the uncertainty of E is unknown.
         greatest_strain: Largest principal strain.
-        strain_over_limit: That strain over the one at which the wood is taken to fail.
+        strain_over_limit: That strain over the strain at which the wood is assumed to fail.
         frequencies: Lowest natural frequencies under the loads [Hz].
         frequencies_before: Those without the loads [Hz].
         tip_displacement: [m], shape [3].
-        wind_force: On all of the branch [N], shape [3].
+        wind_force: Force on the whole branch [N], shape [3].
         bears_times: Factor on the loads that the branch bears; None if it was not requested.
 
     >>> found = limber.open("a.branch").load(snow=2.0)
@@ -354,8 +355,8 @@ class EnergyField(Result):
     Attributes:
         positions: Sampled positions of the grasp [m], shape [m, 3]; the first is at rest.
         energies: Potential of strain and weight above the rest shape there [J], shape [m].
-        forces: Of the gripper on the branch there [N], shape [m, 3].
-        energy_error: Of samples outside the fit: root mean square error over that of the energy.
+        forces: Forces of the gripper on the branch there [N], shape [m, 3].
+        energy_error: Root mean square error over that of the energy, for samples outside the fit.
         force_error: Likewise of the force.
 
     >>> field = limber.open("a.branch").results["energy"]
@@ -411,21 +412,22 @@ class EnergyField(Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Plan(Result):
-    """A gentle path of the grasp, beside the shortest one; all of the full model.
+    """A gentle path of the grasp and the shortest one, both computed with the full model.
 
     Attributes:
-        name: Of its files.
+        name: Name of its files.
         path: Poses along the gentle path: position [m], rotation vector [rad], shape [n, 6].
         times: [s], shape [n].
         energies: Above the rest shape [J], shape [n].
-        forces: Of the gripper on the branch [N], shape [n, 3].
-        strains: Largest in the branch, shape [n].
+        forces: Forces of the gripper on the branch [N], shape [n, 3].
+        strains: Largest strain in the branch, shape [n].
         shortest_path: Poses along the shortest path, shape [k, 6].
         energy: Energy integrated along the gentle path [J m].
-        energy_saved: Against the shortest path [%].
-        cost: Of the gentle path on the energy field, dimensionless: the planner weighs energy and
-            length, each over its scale. With a ``max_detour``: the energy along it [J m].
-        bound: No path costs less than that, dimensionless or [J m] as the cost: the certificate.
+        energy_saved: Relative to the shortest path [%].
+        cost: Cost of the gentle path on the energy field, dimensionless: the planner weighs energy
+            and length, each over its scale. With a ``max_detour``: the energy along it [J m].
+        bound: Lower bound of the cost of any path, dimensionless or [J m] as the cost: the
+        certificate.
         gap: Largest cost of the gentle path above that of the best one [%]; None if unknown.
 
     >>> way = limber.open("a.branch").results["plan:to-goal"]
@@ -492,13 +494,13 @@ class Plan(Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Execution(Result):
-    """How a robot followed a plan, or what the dry run computed.
+    """The execution of a plan by a robot, or the results of the dry run.
 
     Attributes:
-        name: Of the plan.
+        name: Name of the plan.
         armed: Whether the robot moved; otherwise it was a dry run.
-        reached: Whether it came to the path's end and back.
-        stop_reason: Why it was stopped; None where it was not.
+        reached: Whether it reached the path's end and returned.
+        stop_reason: Reason for the stop; None if it was not stopped.
         peak_force: Largest measured force [N]; None in a dry run.
         path_error: Largest distance from the path [m]; None in a dry run.
 
@@ -542,10 +544,10 @@ class Execution(Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Written(Result):
-    """A file that was written.
+    """A written file.
 
     Attributes:
-        path: Of the file.
+        path: Path of the file.
 
     >>> limber.open("a.branch").export("a.swc").path.suffix
     '.swc'
@@ -592,12 +594,12 @@ def _yes(value: bool) -> str:
 
 
 def drawn(draw: "Callable[[], Figure]") -> "Figure":
-    """Draw a figure that a notebook shows once, whatever its settings for figures are."""
+    """Draw a figure that a notebook shows once, regardless of its figure settings."""
     require_extra("report", ("matplotlib",), "A picture")
     import matplotlib.pyplot as plt
 
     figure = draw()
-    # One that stays open is shown when the cell ends, and again as what the cell ends with.
+    # An open figure is shown when the cell ends, and again as the value of the cell.
     plt.close(figure)
     vars(figure)["_repr_png_"] = functools.partial(_png, figure)
     return figure

@@ -1,11 +1,10 @@
-"""The verbs of the Python interface: a branch and what is done to it.
+"""The verbs of the Python interface: a branch and its operations.
 
-Every verb works alike. What it needs comes first, without its name; all else are the inputs,
+All verbs work alike. Required arguments come first, without names; all others are the inputs,
 settings and options of its command by name (``--mesh-spacing 4`` is ``mesh_spacing=4``), which
 :func:`limber.settings` lists. ``quiet=True`` shows no progress. A verb runs its stage in this
-process, writes what the command writes, and returns a frozen result. What has not changed is not
-computed again. Errors are those of :mod:`limber.core.errors`; what the work warns of are Python
-warnings.
+process, writes the same files as the command, and returns a frozen result. Unchanged results are
+not computed again. Errors are those of :mod:`limber.core.errors`; warnings are Python warnings.
 """
 
 import html
@@ -53,7 +52,7 @@ def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> Gener
     """Make a branch with known truth, and scan it as a scanner would.
 
     Args:
-        folder: Where the scan and its truth go.
+        folder: Folder for the scan and its truth.
         quiet: Show no progress.
         settings: ``length`` [m], ``fork_count``, ``noise`` [m], ``seed`` and those that
             ``limber.settings("generate")`` lists.
@@ -68,20 +67,20 @@ def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> Gener
 
 def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: PathLike, *,
                 quiet: bool = False, **settings: Any) -> "Branch":
-    """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+    """Make a branch folder from a scan: skeleton, surface and tetrahedra.
 
     Args:
         cloud: A point cloud's file; or points, shape [n, 3]; or columns ``x``, ``y``, ``z`` and
             others by name, as a structured array or a table of pandas has them. Numbers are in
             ``unit``.
-        folder: The branch folder to make or renew.
+        folder: The branch folder to make or replace.
         quiet: Show no progress.
         settings: ``unit`` ("m", "cm", "mm", "in", "um"), ``root`` [3], ``mesh_spacing`` in radii,
             ``young`` [Pa], ``skeleton`` (a file of your own) and those that
             ``limber.settings("reconstruct")`` lists.
 
     Raises:
-        InputError: the scan or a setting cannot be used. WorkError: no branch came out.
+        InputError: the scan or a setting cannot be used. WorkError: no branch was found.
 
     >>> branch = limber.reconstruct("scan/cloud.ply", "new.branch", mesh_spacing=4)
     >>> branch.mesh.cell_data["young"].max() / 1e6
@@ -99,17 +98,17 @@ def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: Path
 
 
 def mesh(surface: PathLike, folder: PathLike, *, quiet: bool = False, **settings: Any) -> "Branch":
-    """Make a branch folder of a closed surface, a table of sections or a cylinder model.
+    """Make a branch folder from a closed surface, a table of sections or a cylinder model.
 
     Args:
         surface: The file: STL, PLY, OBJ, a CSV of sections, or a cylinder model.
-        folder: The branch folder to make or renew.
+        folder: The branch folder to make or replace.
         quiet: Show no progress.
         settings: ``unit``, ``root`` [3], ``elements_across``, ``young`` [Pa] and those that
             ``limber.settings("mesh")`` lists.
 
     Raises:
-        InputError: the surface or a setting cannot be used. MeshingError: no mesh came out.
+        InputError: the surface or a setting cannot be used. MeshingError: meshing failed.
 
     >>> sections = ["x_mm,y_mm,z_mm,width_mm,height_mm", "0,0,0,10,10", "0,0,200,10,10"]
     >>> _ = Path("beam.csv").write_text("\\n".join(sections))
@@ -190,7 +189,7 @@ class SettingsTable(Mapping[str, Setting]):
 
 
 class ByName(Mapping[str, Value], Generic[Value]):
-    """Things of a branch folder by name; each is read when it is asked for."""
+    """Entries of a branch folder by name; each is read on request."""
 
     def __init__(self, names: list[str], read: Callable[[str], Value]):
         self._names, self._read = tuple(names), read
@@ -211,12 +210,12 @@ class ByName(Mapping[str, Value], Generic[Value]):
 
 
 class Branch:
-    """A branch folder and what can be done with it.
+    """A branch folder and its operations.
 
     Nothing is kept in memory: each verb reads the folder and writes to it, as commands do.
 
     Args:
-        folder: Of the branch; :func:`limber.open` takes the same.
+        folder: Folder of the branch; :func:`limber.open` takes the same.
 
     Raises:
         BranchFolderError: there is no such folder, or it is damaged or of a newer format.
@@ -308,7 +307,7 @@ class Branch:
 
         Args:
             source: A robot's log, a bag, a table of markers, or a folder of them.
-            name: Of the pull.
+            name: Name of the pull.
             quiet: Show no progress.
             settings: ``unit``, ``cell`` (the robot's cell file), ``grasp_point`` [m], ``weight``
                 [N] and those that ``limber.settings("add_pull")`` lists.
@@ -333,7 +332,7 @@ class Branch:
                 ``limber.settings("virtual_pull")`` lists.
 
         Raises:
-            WorkError: the branch cannot be pulled like that.
+            WorkError: the branch cannot be pulled in this way.
 
         >>> limber.open("a.branch").virtual_pull(name="short", frames=4, seed=1).forces.shape
         (4, 3)
@@ -341,7 +340,7 @@ class Branch:
         return cast(Pull, self._run("virtual_pull", quiet, settings))
 
     def estimate(self, *, quiet: bool = False, **settings: Any) -> Estimate:
-        """Estimate Young's modulus along the branch from its pulls; the mesh gets it.
+        """Estimate Young's modulus along the branch from its pulls, and enter it in the mesh.
 
         Args:
             quiet: Show no progress.
@@ -351,7 +350,7 @@ class Branch:
 
         Raises:
             InputError: there are no pulls, or they cannot determine Young's modulus.
-            WorkError: the fit ends at no result.
+            WorkError: the fit has no result.
 
         >>> found = limber.open("a.branch").estimate(pull=("pull-1",))  # doctest: +SKIP
         >>> found.young, found.interval                                 # doctest: +SKIP
@@ -373,7 +372,7 @@ class Branch:
                 ``limber.settings("simulate")`` lists.
 
         Raises:
-            ConvergenceError: the branch could not follow; what it reached is in
+            ConvergenceError: the branch could not follow; the part it reached is in
                 ``branch.results["simulate"]``.
 
         >>> branch = limber.open("a.branch")
@@ -395,7 +394,7 @@ class Branch:
                 the folder) and those that ``limber.settings("load")`` lists.
 
         Raises:
-            WorkError: the branch finds no rest under the loads.
+            WorkError: no equilibrium of the branch was found under the loads.
 
         >>> calm = limber.open("a.branch").load(wind=(0.1, 0, 0))
         >>> gale = limber.open("a.branch").load(wind=(10, 0, 0))
@@ -448,7 +447,7 @@ class Branch:
                 ``limber.settings("execute")`` lists.
 
         Raises:
-            InputError: plan, cell and branch do not belong together, or nobody confirmed.
+            InputError: plan, cell and branch do not belong together, or the user did not confirm.
             NoPathError: the arm cannot follow the path.
             SafetyStop: it was stopped; its ``result`` states where.
 
@@ -505,7 +504,7 @@ class Branch:
         return Written(MappingProxyType(values), Path(output))
 
     def run(self, stage: str, *, quiet: bool = False, **settings: Any) -> Result:
-        """Run a stage that has no verb of its own, such as ``predict``, ``swing`` or ``target``.
+        """Run a stage without a verb, such as ``predict``, ``swing`` or ``target``.
 
         Args:
             stage: Name of its command.
@@ -524,10 +523,11 @@ class Branch:
         return Result(MappingProxyType(values))
 
     def session(self, *, mode: str = "clamped", **settings: Any) -> "InteractiveSession":
-        """Start a process in which the branch follows what holds it, many times a second.
+        """Start a process in which the branch follows its grasps, many times a second.
 
         Args:
-            mode: Of the marked grasp: ``clamped`` (the pose is held) or ``pinned`` (the position).
+            mode: Mode of the marked grasp: ``clamped`` (the pose is held) or ``pinned`` (the
+            position).
             settings: Fields of :class:`limber.session.settings.SessionSettings`.
 
         Returns:
@@ -603,7 +603,7 @@ def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
     """Write points or columns as a PLY file.
 
     Raises:
-        InputError: they are no points.
+        InputError: they are not points.
     """
     from limber.geometry.cloud.cloud import Cloud
 

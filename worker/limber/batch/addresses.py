@@ -1,8 +1,8 @@
 """Addresses of remote files (``s3://``, ``sftp://``, ``gs://`` ...), by fsspec.
 
-Neither locks nor renames can be relied on there: files are brought here, and results are put
-there. Who may read and write is fsspec's business (its configuration and environment), never the
-job file's.
+Locks and renames are not reliable there: files are fetched to this computer, and results are
+uploaded. Read and write permissions are managed by fsspec (its configuration and environment),
+never by the job file.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ def checked_address(address: str) -> str:
     Raises:
         InputError: it is chained, contains a password, or contains ``..``.
     """
-    # First of all: the other messages show the address.
+    # Checked first: the other messages show the address.
     for part in address.split("::"):
         host = part.partition("://")[2].partition("/")[0]
         if ":" in host.rpartition("@")[0]:
@@ -61,7 +61,7 @@ def checked_address(address: str) -> str:
 
 
 def plain_name(address: str) -> str:
-    """Return the last part of an address, as the name that the file gets here.
+    """Return the last part of an address: the name of the local file.
 
     Raises:
         InputError: it is not a name that every system accepts.
@@ -133,7 +133,7 @@ def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
 
 
 def copy_here(address: str, target: Path, stop: Callable[[], None]) -> None:
-    """Copy one file to where nothing is yet; as :func:`fetch`, but cut off it may be a part."""
+    """Copy one file to a free path, like :func:`fetch`; if interrupted, a part may be left."""
     system, path = _system(address)
     with _explained(address, "read"):
         size = system.info(path).get("size")
@@ -153,7 +153,7 @@ def put(source: Path, address: str) -> None:
         try:
             system.put_file(str(source), path)
         except FileNotFoundError:
-            # Disks have folders, which have to be made; other places mostly have none.
+            # Disks have folders, which must be created; most other storage has none.
             system.makedirs(path.rpartition("/")[0], exist_ok=True)
             system.put_file(str(source), path)
 
@@ -187,7 +187,7 @@ def take_away(address: str) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or folder here, if it is there."""
+    """Remove a local file or folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -221,7 +221,7 @@ def _before(system: Any, address: str, path: str) -> str:
 
 @contextmanager
 def _explained(address: str, what: str) -> Iterator[None]:
-    """Say where something went wrong that a file system's client raised in its own way."""
+    """Convert errors of a file system's client into ours, with the address."""
     try:
         yield
     except LimberError:
@@ -248,7 +248,7 @@ def _inside(folder: str, place: str) -> PurePosixPath:
     """The relative path of a file in its folder.
 
     Raises:
-        InputError: a part of it is not a plain name.
+        InputError: a component of it is not a plain name.
     """
     inner = PurePosixPath(place).relative_to(PurePosixPath(folder))
     for part in inner.parts:

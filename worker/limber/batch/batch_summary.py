@@ -55,7 +55,7 @@ def failures(jobs: JobFile, records: Records) -> list[tuple[str, str, str]]:
 
 
 def write_table(jobs: JobFile, records: Records) -> None:
-    """Write the CSV: a row a branch, its stages' results beside each other."""
+    """Write the CSV: one row per branch, with the results of its stages side by side."""
     rows = [_row(branch, records) for branch in jobs.branches]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO(newline="")
@@ -78,14 +78,14 @@ def _row(branch: BranchJob, records: Records) -> dict[str, Any]:
 
 
 def _cell(value: Any) -> Any:
-    """Return a value that no spreadsheet takes for a formula."""
+    """Return a value that no spreadsheet interprets as a formula."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
 def write_page(jobs: JobFile, records: Records) -> None:
-    """Write the page: how many are done, what failed and why, time, memory, pictures of each."""
+    """Write the page: number of finished branches, failures and reasons, time, memory, pictures."""
     write_atomically(path_of_page(jobs), "\n".join(_page(jobs, records)) + "\n")
 
 
@@ -149,7 +149,7 @@ def _way(path: Path, page: Path) -> str:
     try:
         way = Path(os.path.relpath(path.resolve(), page.resolve().parent)).as_posix()
     except ValueError:
-        # On another drive (Windows): no way leads there from here.
+        # On another drive (Windows) there is no relative path.
         return ""
     return html.escape(quote(way))
 

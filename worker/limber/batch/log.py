@@ -1,4 +1,4 @@
-"""The log of a batch, for reading afterwards: a text file of bounded size."""
+"""The log of a batch: a text file of limited size."""
 
 import logging
 from logging.handlers import RotatingFileHandler
@@ -8,11 +8,11 @@ from limber.batch.jobs.branch_jobs import JobFile
 
 MOST_BYTES = 1_000_000
 KEPT = 3
-"""Older files that are kept beside the newest: ``JOBS.log.1`` ..."""
+"""Older files that are kept besides the newest: ``JOBS.log.1`` ..."""
 
 
 def path_of_log(jobs: JobFile) -> Path:
-    """Return where the newest lines go."""
+    """Return the path of the newest lines."""
     return jobs.out / f"{jobs.path.stem}.log"
 
 
@@ -28,7 +28,7 @@ class BatchLog:
         self._handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
 
     def tell(self, *parts: str) -> None:
-        """Append a line of these parts."""
+        """Append a line made of these parts."""
         text = " ".join(" ".join(filter(None, parts)).split())
         self._handler.handle(logging.makeLogRecord({"msg": "%s", "args": (text,)}))
 

@@ -14,16 +14,16 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.scene.colours import colour_scale, css_colours
 
 HEIGHT = 150
-"""Of a picture [pixels]."""
+"""Size of a picture [pixels]."""
 _EDGE = 6
 _WOOD = "#5a4632"
 _VIEWS = (("from the front", 0), ("from the side", 1))
 
 
 def pictures(folder: Path) -> str:
-    """Return drawings (SVG) of a branch, with the range of its modulus; empty where it has no axes.
+    """Return drawings (SVG) of a branch, with the range of its modulus; empty if it has no axes.
 
-    The modulus is that of the mesh; where it is the same everywhere, or unknown, wood is brown.
+    The modulus is that of the mesh; if it is uniform or unknown, wood is brown.
     """
     try:
         skeleton = read_swc(folder / "skeleton.swc")
@@ -41,11 +41,11 @@ def pictures(folder: Path) -> str:
 
 
 def _moduli(path: Path, skeleton: Skeleton) -> np.ndarray | None:
-    """Young's modulus at each node [Pa]; None where it is unknown or the same everywhere."""
+    """Young's modulus at each node [Pa]; None if it is unknown or uniform."""
     try:
         mesh = TetMesh.read(path)
     except (OSError, LimberError):
-        # No mesh yet, or a damaged one: its own stage says so.
+        # No mesh yet, or a damaged one: its own stage reports it.
         return None
     young = mesh.cell_data.get("young")
     if young is None or not (np.isfinite(young) & (young > 0)).all():

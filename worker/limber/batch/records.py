@@ -1,4 +1,4 @@
-"""The progress of a batch: lines appended as it happens, so that they survive any end."""
+"""The progress of a batch: lines appended as it proceeds, so that they survive any end."""
 
 import json
 import os
@@ -22,7 +22,7 @@ WAITING, RUNNING, DONE, KEPT, FAILED = "waiting", "running", "done", "up to date
 class Record:
     """The state of a task: ``numbers`` are those of its result, ``memory_mb`` its largest.
 
-    ``content`` is the digest of the branch that a stage has shown which stores nothing in it.
+    ``content`` is the digest of the branch shown by a stage that stores no results in it.
     """
 
     status: str = WAITING
@@ -54,7 +54,7 @@ class Records:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Take the right to append; another batch of this job file is refused meanwhile."""
+        """Acquire the right to append; another batch of this job file is refused meanwhile."""
         with Stream(self.path, _last_of_each) as self._stream:
             yield
         self._stream = None
@@ -87,13 +87,14 @@ class Records:
                                 tuple(told["warnings"]), dict(told["numbers"]),
                                 str(told.get("content", "")))
         except (ValueError, KeyError, TypeError, RecursionError):
-            # A line that was damaged tells nothing: its task is run again, and kept if it is done.
+            # A damaged line is ignored: its task runs again, and its result is kept if it is up to
+            # date.
             return
         self._found[key] = record
 
 
 def _last_of_each(lines: Iterator[str]) -> list[str] | None:
-    """The last line of each task, where there are many more; a night's runs leave thousands."""
+    """The last line of each task, if there are many more; a night's runs leave thousands."""
     last: dict[tuple[str, str], str] = {}
     count = 0
     for line in lines:
@@ -102,7 +103,7 @@ def _last_of_each(lines: Iterator[str]) -> list[str] | None:
             told = json.loads(line)
             last[str(told["branch"]), str(told["task"])] = line
         except (ValueError, KeyError, TypeError, RecursionError):
-            # Damaged: as when it is read, it tells nothing.
+            # Damaged: ignored, as when it is read.
             continue
     return list(last.values()) if count > max(_LEAST_LINES, _MOST_TIMES * len(last)) else None
 
@@ -121,10 +122,10 @@ def numbers_of(result: dict[str, Any], longest: int = 12) -> dict[str, float]:
 
 
 def path_of_table(jobs: JobFile) -> Path:
-    """Return where the table of results goes."""
+    """Return the path of the table of results."""
     return jobs.out / f"{jobs.path.stem}.csv"
 
 
 def path_of_page(jobs: JobFile) -> Path:
-    """Return where the summary goes."""
+    """Return the path of the summary."""
     return jobs.out / f"{jobs.path.stem}.html"

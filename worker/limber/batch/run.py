@@ -20,9 +20,9 @@ from limber.version import VERSION
 
 _TICK_SECONDS = 0.2
 _FETCH = -1
-"""Before a branch's first task: what it needs is brought from its addresses."""
+"""Before a branch's first task its inputs are fetched from their addresses."""
 _MEMORY_MB_EACH = 1000.0
-"""What a stage may need; the pool starts no more processes than memory has room for."""
+"""Memory of a stage; the pool starts no more processes than memory allows."""
 
 
 def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
@@ -30,23 +30,23 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
              scheduler: str | None = None, progress: Progress = SILENT) -> None:
     """Run the tasks that are not up to date; a failure ends only its own branch.
 
-    What has failed before, with the same settings, is run again only with ``retry_failed``. Each
-    stage looks for itself whether the branch has its result already.
+    Tasks that failed before with the same settings are run again only with ``retry_failed``. Each
+    stage itself checks whether the branch already has its result.
 
     Args:
         jobs: The checked job file.
-        records: Take in how each task ends, as it happens.
-        retry_failed: Try again what has failed.
-        workers: Largest number of parallel branches; by default the file's, or the core budget.
-            On a queue's cluster: how many jobs to ask for.
-        cluster: Where, as one of :data:`limber.batch.jobs.job_file.CLUSTERS`; by default the
+        records: Records the outcome of each task as it ends.
+        retry_failed: Try failed tasks again.
+        workers: Largest number of parallel branches; by default the file's, or the core budget. On
+            a queue's cluster: the number of jobs to request.
+        cluster: Where to run, one of :data:`limber.batch.jobs.job_file.CLUSTERS`; by default the
             file's, or this process's own pool.
         scheduler: Address of a Dask scheduler to use instead.
-        progress: Cancelling it stops all; what was done stays.
+        progress: Cancelling it stops all; finished results stay.
 
     Raises:
         Cancelled: it was cancelled.
-        WorkError: the cluster could not be had, or was lost.
+        WorkError: the cluster was not available, or was lost.
     """
     jobs.out.mkdir(parents=True, exist_ok=True)
     kind = None if scheduler else cluster or jobs.cluster
@@ -59,7 +59,7 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
 
 
 class Machines(Protocol):
-    """Runs tasks: a number at a time; all can be stopped together."""
+    """Runs a limited number of tasks at a time; all can be stopped together."""
 
     @property
     def count(self) -> int: ...
@@ -92,7 +92,7 @@ class _ThisProcess:
 
 
 class _Course:
-    """Takes all branches through their tasks; each may be fetched before and uploaded after."""
+    """Runs the tasks of all branches; each branch may be fetched before and uploaded after."""
 
     def __init__(self, jobs: JobFile, records: Records, machines: Machines, staging: Staging,
                  log: BatchLog, progress: Progress, *, retry_failed: bool):
@@ -103,7 +103,7 @@ class _Course:
         self.earlier: dict[Future, Record] = {}
         self.ended = 0
         self.place = _identity(jobs.out)
-        # While some are moved others are computed.
+        # Some are transferred while others are computed.
         self.ahead = AT_ONCE if any(branch.is_moved for branch in jobs.branches) else 0
 
     def run(self) -> None:
@@ -111,7 +111,7 @@ class _Course:
         started = time.monotonic()
         try:
             while self.waiting or self.running:
-                # A branch is brought to its end before another is begun: results come early.
+                # A branch is completed before another is started, so results come early.
                 while self.waiting and len(self.running) < self.machines.count + self.ahead:
                     self.begin(self.waiting.popleft())
                 done, _ = wait(self.running, _TICK_SECONDS, FIRST_COMPLETED)
@@ -133,7 +133,7 @@ class _Course:
         self.progress(self.ended / total, at, **numbers)
 
     def begin(self, branch: BranchJob) -> None:
-        """Have a branch fetched, or its first task run."""
+        """Fetch a branch, or run its first task."""
         if not branch.is_moved or self.is_given_up(branch, 0):
             self.submit(branch, 0)
         else:
@@ -145,7 +145,7 @@ class _Course:
         return failed and not self.retry_failed
 
     def submit(self, branch: BranchJob, number: int) -> None:
-        """Have the branch's task of this number run, or end the branch."""
+        """Run the branch's task of this number, or end the branch."""
         if number == len(branch.tasks):
             self.end(branch)
             return
@@ -177,7 +177,7 @@ class _Course:
                             "Restore it and run this again. Stored results are kept.")
 
     def end(self, branch: BranchJob) -> None:
-        """Have the results of a branch uploaded, or count it as ended."""
+        """Upload the results of a branch, or count it as ended."""
         if branch.home or self.jobs.home:
             self.running[self.staging.put(branch)] = (
                 branch, len(branch.tasks), time.monotonic())
@@ -193,7 +193,7 @@ class _Course:
         record, earlier = (self.outcome(future, branch, time.monotonic() - since),
                            self.earlier.pop(future))
         is_kept = record.status == KEPT and earlier.has_succeeded
-        # What was told of it, and what it took, is of its making, not of finding it made.
+        # Warnings and cost are those of the run that made it.
         self.records.end(branch, task, replace(earlier, status=KEPT, numbers=record.numbers)
                          if is_kept else record)
         self.log.tell(branch.name, task.label, f"{record.status} after {record.seconds or 0:.1f} s",
@@ -211,8 +211,9 @@ class _Course:
         self.log.tell(message)
 
     def moved(self, future: Future, branch: BranchJob, number: int, seconds: float) -> None:
-        """Go on after a branch was fetched, or end with it; a failure is that of the next task,
-        or of the last."""
+        """Continue after a branch was fetched, or end with it; a failure counts for the next task,
+        or for the last.
+        """
         try:
             future.result()
         except LimberError as error:
@@ -236,10 +237,10 @@ class _Course:
         except (Cancelled, ClusterLostError):
             raise
         except LimberError as error:
-            # It crashed, or went over its limits: the pool says so.
+            # It crashed, or exceeded its limits: the pool states it.
             return Record(FAILED, str(error), round(seconds, 3))
         except Exception as error:
-            # A bug of ours in a stage: it costs this branch, not the night's work.
+            # A bug in a stage of Limber: it costs this branch, not the whole batch.
             notes = " ".join(getattr(error, "__notes__", ()))
             return Record(FAILED, f"internal error: {error!r}; please report it (`limber "
                           f"bug-report {branch.folder}`). {notes}", round(seconds, 3))

@@ -20,17 +20,17 @@ _SAMPLE_SECONDS = 0.2
 
 
 def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any]:
-    """Run a stage; returns how it ended, also where it failed.
+    """Run a stage; return its outcome, also if it failed.
 
     Returns:
-        ``error`` (empty where it succeeded), ``result``, ``warnings``, ``seconds``, ``memory_mb``
-        at its largest, ``content``, the digest of the branch that a stage has shown which stores
-        nothing in it, and ``is_kept``: the branch had it already, from this input with these
+        ``error`` (empty if it succeeded), ``result``, ``warnings``, ``seconds``, ``memory_mb`` at
+        its largest, ``content``, the digest of the branch shown by a stage that stores no results
+        in it, and ``is_kept``: the branch already had the result, from this input with these
         settings.
 
     Raises:
         BranchBusyError: another program is writing to the branch.
-        Cancelled: it was.
+        Cancelled: the stage was cancelled.
     """
     warnings: list[str] = []
     before = _finished(task, folder)
@@ -57,10 +57,10 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
 
 
 def is_shown(task: StageTask, folder: Path, content: str) -> bool:
-    """Whether a stage that stores nothing in the branch, as a scene, has nothing new to show.
+    """Whether a stage that stores no results in the branch, such as a scene, is up to date.
 
     Args:
-        content: Digest of the branch that it has shown; empty where it has shown none.
+        content: Digest of the branch that it has shown; empty if it has shown none.
     """
     outputs = _outputs(task)
     return bool(content and outputs) and content == _content(task, folder) and all(
@@ -68,7 +68,7 @@ def is_shown(task: StageTask, folder: Path, content: str) -> bool:
 
 
 def _content(task: StageTask, folder: Path) -> str:
-    """Digest of the branch, and of our version, for a stage that stores nothing; else empty."""
+    """Digest of branch and Limber version for a stage that stores no results; else empty."""
     if stage_description(task.stage).key or not _outputs(task):
         return ""
     try:
@@ -87,20 +87,20 @@ def _outputs(task: StageTask) -> list[Path]:
 
 
 def _finished(task: StageTask, folder: Path) -> str | None:
-    """Return when the branch's entry of the task was made; None where there is none."""
+    """Return when the branch's entry of the task was made; None if there is none."""
     key = stage_description(task.stage).entry(task.inputs, task.settings)
     if not key or not folder.is_dir():
         return None
     try:
         entry = read_manifest(folder).stages.get(key)
     except (LimberError, OSError):
-        # The stage says what is wrong with it.
+        # The stage reports what is wrong.
         return None
     return entry.finished + str(entry.seconds) if entry else None
 
 
 class _Memory:
-    """Watches the memory of this process and of what it starts."""
+    """Monitors the memory of this process and of its children."""
 
     def __init__(self) -> None:
         self.most_mb = 0.0

@@ -1,7 +1,7 @@
-"""The command ``limber``: finds the commands, and gives each the same way of running.
+"""The command ``limber``: finds the commands and runs each in the same way.
 
-A stage's command is made from its description (:mod:`limber.stages.registry`); any other command
-is a module in ``limber/cli/commands`` with an object ``command``, its docstring the help. Those
+A stage's command is made from its description (:mod:`limber.stages.registry`). Any other command is
+a module in ``limber/cli/commands`` with an object ``command``; its docstring is the help. Commands
 made here take ``--json``, ``--verbose`` and ``--progress``, end with the exit codes of
 ``limber.core.errors`` and, with ``--json``, print one JSON object as their last line.
 """
@@ -46,7 +46,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def command_summaries() -> dict[str, str]:
-    """Return what each command does in one line, by name; imports none of them.
+    """Return a summary of each command in one line, by name; imports none of them.
 
     `limber --help` must not wait for the numerical packages.
     """
@@ -59,17 +59,17 @@ def command_summaries() -> dict[str, str]:
 
 
 class _Commands(click.Group):
-    """Loads each command's module only when that command is asked for."""
+    """Loads each command's module only when that command is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(command_summaries())
 
     def resolve_command(self, ctx: click.Context, args: list[str],
                         ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find a command by its name; one that is not known is answered with those like it."""
+        """Find a command by its name; for an unknown one, the error lists similar names."""
         name = args[0]
         if name not in command_summaries() and not name.startswith("-"):
-            # Loads no package: it is what one who has just begun meets first.
+            # Loads no package: it is the first thing that a new user runs.
             close = difflib.get_close_matches(name, command_summaries(), 2)
             ctx.fail(f"There is no command '{name}'. " + (
                 f"Did you mean {' or '.join(close)}?" if close else "`limber --help` lists all."))
@@ -109,11 +109,11 @@ def main(follow_links: bool) -> None:
 
 
 class Run:
-    """What a command's function gets besides its options.
+    """Arguments of a command's function besides its options.
 
-    ``progress`` to report and warn to, ``say`` to print a line on standard error, ``show`` a
+    ``progress`` receives reports and warnings, ``say`` prints a line on standard error, ``show`` a
     table there. ``warnings`` are kept for the JSON result. ``close`` sets the last lines, which
-    stand in place of all of the result.
+    replace the full result.
     """
 
     def __init__(self, sink: Sink | None, say: Callable[[str], None]):
@@ -123,7 +123,7 @@ class Run:
         self.closing: list[str] = []
 
     def close(self, *found: str, where: object = "", then: str = "") -> None:
-        """Say what was found, where it is and what to type next."""
+        """Print what was found, where it is and what to type next."""
         self.closing = closing_lines(found, where, then)
 
     def _warned(self, message: str) -> None:
@@ -131,16 +131,16 @@ class Run:
         self.say(f"warning: {message}")
 
     def show(self, title: str, rows: list[list[str]]) -> None:
-        """Print a table, its first row the header."""
+        """Print a table; its first row is the header."""
         self.say("\n".join([f"\n{title}", *(f"  {line}" for line in table_lines(rows))]))
 
 
 def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
     """Make a click command of ``function(run, **options) -> result dict``.
 
-    The docstring's first line is the help text. The result is printed for a person to read, in
-    the function's own closing lines or (``--verbose``) value by value, or, with ``--json``, as
-    the last line together with ``command``, ``status``, ``seconds``, ``warnings`` and ``error``.
+    The docstring's first line is the help text. The result is printed for people, in the function's
+    own closing lines or (``--verbose``) value by value, or, with ``--json``, as the last line
+    together with ``command``, ``status``, ``seconds``, ``warnings`` and ``error``.
     """
     def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
         @functools.wraps(function)
@@ -185,7 +185,7 @@ def command_of(stage: "StageDescription", help_text: str) -> click.Command:
 
 
 def _close_stage(run: Run, stage: "StageDescription", values: dict[str, Any]) -> None:
-    """Say what a stage found, in which file, and which command follows.
+    """Print what a stage found, in which file, and which command follows.
 
     Args:
         values: Inputs, settings and result by name.
@@ -196,7 +196,7 @@ def _close_stage(run: Run, stage: "StageDescription", values: dict[str, Any]) ->
 
 
 def _place(stage: "StageDescription", values: dict[str, Any]) -> object:
-    """The file or folder that a stage wrote first, as far as it did."""
+    """The first file or folder that a stage wrote, if any."""
     folder = values.get("branch_folder")
     if folder is None or "output" in values:
         return values.get("output") or values.get("data") or values.get("folder") or folder or ""
@@ -230,7 +230,7 @@ def run(arguments: list[str] | None = None) -> None:
 
 
 def call(arguments: list[str] | None = None) -> int:
-    """Run one command line and return its exit code; what Blender's command entry calls."""
+    """Run one command line and return its exit code; called by Blender's command entry."""
     _terminate_like_interrupt()
     if "LIMBER_PARENT_PIPE" in os.environ:
         from limber.core.processes.ending import end_with_parent_pipe
@@ -255,9 +255,9 @@ def call(arguments: list[str] | None = None) -> int:
 
 
 def _output_lost(error: OSError) -> int:
-    """Say that standard output takes no more; what a command wrote elsewhere is complete."""
+    """State that standard output is closed; a command's other output is complete."""
     with contextlib.suppress(OSError, ValueError):
-        # Python flushes it once more at the end, and would report that as a fault of ours.
+        # Python flushes it again at exit, and would report that as an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if not isinstance(error, BrokenPipeError):
         click.echo(f"error: Standard output cannot be written ({error.strerror or error}).",
@@ -298,7 +298,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
         told = machine_error(error)
         code = told.exit_code if told else 3
         if told is None:
-            # A bug of ours: the trace goes to standard error, the contract of the last line holds.
+            # A bug: the traceback goes to standard error, and the last line is JSON all the same.
             traceback.print_exc()
             told = f"internal error: {error!r}; please report it"
         outcome |= {"status": "failed", "error": str(told)}
@@ -308,7 +308,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
 
 
 def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
-    """Return what the error offers to do instead, as options of the stage; see ``offers``."""
+    """Return the remedies that the error offers, as options of the stage; see ``offers``."""
     if name not in stage_summaries():
         return []
     from limber.stages.offers import offers
@@ -317,7 +317,7 @@ def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
 
 
 def _say(text: str) -> None:
-    """Print on standard error; names and texts of files cannot steer the terminal."""
+    """Print on standard error; names and texts of files cannot control the terminal."""
     click.echo(_CONTROL.sub("?", text), err=True)
 
 
@@ -328,7 +328,7 @@ def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,
     if outcome["error"]:
         _say(f"error: {outcome['error']}")
     elif style != "json":
-        # Warnings were said when they came up.
+        # Warnings were printed when they occurred.
         shown = {k: v for k, v in _plain(result).items() if k != "warnings"}
         is_short = bool(closing) and style == "short"
         for line in closing if is_short else [*result_lines(shown), *closing]:
@@ -338,11 +338,11 @@ def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,
 
 
 def _terminate_like_interrupt() -> None:
-    """Let SIGTERM end a command as Ctrl-C does: with its clean-up and exit code 130."""
+    """Let SIGTERM end a command like Ctrl-C: with its clean-up and exit code 130."""
     def interrupt(_signal: int, _frame: Any) -> None:
         raise KeyboardInterrupt
     try:
         signal.signal(signal.SIGTERM, interrupt)
     except ValueError:
-        # Not the main thread (Blender may call us from one): the default handler stays.
+        # Not the main thread (Blender may call from another): the default handler stays.
         return

@@ -1,8 +1,8 @@
-"""Results as a person reads them on a terminal: few digits, one thing a line, tables aligned.
+"""Results for people on a terminal: few digits, one item per line, tables aligned.
 
-A command ends with what was found, where it is and what to do next. Lines of what was found are
-templates with the names of results in them, ``"{length_m:m} of centreline"``; units that a name
-may be written in are those of :data:`UNITS`.
+A command ends with what was found, where it is and what to do next. Lines of findings are templates
+with the names of results in them, ``"{length_m:m} of centreline"``; the units are those of
+:data:`UNITS`.
 """
 
 import math
@@ -13,16 +13,17 @@ from pathlib import Path
 from typing import Any
 
 Line = str | Callable[[Mapping[str, Any]], str | None]
-"""A template, or what makes a line of the results; a line without its results is left out."""
+"""A template, or a function from results to a line; a line without its results is omitted."""
 
-# A list of plain numbers up to this length stands on one line; of others so many are shown.
+# Longest list of plain numbers that is printed on one line, and most elements that are shown of
+# others.
 _SHOWN = 12
 
 
 def result_lines(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a stage's result as lines ``name: value``; what is nested is indented below its name.
+    """Yield a stage's result as lines ``name: value``; nested values are indented below their name.
 
-    Numbers have five digits; what is empty is left out. ``--json`` has it all.
+    Numbers have five digits; empty values are omitted. ``--json`` has everything.
     """
     for name, value in result.items():
         if _is_empty(value):
@@ -40,20 +41,21 @@ def result_lines(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines whose values are all there, filled in."""
+    """Yield the filled-in lines of which all values are present."""
     for line in lines:
         try:
             told = _FILLED.vformat(line, (), values) if isinstance(line, str) else line(values)
         except (_NotThere, KeyError):
-            # A result that an older program wrote may lack it.
+            # A result of an older version may lack it.
             continue
         if told:
             yield told
 
 
 def command_to_type(template: str, values: Mapping[str, Any]) -> str:
-    """Return a command with its names and paths filled in, quoted for a shell; empty where one of
-    them is not there. ``{name:if}`` asks for a value and stands for nothing."""
+    """Return a command with its names and paths filled in, quoted for a shell; empty if one of them
+    is missing. ``{name:if}`` requires a value but prints nothing.
+    """
     try:
         return _QUOTED.vformat(template, (), values)
     except _NotThere:
@@ -81,8 +83,9 @@ UNITS: dict[str, Callable[[float], str]] = {
     "Hz": lambda value: f"{value:.3g} Hz", "s": lambda value: f"{value:.3g} s",
     "MB": lambda value: f"{value / 1e6:,.1f} MB", "count": lambda value: f"{value:,.0f}",
     "share": lambda value: f"{100 * value:.3g} %", "%": lambda value: f"{value:.3g} %"}
-"""How a value in SI units is written for a person; ``|m`` is the length of a vector, and
-``#branch/branches`` a number of them."""
+"""Format of a value in SI units for people; ``|m`` is the length of a vector, and
+``#branch/branches`` a number of them.
+"""
 
 
 class _NotThere(Exception):
@@ -123,7 +126,7 @@ _FILLED, _QUOTED = _Filled(), _Quoted()
 
 
 def table_lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the rows of a table with their columns aligned to the right."""
+    """Yield the rows of a table with right-aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         yield "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))

@@ -1,4 +1,4 @@
-"""From the coordinates of the file that a branch was made from to the branch's own, and back."""
+"""From the coordinates of the file that a branch was made from to the branch's, and back."""
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -10,7 +10,7 @@ class Alignment(BaseModel):
     """From the input file's coordinates to the branch's: ``x = rotation (scale * p - origin)``.
 
     ``scale`` is metres per input unit, ``origin`` [m] the recentring in scaled input axes,
-    ``rotation`` the upright turn. All three are kept so that a result can be taken back.
+    ``rotation`` the upright rotation. All three are kept so that a result can be transformed back.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -28,9 +28,9 @@ class Alignment(BaseModel):
         return rows
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Take input coordinates, shape [n, 3], to branch coordinates [m]."""
+        """Transform input coordinates, shape [n, 3], to branch coordinates [m]."""
         return (np.asarray(points) * self.scale - self.origin) @ np.array(self.rotation).T
 
     def undo(self, points: np.ndarray) -> np.ndarray:
-        """Take branch coordinates [m], shape [n, 3], back to those of the input file."""
+        """Transform branch coordinates [m], shape [n, 3], back to those of the input file."""
         return (np.asarray(points) @ np.array(self.rotation) + self.origin) / self.scale

@@ -1,6 +1,6 @@
-"""The errors that Limber raises on purpose, and the exit code that each ends a command with.
+"""The errors that Limber raises on purpose, and the exit code of each.
 
-Every message has three parts: what was seen, why it is wrong, what to do.
+Every message has three parts: what was found, why it is wrong, what to do.
 """
 
 from collections.abc import Iterable
@@ -8,26 +8,26 @@ from typing import Any, Self
 
 
 class LimberError(Exception):
-    """Base of all errors that a user can meet. Not raised itself."""
+    """Base of all errors that a user can see. Not raised itself."""
 
     exit_code = 3
     status = "failed"
     place: tuple[float, ...] | None = None
-    """Where it is, in the coordinates and the unit of the file that the stage reads."""
+    """Position of the problem, in the coordinates and unit of the file that the stage reads."""
 
     def __init__(self, seen: str, why: str = "", fix: str = ""):
-        """State what was ``seen``, ``why`` that is wrong and how to ``fix`` it."""
+        """State what was ``seen``, ``why`` it is wrong and how to ``fix`` it."""
         self.seen, self.why, self.fix = seen, why, fix
         super().__init__(" ".join(part for part in (seen, why, fix) if part))
 
     def at(self, place: Iterable[float]) -> Self:
-        """Say where it is; returns the error itself."""
+        """Set the position; returns the error itself."""
         self.place = tuple(float(value) for value in place)
         return self
 
 
 class InputError(LimberError):
-    """The input or its use is wrong; nothing was computed (exit code 2)."""
+    """The input or the usage is wrong; nothing was computed (exit code 2)."""
 
     exit_code = 2
 
@@ -53,7 +53,7 @@ class ConvergenceError(WorkError):
 
 
 class MeshingError(WorkError):
-    """No valid surface or tetrahedral mesh came out."""
+    """No valid surface or tetrahedral mesh was produced."""
 
 
 class NoPathError(WorkError):
@@ -61,13 +61,13 @@ class NoPathError(WorkError):
 
 
 class MissingDependencyError(WorkError):
-    """An optional package is not installed; ``limber doctor`` lists what that costs."""
+    """An optional package is not installed; ``limber doctor`` lists the consequences."""
 
 
 class SafetyStop(LimberError):
     """A robot was stopped, or not started, for safety (exit code 4).
 
-    ``result`` holds what was found up to then; it is part of the command's JSON.
+    ``result`` holds the results up to then; it is part of the command's JSON.
     """
 
     exit_code = 4
@@ -79,11 +79,11 @@ class SafetyStop(LimberError):
 
 
 class DamagedCacheWarning(UserWarning):
-    """A file that is kept to be quicker the next time could not be used."""
+    """A cached file could not be used."""
 
 
 class Cancelled(LimberError):
-    """The user stopped the work (exit code 130); what was there before is untouched."""
+    """The user stopped the work (exit code 130); earlier results are unchanged."""
 
     exit_code = 130
     status = "cancelled"

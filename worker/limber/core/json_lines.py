@@ -1,4 +1,4 @@
-"""JSON objects that a program writes line by line, between lines of whoever else writes there."""
+"""JSON objects that a program writes line by line, between other lines."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def json_object(line: str | bytes) -> dict[str, Any] | None:
-    """Return the object of a line; None of any other line, or of one that was cut short."""
+    """Return the object of a line; None for any other or truncated line."""
     try:
         content = json.loads(line)
     except (ValueError, RecursionError):
@@ -16,7 +16,7 @@ def json_object(line: str | bytes) -> dict[str, Any] | None:
 
 
 def json_objects(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
-    """Yield the objects of those lines that are one."""
+    """Yield the objects of those lines that contain one."""
     for line in lines:
         if (content := json_object(line)) is not None:
             yield content

@@ -1,4 +1,4 @@
-"""Values as JSON has them."""
+"""Values in JSON form."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` as JSON has it: models, numpy and paths become dicts, lists, numbers.
+    """Return ``value`` in JSON form: models, numpy and paths become dicts, lists, numbers.
 
     A number that is not finite becomes None: JSON has no NaN.
     """

@@ -1,4 +1,4 @@
-"""What is loaded when it is asked for: `limber --help` waits for no package."""
+"""Loading on first use: `limber --help` imports no heavy package."""
 
 import importlib
 from collections.abc import Callable, Mapping
@@ -11,8 +11,8 @@ def exports(package: str, places: Mapping[str, str],
     """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562).
 
     Args:
-        package: Its name.
-        places: Name to the module, relative to the package, that defines it.
+        package: Name of the package.
+        places: Names, each with the module (relative to the package) that defines it.
     """
     def get(name: str) -> Any:
         if name not in places:

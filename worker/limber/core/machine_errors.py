@@ -1,5 +1,5 @@
-"""What the machine does to a program, in words: a full disk, a lost folder, no memory, packages
-that do not load."""
+"""Machine errors in plain words: a full disk, a lost folder, no memory, packages that do not load.
+"""
 
 import errno
 import re
@@ -10,7 +10,7 @@ from limber.core.errors import InputError, LimberError, MissingDependencyError, 
 
 
 def _codes(*names: str) -> frozenset[int]:
-    # Windows has not all of them.
+    # Windows lacks some of them.
     return frozenset(getattr(errno, name) for name in names if hasattr(errno, name))
 
 
@@ -18,11 +18,11 @@ _FULL = _codes("ENOSPC", "EDQUOT")
 _LOST = _codes("ESTALE", "EIO", "ENODEV", "ENXIO")
 _UNREACHABLE = _codes("ENOTCONN", "ESHUTDOWN", "EHOSTDOWN", "EHOSTUNREACH", "ENETDOWN",
                       "ENETUNREACH", "ETIMEDOUT")
-"""Of a file; without a name they may be of a robot's connection."""
+"""Errors of a file; without a file name they may be those of a robot's connection."""
 _LOST_ON_WINDOWS = frozenset((53, 55, 59, 64, 67, 121, 1231))
-"""ERROR_BAD_NETPATH and its kin, which Python takes for a file that is not there."""
+"""ERROR_BAD_NETPATH and related errors, which Python reports as a missing file."""
 _FULL_IN_WORDS = re.compile(r"no space left|not enough free space|requested and \d+ written", re.I)
-"""As numpy and HDF5 say it, without a number."""
+"""The wording of numpy and HDF5, which give no error number."""
 _FORBIDDEN = _codes("EROFS", "EACCES", "EPERM")
 _NO_SUCH_NAME = _codes("ENAMETOOLONG", "ELOOP", "ENOTDIR", "EISDIR", "EILSEQ")
 _TOO_LARGE = _codes("EFBIG", "EOVERFLOW")
@@ -30,7 +30,7 @@ _TOO_MANY = _codes("EMFILE", "ENFILE")
 
 
 def machine_error(error: BaseException, place: Path | None = None) -> LimberError | None:
-    """Return what the user can read of an error that is the machine's and not ours; else None.
+    """Return a readable text for an error of the machine; None for any other error.
 
     Args:
         error: As Python or the system raised it.

@@ -1,4 +1,4 @@
-"""Packages that Limber works without until something needs them."""
+"""Optional packages, loaded when they are needed."""
 
 import importlib.util
 
@@ -6,12 +6,12 @@ from limber.core.errors import MissingDependencyError
 
 
 def require_extra(extra: str, packages: tuple[str, ...], what: str) -> None:
-    """Make sure that what an extra of Limber brings is installed, before work begins.
+    """Check that the packages of a Limber extra are installed, before work begins.
 
     Args:
-        extra: Its name, as in ``pip install 'limber[report]'``.
-        packages: What it brings, by the names they are imported with.
-        what: What needs it, for the message.
+        extra: Name of the extra, as in ``pip install 'limber[report]'``.
+        packages: Its packages, by their import names.
+        what: The feature that needs it, for the message.
 
     Raises:
         MissingDependencyError: a package is missing.

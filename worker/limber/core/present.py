@@ -1,4 +1,4 @@
-"""Values that may be None by their type, and are there by the caller's order of steps."""
+"""Values that may be None by type but are present by the caller's order of steps."""
 
 from typing import TypeVar
 
@@ -12,7 +12,7 @@ def present(value: Value | None, what: str) -> Value:
         what: The value's name, for the message.
 
     Raises:
-        ValueError: it is None. The code is wrong then, not the user's input.
+        ValueError: it is None. This is a bug, not an error in the user's input.
     """
     if value is None:
         raise ValueError(f"There is no {what}.")

@@ -1,12 +1,12 @@
-"""What long work reports: progress and warnings, in the same way for a terminal and a test.
+"""Reports of long work: progress and warnings, the same for a terminal and a test.
 
-A long function takes ``progress: Progress = SILENT`` and calls it as it goes::
+A long function takes ``progress: Progress = SILENT`` and calls it during the work::
 
     progress(0.4, "contracting", iteration=7)
 
-A call raises :class:`limber.core.errors.Cancelled` once the work has been cancelled, so the
-work can stop at every call. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
-A warning that does not stop the work is reported with ``progress.warn(message)``.
+A call raises :class:`limber.core.errors.Cancelled` once the work has been cancelled, so the work
+can stop at every call. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
+``progress.warn(message)`` reports a warning that does not stop the work.
 """
 
 import contextlib
@@ -60,7 +60,7 @@ class Progress:
         return Progress(self._sink, self._on_warning, _span=span, _stop=self._stop)
 
     def named(self, name: str) -> "Progress":
-        """Return the same progress, its warnings beginning with ``name``."""
+        """Return the same progress, its warnings prefixed with ``name``."""
         return self._with_warnings(lambda message: self.warn(f"{name}: {message}"))
 
     def keeping(self, warnings: list[str]) -> "Progress":
@@ -74,7 +74,7 @@ class Progress:
         return Progress(self._sink, on_warning, _span=self._span, _stop=self._stop)
 
     def to_the_end(self) -> "Progress":
-        """Return the same progress of work that is finished though it was cancelled."""
+        """Return the same progress for work that is finished even though it was cancelled."""
         return Progress(self._sink, self._on_warning, _span=self._span)
 
     def cancel(self) -> None:
@@ -90,7 +90,7 @@ SILENT = Progress()
 
 
 class JsonSink:
-    """Writes one JSON object a line: ``{"progress", "message", "seconds", ...numbers}``."""
+    """Writes one JSON object per line: ``{"progress", "message", "seconds", ...numbers}``."""
 
     def __init__(self, stream: TextIO | None = None, *, interval_seconds: float = 0.05):
         self._stream = stream or sys.stdout
@@ -126,7 +126,7 @@ class BarSink:
         from rich.progress import Progress as RichProgress
         from rich.table import Column
 
-        # The message gives way where the window is narrow, never the bar and its percentage.
+        # In a narrow window the message is shortened, never the bar and its percentage.
         self._bar = RichProgress(
             TextColumn("{task.fields[title]}",
                        table_column=Column(no_wrap=True, min_width=len(title))),
@@ -155,7 +155,7 @@ class BarSink:
 
 
 class LineSink:
-    """Rewrites one line of text: for a notebook, whose output takes no bar."""
+    """Rewrites one line of text: for a notebook, whose output does not support a bar."""
 
     def __init__(self, title: str, stream: TextIO | None = None, *,
                  interval_seconds: float = 0.1):
@@ -179,7 +179,7 @@ class LineSink:
             self._write(text)
 
     def _write(self, text: str) -> None:
-        """Write over what stood there."""
+        """Overwrite the previous line."""
         self._stream.write("\r" + text.ljust(len(self._shown)))
         self._stream.flush()
         self._shown = text
@@ -193,7 +193,7 @@ def _short(value: Any) -> str:
 def damage_told_to(tell: Callable[[str], None]) -> Iterator[None]:
     """Pass the first warning about a damaged cache to ``tell``; it comes from a lower layer.
 
-    Where one file of a cache is damaged others mostly are too: the user reads of one.
+    If one file of a cache is damaged, others usually are too: the user is told once.
     """
     told: list[str] = []
     with warnings.catch_warnings():

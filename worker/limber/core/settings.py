@@ -1,8 +1,8 @@
-"""Settings that a user chooses: the common base of their models, and errors on refused values.
+"""User settings: the common base of their models, and errors on refused values.
 
-A model is the one source of an option's name, type, range, default and help; of its place in
-``--help``, in the JSON schema and in the add-on's panel; and of what a manifest records. The
-description of a value states its unit in square brackets.
+A model is the single source of an option's name, type, range, default and help. It also defines its
+position in ``--help``, in the JSON schema and in the add-on's panel, and its record in a manifest.
+The description of a value states its unit in square brackets.
 """
 
 import difflib
@@ -28,16 +28,16 @@ def _with_length(vector: tuple[float, float, float]) -> tuple[float, float, floa
 
 
 Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
-"""A direction: three numbers that are not all 0; of any length."""
+"""A direction: three numbers, not all 0; of any length."""
 
 
 YOUNG_PA, DENSITY_KG_M3 = (1e3, 1e11), (50.0, 3000.0)
 MOST_FORCE_N = 1e5
-"""What a branch, or a model of one, can have, and what it can bear."""
+"""Plausible ranges of the properties and loads of a branch or of a model of one."""
 
 
 def possible_young(given: Any) -> Any:
-    """Validate one Young's modulus [Pa], several or None; ValueError names the likely slip."""
+    """Validate one Young's modulus [Pa], several or None; ValueError names the likely mistake."""
     for value in _numbers(given):
         if not YOUNG_PA[0] <= value <= YOUNG_PA[1]:
             likely = f"; for {value:g} GPa write {value:g}e9" if 1e-2 <= value < 1e3 else ""
@@ -57,7 +57,7 @@ def possible_density(given: Any) -> Any:
 
 
 def possible_force(given: Any) -> Any:
-    """Validate a force [N], its parts or None, likewise."""
+    """Validate a force [N], its components or None, likewise."""
     for value in _numbers(given):
         if abs(value) > MOST_FORCE_N:
             raise ValueError(f"it is in N, and no branch bears {value:g} N; for {value:g} mN write "
@@ -70,7 +70,7 @@ def _numbers(given: Any) -> tuple[float, ...]:
 
 
 class OneOf:
-    """Annotates a text that is one of a registry's names, asked for when they are needed."""
+    """Annotates a text that is one of a registry's names, which are looked up when needed."""
 
     def __init__(self, names: Callable[[], tuple[str, ...]]):
         self.names = names
@@ -88,7 +88,7 @@ class OneOf:
 
 
 class Renamed:
-    """Annotates a choice that has new names beside those that files and results keep."""
+    """Annotates a choice with new names, beside the old ones in files and results."""
 
     def __init__(self, kept: Mapping[str, str]):
         self.kept = kept
@@ -102,24 +102,24 @@ class Renamed:
 
 GraspMode = Annotated[Literal["clamped", "pinned"],
                       Renamed({"rigid": "clamped", "point": "pinned"})]
-"""Rigid: position and rotation of a piece are held; point: its mean position alone."""
+"""Rigid: position and rotation of a piece are held; point: only its mean position."""
 
 Groups = dict[str, tuple[str, ...]]
-"""Title to the names of the fields that stand under it."""
+"""Titles, each with the names of the fields below it."""
 
 _UNIT = re.compile(r"\[([^\[\]]+)\]")
 
 
 class Settings(BaseModel):
-    """Base of all settings and inputs: frozen, and closed to names that it does not know.
+    """Base of all settings and inputs: frozen, and refusing unknown names.
 
     Attributes:
-        groups: Title to the names of the fields below it; a model that inherits adds
-            to those of its bases.
-        common: Fields that ``--help`` shows, beside those that must be given: what most users
-            choose. ``--help-all`` shows the others too.
-        results_version: Raised where the same settings on the same input give other results than
-            before: branches then count as out of date, and a batch runs the stage again.
+        groups: Titles, each with the names of the fields below it; a derived model adds to those of
+            its bases.
+        common: Fields that ``--help`` shows besides required ones: those that most users choose.
+            ``--help-all`` shows the others too.
+        results_version: Increased when the same settings on the same input give other results than
+            before. Branches then count as out of date, and a batch runs the stage again.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -156,7 +156,7 @@ class Settings(BaseModel):
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """Return the sentence that names the known names nearest to one that is not known."""
+    """Return the sentence that names the known names closest to an unknown one."""
     close = difflib.get_close_matches(name, known, 3)
     return f"Did you mean {' or '.join(close)}?" if close else f"Known: {', '.join(known)}."
 
@@ -177,7 +177,7 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
     first = error.errors()[0]
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:
-        # It is about several values together, and names them.
+        # It concerns several values, and names them.
         return InputError(f"{message}.", "", "See the options' help.")
     return InputError(f"{_flag(str(first['loc'][0]))} {first.get('input')!r}: {message}.",
                       "The stage cannot use this value.",
@@ -185,7 +185,7 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
 
 
 def _missing(model: type[BaseModel], values: dict[str, Any], names: list[str]) -> InputError:
-    """Say which options are missing, what each is, and propose values."""
+    """State which options are missing, explain each, and propose values."""
     stem = next((value.resolve().stem for value in values.values() if isinstance(value, Path)),
                 "NAME")
     seen, meant, proposed = [], [], []

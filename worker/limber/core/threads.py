@@ -1,9 +1,9 @@
 """One thread in every numerical library, from the first import of ``limber`` on.
 
-How many threads a BLAS library uses decides in which order it adds, and so the last digits: a
-result would depend on the machine, on the environment and on what ran before in the process. On two
+The number of threads of a BLAS library determines its order of summation, and thus the last digits.
+A result would depend on the machine, on the environment and on earlier work in the process. On two
 cores OpenBLAS's threads also double the time of a supernodal factorisation of a branch (its blocks
-are small). Limber's work is parallel over samples instead, in processes.
+are small). Limber's work is instead parallel over samples, in processes.
 """
 
 import os
@@ -14,10 +14,10 @@ _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLI
 
 
 def one_thread() -> None:
-    """Let every BLAS and OpenMP library of this process work with one thread, from now on.
+    """Limit every BLAS and OpenMP library of this process to one thread, from now on.
 
-    Libraries that are loaded later, here and in processes started from here, read it from the
-    environment; those that numpy and others have loaded are told now, in some milliseconds.
+    Libraries that are loaded later, here or in child processes, read it from the environment. Those
+    already loaded by numpy and others are set now, in some milliseconds.
     """
     os.environ.update(dict.fromkeys(_VARIABLES, "1"))
     if "numpy" in sys.modules:

@@ -13,13 +13,13 @@ UNITS: dict[str, dict[str, float]] = {
     "kg": {"kg": 1.0, "g": 1e-3}, "rad": {"rad": 1.0, "deg": math.pi / 180},
     "J": {"J": 1.0, "mJ": 1e-3}, "kg/m^3": {"kg/m^3": 1.0, "g/cm^3": 1e3},
     "MB": {"MB": 1.0, "GB": 1e3}, "m/s": {"m/s": 1.0, "mm/s": 1e-3}, "m^2": {"m^2": 1.0}}
-"""What is in one of the units that may be written for a value in the unit named first."""
+"""Units that may be written for a value, each by its size in the unit named first."""
 
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*?)\s*$")
 
 
 def in_unit(value: Any, unit: str) -> Any:
-    """Return a number, or numbers, of a text with a unit in ``unit``; other values as they are.
+    """Return a number, or numbers, of a text with a unit in ``unit``; other values unchanged.
 
     Raises:
         ValueError: the text has a unit that cannot be converted to ``unit``.

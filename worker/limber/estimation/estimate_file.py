@@ -1,4 +1,4 @@
-"""Read ``estimate.json`` and check what the report and predictions take from it."""
+"""Read ``estimate.json`` and check the values used by the report and predictions."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,7 +9,7 @@ from limber.core.files.reading import checked_as, read_json
 
 _Positive = Annotated[float, Field(gt=0)]
 _Modulus = Annotated[float, Field(ge=1.0, le=1e15)]
-"""[Pa], also of a fit that ended far from anything that a branch can have."""
+"""[Pa], also for a fit that ended far outside the range of branches."""
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Maybe = float | None
 _Vector = tuple[float, float, float]

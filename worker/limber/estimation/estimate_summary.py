@@ -1,4 +1,4 @@
-"""What an estimate writes: the result of the stage and ``estimate.json``."""
+"""The output of an estimate: the result of the stage and ``estimate.json``."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
 
 
 def _bending(found: Estimate) -> dict[str, Any]:
-    """Bending stiffness at the control points, where the branch's shape was judged."""
+    """Bending stiffness at the control points, if the branch's shape was judged."""
     if found.second_moment is None:
         return {}
     interval = bending_interval(found.values.young, found.uncertainty.young_interval,
@@ -47,7 +47,7 @@ def _bending(found: Estimate) -> dict[str, Any]:
 
 
 def _reduced_error(found: Estimate) -> dict[str, Any]:
-    """What the reduced model was off by before its correction by the full one."""
+    """Error of the reduced model before its correction by the full one."""
     errors = [error for forward in found.objective.forwards
               if (error := forward.reduction_error) is not None]
     if not errors:

@@ -1,4 +1,4 @@
-"""The branch that is estimated: its model and the control points of Young's modulus."""
+"""The branch to estimate: its model and the control points of Young's modulus."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from limber.recordings.recording import Pull
 
 @dataclass(frozen=True)
 class Subject:
-    """The branch that is estimated.
+    """The branch to estimate.
 
     Attributes:
         mesh: Its tetrahedra.
@@ -53,7 +53,7 @@ class Subject:
         return self.model.prestress is not None and bool(self.model.gravity.any())
 
     def carries_itself(self, values: Values) -> bool:
-        """Whether it stays in the scanned shape under its weight, with these values."""
+        """Whether it is stable in the scanned shape under its weight, with these values."""
         return is_stable(self.model.with_parameters(
             young=self.young(values), poisson=values.poisson, density=values.density))
 

@@ -1,7 +1,7 @@
 """Fit Young's modulus along a branch to its pulls: initial values and fit.
 
 :mod:`limber.estimation.judgement` holds the result and its uncertainty.
-:mod:`limber.estimation.estimate_summary` selects what is written.
+:mod:`limber.estimation.estimate_summary` selects the written values.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ from limber.recordings.sensor_checks import force_unit_suspicion
 
 
 class _ForceLeadsNowhereError(WorkError):
-    """No equilibrium under a pull's measured force; its path may still lead."""
+    """No equilibrium under a pull's measured force; there may be one along its path."""
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
@@ -76,7 +76,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         except _ForceLeadsNowhereError as error:
             progress.warn(f"{error.seen} {error.why} The gripper's recorded path is prescribed "
                           "instead.")
-            # What was evaluated by force says nothing of this.
+            # Force-driven evaluations do not apply here.
             led = settings.model_copy(update={"drive": "pose"})
             try:
                 return once(branch, led, EvaluationLog(None, ""))
@@ -90,7 +90,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
 
 def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
                  progress: Progress) -> Estimate:
-    """Return the estimate with the weight; without it where it cannot be carried."""
+    """Return the estimate with the weight; without it if the weight cannot be carried."""
     heavy: Estimate | None = None
     failure: Exception | None = None
     try:
@@ -107,7 +107,7 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
             raise
         return heavy
     if subject.carries_itself(found.values):
-        # It was not the weight.
+        # The weight was not the cause.
         if failure is not None:
             raise failure
         return present(heavy, "estimate with the weight")
@@ -124,7 +124,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     """Check what the data determine, fit the moduli, and compute their uncertainty.
 
     Args:
-        cache, digest: Folder of the reduced bases, and digest of what they depend on; see
+        cache, digest: Folder of the reduced bases, and digest of their dependencies; see
             :class:`limber.estimation.fitting.reduced_fit.Reduction`.
     """
     require_scale_in_principle(objective.forwards)
@@ -134,7 +134,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
-    # Whether it is worth a word shows at the end: a modulus is told better where it is soft.
+    # Whether to warn is decided at the end: the data determine a modulus better once it is soft.
     space, _ = link_unresolved(first, objective.space)
     objective = objective.with_space(space)
     try:
@@ -160,7 +160,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
 
 def _standing(objective: Objective, start: Values, settings: EstimateSettings, progress: Progress,
               reduction: Reduction | None) -> tuple[Values, Evaluation]:
-    """Return values to start from for which there are equilibria, and what they give."""
+    """Return initial values that have equilibria, and their evaluation."""
     judged_on = objective
     if reduction is not None and reduction.is_built:
         start = reduction.around(start)
@@ -181,9 +181,10 @@ def _standing(objective: Objective, start: Values, settings: EstimateSettings, p
 
 
 def _force_is_measured(objective: Objective) -> bool:
-    """Whether a force well over its noise was measured: it gives the scale, wherever a fit starts.
+    """Whether the measured force is well above its noise: it determines the scale wherever a fit
+    starts.
 
-    Sensitivities at a start that is far too soft would deny that.
+    Sensitivities at a start that is far too soft would not show that.
     """
     for forward, sigma in zip(objective.forwards, objective.force_sigma, strict=True):
         force = forward.frames.wrenches[:, :3]
@@ -240,7 +241,7 @@ def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
 
 def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
              progress: Progress) -> Fit:
-    """Simulate more key frames where the spline between them is worse than the measurements."""
+    """Simulate more key frames if the spline error between them exceeds the measurement noise."""
     for _ in range(3):
         coarse = []
         values = objective.space.unpack(fit.evaluation.free)
@@ -285,9 +286,9 @@ def best_so_far(objective: Objective) -> Fit:
 
 def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
                        progress: Progress) -> tuple[Fit, Objective]:
-    """Link what the data leave open at the solution, and only that, and fit again if it differs.
+    """Link what the data do not determine at the solution, and fit again if the links differ.
 
-    Links are only added after the first time: what comes and goes would never end.
+    After the first round links are only added; otherwise the iteration might not end.
     """
     messages: list[str] = []
     for attempt in range(objective.space.group_count):

@@ -22,7 +22,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
     """Make the forward simulation of each pull.
 
     Raises:
-        InputError: a pull has nothing to compare, or observes other points.
+        InputError: a pull has no measurements to compare, or observes other points.
     """
     forwards = []
     for pull in pulls:
@@ -88,8 +88,8 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
 def is_path_observed(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
     """Whether a slow pull's force is prescribed and the gripper's recorded path is observed.
 
-    So it is wherever the force was measured, of a clamped grasp the torque too, and the gripper's
-    frame may be off. Without the force there is nothing else to lead but the path; it then counts
+    This is so if the force was measured (for a clamped grasp the torque too) and the gripper's
+    frame may have an error. Without a force only the path can drive the simulation; it then counts
     as exact.
     """
     measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
@@ -104,8 +104,9 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: Estimat
                     ) -> ParameterSpace:
     """Return the free parameters, with the priors of those that were not requested.
 
-    Poisson's ratio, the density where weight or inertia acts, and the form of the field are free
-    within their priors; asked for (``--fit-poisson``, ``--fit-density``), they are so without.
+    Poisson's ratio, the density if weight or inertia acts, and the form of the field are free
+    within their priors; requested ones (``--fit-poisson``, ``--fit-density``) are free without a
+    prior.
     """
     wanted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
               "alpha": settings.fit_damping, "beta": settings.fit_damping}
@@ -132,10 +133,10 @@ def _with_overrides(entry: PullEntry, settings: EstimateSettings) -> PullEntry:
 
 
 def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress) -> None:
-    """Warn where the first frame, at rest, shows the points elsewhere than the branch has them.
+    """Warn if the points in the first frame, at rest, are not at their positions on the branch.
 
     Raises:
-        InputError: all of them lie farther off than the branch is long.
+        InputError: all of them are farther away than the branch is long.
     """
     at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
     if not len(rest) or not at_rest.any() or pull.entry.gravity_m_s2 is not None:

@@ -3,9 +3,9 @@
 Slow pulls follow that path once. Fast ones shake the branch along it, or pull and release it. A
 hung weight needs no path.
 
-A path invented in space would compress a branch (it buckles) or stretch it (it tears): its length
-is fixed and nobody knows beforehand how it bends. A hand feels that and yields. Here the truth is
-pulled by a force that grows and turns, and where its grasp then goes is the path.
+A path drawn in space would compress a branch (it buckles) or stretch it (it tears), because its
+length is fixed and its bending is not known beforehand. A hand feels that and yields. Here the true
+branch is pulled by a force that grows and turns, and the motion of the grasp is the path.
 """
 
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_s
 
 SETTINGS = StaticSettings(tolerance=1e-8)
 TURNED_PART = 0.7
-"""Of the turn that a branch would make by itself, how much a clamping gripper lets it."""
+"""Fraction of the free rotation that a clamping gripper allows."""
 WAY_STATES = 12
-"""Slow states that the way of a shaken gripper is a spline through."""
+"""Number of static states that define the path of a shaken gripper."""
 SHAKES = 2.0
-"""How often a shaken gripper goes back and forth."""
+"""Number of oscillations of a shaken gripper."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class MotionWanted:
     """Requested motion of a virtual gripper.
 
     Attributes:
-        kind: ``pull`` (slow, the branch turns freely), ``turned`` (slow, held back in turning),
-            ``shake`` (fast, along the way of a pull), ``release`` (fast, pulled by force and let
+        kind: ``pull`` (slow, the branch turns freely), ``turned`` (slow, rotation restrained),
+            ``shake`` (fast, along the path of a pull), ``release`` (fast, pulled by force and let
             go), ``weight`` (a growing weight hangs on the grasp).
         point: The grasp point at rest [m], shape [3].
         axis: From base to grasp, shape [3].
-        travel: Of the grasp [m].
+        travel: Travel of the grasp [m].
         turn, phase: See :func:`sideways_forces`.
         times: [s], shape [n].
         weight: The largest weight's force [N], shape [3].
@@ -63,9 +63,10 @@ class MotionMade:
     """Resulting motion at each time.
 
     Attributes:
-        poses: Of the grasp point [m, rad], shape [n, 6].
-        wrenches: Of the gripper on the branch [N, N m], torque about the pose, shape [n, 6].
-        displacements: Of all nodes [m], each of shape [node_count, 3].
+        poses: Poses of the grasp point [m, rad], shape [n, 6].
+        wrenches: Wrenches of the gripper on the branch [N, N m], torque about the pose, shape [n,
+        6].
+        displacements: Displacements of all nodes [m], each of shape [node_count, 3].
     """
 
     poses: np.ndarray
@@ -121,7 +122,7 @@ def _slow(model: BranchModel, grasp: Grasp, wanted: MotionWanted, forces: np.nda
 
 def _shaken(model: BranchModel, grasp: Grasp, wanted: MotionWanted, way: MotionMade,
             progress: Progress) -> MotionMade:
-    """Out within a quarter of the time, back and forth over half the way, and held still."""
+    """Out within a quarter of the time, back and forth over half the path, then at rest."""
     share = wanted.times / wanted.times[-1]
     out = np.clip(share / 0.25, 0.0, 1.0)
     swing = np.clip((share - 0.25) / 0.5, 0.0, 1.0)
@@ -137,7 +138,7 @@ def _shaken(model: BranchModel, grasp: Grasp, wanted: MotionWanted, way: MotionM
 
 def _released(model: BranchModel, grasp: Grasp, wanted: MotionWanted,
               progress: Progress) -> MotionMade:
-    """A force that grows over a third of the time and is gone within a frame."""
+    """A force that grows over a third of the time and is removed within a frame."""
     direction = sideways_forces(wanted.axis, 2, turn=0.0, phase=wanted.phase)[-1]
     size = force_for_travel(model, grasp, direction, wanted.travel)
     share = wanted.times / wanted.times[-1]
@@ -160,11 +161,11 @@ def _require(result: DynamicResult) -> None:
 
 def _poses(model: BranchModel, grasp: Grasp, point: np.ndarray,
            displacements: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of the grasp point, which the patch carries, and of the patch's centre."""
+    """Poses of the grasp point, which moves with the patch, and of the patch's centre."""
     centres = np.array([grasp.pose_of(model.mesh.nodes, displacement)
                         for displacement in displacements])
     if grasp.mode == "pinned":
-        # Held by its weighted mean: where the point goes, whatever the turn.
+        # Held by its weighted mean: the position of the point, whatever the rotation.
         poses = centres.copy()
         poses[:, :3] += point - grasp.centre
         return poses, centres
@@ -191,20 +192,20 @@ def _made(poses: np.ndarray, held: np.ndarray, forces: np.ndarray, torques: np.n
 
 def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: float,
                     ) -> np.ndarray:
-    """Return forces across ``axis`` that grow from 0 to 1 N while turning, shape [n, 3].
+    """Return forces across ``axis`` that grow from 0 to 1 N while rotating, shape [n, 3].
 
     Args:
         axis: From base to grasp, shape [3].
         frame_count: The first force is 0.
-        turn: How far the direction turns about the axis [rad].
-        phase: Where it starts [rad].
+        turn: Rotation of the direction about the axis [rad].
+        phase: Initial direction [rad].
     """
     axis = axis / np.linalg.norm(axis)
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
     share = np.linspace(0.0, 1.0, frame_count)
-    # Speed fades in and out as a robot's does.
+    # Speed ramps up and down as a robot's does.
     eased = 0.35 * share * share * (3 - 2 * share) + 0.65 * share
     angle = phase + turn * eased
     return eased[:, None] * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
@@ -215,7 +216,7 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
     """Return the factor of ``direction`` [N] that moves the grasp by ``travel`` [m], to 3 %.
 
     Raises:
-        WorkError: none does.
+        WorkError: there is no such factor.
     """
     def pulled(size: float, start: StaticResult | None) -> tuple[float, StaticResult]:
         result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=start)
@@ -240,7 +241,7 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
         else:
             high = size
         if np.isinf(high):
-            # Up to a tenth of the way the branch answers as it began, farther out it stiffens.
+            # Up to a tenth of the path the response is linear; beyond it the branch stiffens.
             size *= min(max(travel / distance, 1.2), max(3.0, 0.1 * travel / distance))
         elif np.isfinite(distance):
             size = np.clip(size * travel / distance, low + 0.1 * (high - low),

@@ -1,12 +1,12 @@
 """Interpolation prior: Young's modulus between the control points is uncertain.
 
-The paper takes inverse-distance weights of the moduli. A modulus that runs straight between the
-control points, falls monotonically, or differs in side branches explains a pull as well, with
-other moduli at the control points: by tens of percent where neighbours differ severalfold. So the
-field is a mixture of the paper's and of one straight in its logarithm, with bumps between the
-control points and beyond the outer ones; mixture and bumps are unknowns beside the moduli, that
-the pull tells or that widen the intervals. Bumps are the larger the more the moduli beside them
-differ.
+The paper uses inverse-distance weights of the moduli. A modulus that is linear between the control
+points, decreases monotonically, or differs in side branches explains a pull equally well, with
+other moduli at the control points: by tens of percent if neighbours differ severalfold. The field
+is therefore a mixture of the paper's field and one that is linear in its logarithm, with bumps
+between the control points and beyond the outer ones. Mixture and bumps are unknowns in addition to
+the moduli: the pull determines them, or they widen the intervals. Bumps are larger the more the
+neighbouring moduli differ.
 """
 
 from dataclasses import dataclass, replace
@@ -20,17 +20,19 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 
 MIXTURE = (0.5, 0.5)
-"""Mean and deviation of the part of the straight field in the mixture."""
+"""Mean and deviation of the fraction of the log-linear field in the mixture."""
 BUMP_BETWEEN, BUMP_BEYOND, BUMP_OF_ORDER = 0.1, 0.3, 0.3
-"""Deviations of log E from the mixture: halfway between control points, at base and tip beyond
-the outer ones, and of side branches from the place they grow from. Of a branch along which log E
-does not change."""
+"""Deviations of log E from the mixture: halfway between control points, at base and tip beyond the
+outer ones, and of side branches from the point they grow from. For a branch with constant log E.
+"""
 STEP_BETWEEN, STEP_BEYOND = 0.15, 0.3
-"""The same as a part of the step of log E beside, which comes to those. A cubic between two control
-points lies off the straight line halfway by an eighth of the difference of its slopes at both;
-slopes of 0 to 3 times the straight one's keep it monotone (Fritsch and Carlson 1980), and any of
-them alike have that deviation: 3/8 sqrt(2/12) = 0.153. Beyond the outer control points it may stop
-at once or run on for as long as a step: the uniform deviation, sqrt(1/12) = 0.29."""
+"""The same as a fraction of the adjacent step of log E, which is added to those. A cubic between
+two control points differs from the straight line halfway by an eighth of the difference of its
+slopes at both. Slopes of 0 to 3 times the straight one's keep it monotone (Fritsch and Carlson
+1980); if all are equally likely, the deviation is 3/8 sqrt(2/12) = 0.153. Beyond the outer control
+points it may stop at once or continue for the length of a step: the uniform deviation, sqrt(1/12) =
+0.29.
+"""
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,12 @@ class YoungField:
 
     Attributes:
         weights: The paper's inverse-distance weights, shape [tet_count, K].
-        straight: Weights of the logarithms in the straight field, shape [tet_count, K]; None: the
-            field is the paper's, there is nothing else to know.
-        bumps: Where each further unknown changes log E, 1 at most, shape [tet_count, B].
-        widths: Deviations of these changes where all moduli are the same, shape [B].
-        steps: What a change of log E at the control points adds to them, shape [B, K].
-        names: Of the mixture and the bumps, B + 1; empty without ``straight``.
+        straight: Weights of the logarithms in the log-linear field, shape [tet_count, K]; None: the
+            field is the paper's, without further unknowns.
+        bumps: Effect of each further unknown on log E, 1 at most, shape [tet_count, B].
+        widths: Deviations of these changes if all moduli are the same, shape [B].
+        steps: Increase of them by a change of log E at the control points, shape [B, K].
+        names: Names of the mixture and the bumps, B + 1; empty without ``straight``.
     """
 
     weights: np.ndarray
@@ -55,7 +57,7 @@ class YoungField:
     names: tuple[str, ...] = ()
 
     def young(self, values: Values) -> np.ndarray:
-        """Of all tetrahedra [Pa], shape [tet_count]."""
+        """Young's modulus of all tetrahedra [Pa], shape [tet_count]."""
         plain = self.weights @ values.young
         if self.straight is None:
             return plain
@@ -66,8 +68,8 @@ class YoungField:
                       + self.bumps @ (sizes * form[1:]))
 
     def shares(self, values: Values, extra: tuple[str, ...]) -> np.ndarray:
-        """Derivative of log E of the tetrahedra to log E at the control points and, where they
-        are among the ``extra`` parameters, to the further unknowns, shape [K + B + 1, tet_count].
+        """Derivative of log E of the tetrahedra to log E at the control points and, if they are
+        among the ``extra`` parameters, to the further unknowns, shape [K + B + 1, tet_count].
         """
         plain = self.weights @ values.young
         shares = (self.weights * values.young).T / plain
@@ -84,22 +86,23 @@ class YoungField:
         return np.vstack([shares, MIXTURE[1] * apart, (self.bumps * sizes).T])
 
     def deviations(self, values: Values) -> np.ndarray:
-        """Of log E by each bump, with these moduli, shape [B]."""
+        """Change of log E by each bump, with these moduli, shape [B]."""
         return np.zeros(0) if self.straight is None else self._sizes(values)[0]
 
     def growth(self, values: Values) -> np.ndarray:
-        """Derivative of the logarithm of how much each further unknown changes the field to log E
-        at the control points, shape [B + 1, K]."""
+        """Derivative of the logarithm of each further unknown's effect on the field to log E at the
+        control points, shape [B + 1, K].
+        """
         plain = self.weights @ values.young
         apart = self.straight @ np.log(values.young) - np.log(plain)
         by_young = self.straight - self.weights * values.young / plain[:, None]
         sizes, sizes_by_young = self._sizes(values)
-        # Of a uniform branch both fields of the mixture are the same.
+        # For a uniform branch both fields of the mixture are the same.
         return np.vstack([apart @ by_young / max(float(apart @ apart), 1e-12),
                           sizes_by_young / sizes[:, None]])
 
     def same_at_any_step(self) -> "YoungField":
-        """Return the field whose bumps are those of a uniform branch, as estimates once took it."""
+        """Return the field with the bumps of a uniform branch, as in older estimates."""
         return self if self.straight is None else replace(self, steps=np.zeros_like(self.steps))
 
     def _sizes(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +124,7 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
     """Return the field with an unknown interpolation; for a single modulus, the uniform one.
 
     Args:
-        fractions: Places of the control points on the main path, growing, shape [K].
+        fractions: Positions of the control points on the main path, ascending, shape [K].
     """
     places = np.asarray(fractions, float)
     if len(places) < 2 or np.any(np.diff(places) <= 0):
@@ -153,11 +156,12 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
 
 
 def _places(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Of each tetrahedron: place on the main path (0 to 1), and whether it is on a side branch."""
+    """Position of each tetrahedron on the main path (0 to 1), and whether it is on a side branch.
+    """
     path = np.asarray(skeleton.main_path())
     on_path = np.zeros(len(skeleton.nodes), bool)
     on_path[path] = True
-    # A side branch belongs to the place that it grows from.
+    # A side branch has the position of its base.
     root = np.arange(len(skeleton.nodes))
     for node in range(len(root)):
         climbed = node

@@ -38,13 +38,14 @@ from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
 
 MISFIT_FACTOR = 4.0
-"""Mean squared residual over the expected one from which model and pull do not belong together:
-twice the stated noise. Of 10 branches reconstructed from scans, all sound ones stayed under 1.3,
-and the one whose axis ran into a twig and back came to 13, with moduli threefold off."""
+"""Mean squared residual over the expected one above which model and pull do not belong together:
+twice the stated noise. Of 10 branches reconstructed from scans, all correct ones stayed under 1.3;
+the one whose axis ran into a twig and back reached 13, with moduli off by a factor of three.
+"""
 UNEXPLAINED_FACTOR = 1.5
-"""The same, from which something acts that is not in the model."""
+"""The same, above which something acts that is not in the model."""
 WIDE = 0.15
-"""Standard deviation of a log E from which it is worth a word what would narrow it."""
+"""Standard deviation of a log E above which advice on narrowing it is given."""
 
 
 @dataclass
@@ -52,16 +53,16 @@ class Estimate:
     """Result of an estimate.
 
     Attributes:
-        fit: The optimiser's end.
-        objective: What it minimised. Its parameter space has the links.
+        fit: The result of the optimiser.
+        objective: The minimised objective. Its parameter space has the links.
         uncertainty: Covariance and intervals.
         identifiability: Computed before the fit.
-        warnings: What the user should know.
+        warnings: Warnings for the user.
         held_out: Per pull, the prediction of a fit without it: RMS distance [m] and RMS force
             error [N], also relative to the pull's travel and peak force.
         model_error: Errors of shape and mesh, which residuals do not show.
-        second_moment: Mean second moment of area of each control point's part of the branch [m^4],
-            shape [K]; None before the shape was judged.
+        second_moment: Mean second moment of area of each control point's section of the branch
+            [m^4], shape [K]; None before the shape was judged.
         is_weightless: Whether the estimate ignores the weight because the branch cannot carry it.
     """
 
@@ -82,7 +83,7 @@ class Estimate:
 
     @property
     def values(self) -> Values:
-        """Of the model on its mesh."""
+        """Young's modulus of the model on its mesh."""
         return self.objective.space.unpack(self.fit.evaluation.free)
 
     @property
@@ -127,7 +128,7 @@ class Estimate:
 
     @property
     def is_bad(self) -> str | None:
-        """Why the fit gives no valid result; None if it does."""
+        """Reason why the fit gives no valid result; None if it does."""
         space = self.objective.space
         bound = [name for name in space.on_bound(self.fit.evaluation.free)
                  if name not in {prior for prior, _, _ in space.priors}]
@@ -179,7 +180,7 @@ def hold_out(found: Estimate, settings: EstimateSettings) -> None:
 
 
 def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> dict[str, Any]:
-    """How a fit that did not see a pull foretells it.
+    """Score the prediction of a pull by a fit without it.
 
     ``in_fit``: the pull is one of the estimate's, left out for this score alone.
     """
@@ -197,7 +198,7 @@ def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSe
     """Score the prediction of a pull that the estimate does not use, into ``found.held_out``.
 
     Raises:
-        LimberError: the pull has nothing to compare.
+        LimberError: the pull has no measurement to compare.
     """
     forward = forwards_of([pull], subject, settings)
     alone = Objective(forward, found.objective.space,
@@ -210,7 +211,7 @@ def require_result(found: Estimate) -> None:
     """Reject a fit without a valid result.
 
     Raises:
-        WorkError: with the reason.
+        WorkError: the fit has no valid result; states the reason.
     """
     reason = found.is_bad
     if reason is not None:
@@ -252,7 +253,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
 
 
 def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
-    """From the gripper's frame where its path leads; said where the user reads it."""
+    """Error from the gripper's frame if its path is prescribed, with a warning."""
     led = led_by_path(found.objective.forwards)
     if not led:
         return None
@@ -283,7 +284,7 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
 
 
 def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None:
-    """Say what would narrow a wide interval: what makes up most of its variance.
+    """Report how to narrow a wide interval, from the causes of most of its variance.
 
     Args:
         parts: Variance of log E at the control points by cause, each of shape [K].

@@ -1,11 +1,12 @@
 """Expected information on Young's modulus from a future pull, and its risk.
 
-The pull is made on the branch as it is estimated, without noise, and put into the very problem that
-a fit would solve: its derivatives, with errors of cell and sensors eliminated, are the information
-that such a pull holds (Fisher's; Pukelsheim 2006, Optimal Design of Experiments, 3). Added to what
-the pulls so far have told it gives the covariance to expect. How the modulus runs between the
-control points is one for all pulls: one at the same place tells little more of it, one elsewhere
-does. What every pull of this scan has in common, the errors of shape and mesh, no pull takes away.
+The pull is simulated without noise on the branch as estimated, and inserted into the problem that a
+fit would solve. Its derivatives, with errors of cell and sensors eliminated, give the information
+of such a pull (Fisher's; Pukelsheim 2006, Optimal Design of Experiments, 3). Added to the
+information of the previous pulls, it gives the expected covariance. The interpolation of the
+modulus between the control points is the same for all pulls: another pull at the same position adds
+little information on it, one at another position more. No pull reduces the errors that all pulls of
+this scan have in common, those of shape and mesh.
 """
 
 from dataclasses import dataclass, replace
@@ -37,9 +38,9 @@ from limber.recordings.recording import (
 )
 
 UNKNOWN_SCALE = 1.15
-"""Deviation of the common log E before anything is measured: a factor of ten within its 95 %."""
+"""Deviation of the common log E before any measurement: a factor of ten within its 95 %."""
 _FIRM = 1e-4
-"""Share of the variance by which moduli of one group may differ."""
+"""Fraction of the variance by which moduli of one group may differ."""
 _PROBE_REACH = 0.15  # of the arc length: at which places and directions are compared
 _REACHES = (0.05, 0.1, 0.25, 0.35)  # then tried for the best of them
 _DIRECTIONS = 4
@@ -54,8 +55,8 @@ class Known:
     """Covariance of log E at the K control points and of the form of their field, F numbers.
 
     Attributes:
-        measured: Of what pulls tell, shape [K + F, K + F]: another one makes it smaller.
-        common: Of log E, what all pulls of this scan have in common, shape [K, K].
+        measured: Covariance from pulls, shape [K + F, K + F]: another pull reduces it.
+        common: Covariance of log E that all pulls of this scan have in common, shape [K, K].
     """
 
     measured: np.ndarray
@@ -63,8 +64,9 @@ class Known:
 
     @classmethod
     def nothing(cls, count: int, form_count: int = 0) -> "Known":
-        """Before any pull: moduli within a factor of ten, neighbours alike as on branches, the
-        form of their field within its deviations."""
+        """Before any pull: moduli within a factor of ten, neighbours similar as on branches, the
+        form of their field within its deviations.
+        """
         apart = 0.5 * LINK_DEVIATION**2 * np.eye(count)
         return cls(block_diag(UNKNOWN_SCALE**2 + apart, np.eye(form_count)),
                    np.zeros((count, count)))
@@ -82,19 +84,20 @@ class Known:
         if not np.isfinite([*measured.ravel(), *interval.ravel(), *sensor.ravel()]).all():
             return cls.nothing(count, len(form))
         whole, told = (np.log(each[:, 1] / each[:, 0]) / (2 * 1.96) for each in (interval, sensor))
-        # Of a soft piece the interval is wider than the covariance says, and a pull can narrow it.
+        # The interval of a soft piece is wider than the covariance states, and a pull can narrow
+        # it.
         wider = np.r_[told / np.sqrt(np.diag(measured)[:count]), np.ones(len(form))]
         return cls(measured * np.outer(wider, wider),
                    np.diag(np.maximum(whole**2 - told**2, 0.0)))
 
     @property
     def total(self) -> np.ndarray:
-        """Of log E, shape [K, K]."""
+        """Covariance of log E, shape [K, K]."""
         count = len(self.common)
         return self.measured[:count, :count] + self.common
 
     def after(self, information: np.ndarray) -> "Known":
-        """Return what is known with a pull of this information [K + F, K + F] besides."""
+        """Return the knowledge with an additional pull of this information [K + F, K + F]."""
         measured = np.linalg.inv(np.linalg.inv(self.measured) + information)
         return replace(self, measured=0.5 * (measured + measured.T))
 
@@ -114,8 +117,9 @@ class Cell:
 
     @classmethod
     def of(cls, pull: Pull | None) -> "Cell":
-        """Return the cell of an earlier pull, which a new one will be as long as; without one, as
-        one set up with care."""
+        """Return the cell of an earlier pull, with that pull's length; without one, a carefully
+        calibrated cell.
+        """
         if pull is None:
             return cls()
         seen, entry = pull.observations, pull.entry
@@ -124,9 +128,9 @@ class Cell:
                    len(seen.times) if seen is not None and is_alike else _RECORDED_FRAMES)
 
     def in_frames(self, count: int) -> "Cell":
-        """Return the cell in which ``count`` frames hold the information of all of this one's.
+        """Return the cell in which ``count`` frames contain the information of all of this one's.
 
-        What varies from frame to frame averages out; what stays through a recording does not.
+        Errors that vary from frame to frame average out; constant ones do not.
         """
         part = (count / self.frame_count)**0.5
         sensor, known = self.sensor, self.calibration
@@ -153,13 +157,13 @@ class ExpectedPull:
     """Expected result of a candidate pull.
 
     Attributes:
-        choice: Which pull.
-        point, end: Of the grasp before and after [m], shape [3].
-        peak_force: Of the gripper [N].
+        choice: The candidate pull.
+        point, end: Positions of the grasp before and after [m], shape [3].
+        peak_force: Peak force of the gripper [N].
         peak_strain: Largest principal strain anywhere in the branch.
-        information: Of log E at the control points and the form of their field,
-            shape [K + F, K + F].
-        bits: What it tells beyond what is known.
+        information: Information on log E at the control points and the form of their field, shape
+            [K + F, K + F].
+        bits: Information gained beyond what is known.
     """
 
     choice: PullChoice
@@ -172,7 +176,7 @@ class ExpectedPull:
 
     @property
     def bits_per_percent(self) -> float:
-        """Information for each percent of strain."""
+        """Information per percent of strain."""
         return self.bits / (100.0 * self.peak_strain)
 
 
@@ -188,16 +192,17 @@ class Suggested:
 def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
             fractions: tuple[float, ...], *, max_strain: float, max_force: float = np.inf,
             workers: int | None = None, progress: Progress = SILENT) -> Suggested:
-    """Return pulls in the order of their information for each percent of strain.
+    """Return pulls in the order of their information per percent of strain.
 
-    Places and directions are compared at one travel; for the best of them others are tried.
+    Positions and directions are compared at one travel; for the best of them other travels are
+    tried.
 
     Args:
-        values: As estimated, or likely.
-        fractions: Places on the main path where the branch may be held.
+        values: Estimated or assumed values.
+        fractions: Positions on the main path at which the branch may be held.
 
     Raises:
-        WorkError: no pull keeps the limits.
+        WorkError: no pull is within the limits.
     """
     phases = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     first = [PullChoice(fraction, float(phase), _PROBE_REACH)
@@ -229,7 +234,7 @@ def _all(choices: list[PullChoice], subject: Subject, values: Values, known: Kno
 
 def _tried(choice: PullChoice, subject: Subject, values: Values, known: Known, cell: Cell,
            ) -> ExpectedPull | None:
-    """Return what comes of a pull; None where the branch cannot be pulled so."""
+    """Return the expected result of a pull; None if the branch cannot be pulled that way."""
     try:
         return expected_pull(choice, subject, values, known, cell)
     except LimberError:
@@ -241,7 +246,7 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
     """Simulate a pull on the branch as estimated, and return its information.
 
     Raises:
-        WorkError: the branch cannot be pulled so.
+        WorkError: the branch cannot be pulled that way.
     """
     simulated = cell.in_frames(_FRAMES)
     pull, displacements = _without_noise(choice, subject, values, simulated)
@@ -267,13 +272,13 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
 
 
 def _own_rows(space: ParameterSpace, known_count: int) -> np.ndarray:
-    """What is known beforehand of all but the first free values, of which the pulls so far tell."""
+    """Prior information on all free values but the first ones, which the pulls determine."""
     rows, _ = space.own_rows()
     return rows[~rows[:, :known_count].any(axis=1)]
 
 
 def _of_field(jacobian: np.ndarray, count: int, form_count: int, repeat_sigma: float) -> np.ndarray:
-    """Return the information of log E and form, the first free values, all others being unknown.
+    """Return the information on log E and form, the first free values, with all others unknown.
 
     Shape [count + form_count] twice.
     """
@@ -282,7 +287,7 @@ def _of_field(jacobian: np.ndarray, count: int, form_count: int, repeat_sigma: f
     found = whole[:kept, :kept]
     if cross.size:
         found = found - cross @ np.linalg.solve(whole[kept:, kept:], cross.T)
-    # One recording's stiffness differs from another's: an error that all moduli share.
+    # The stiffness differs between recordings: an error that all moduli share.
     along = found[:, :count].sum(axis=1)
     if repeat_sigma > 0.0:
         found = found - np.outer(along, along) / (repeat_sigma**-2 + along[:count].sum())

@@ -9,8 +9,9 @@ POISSON_BOUNDS = (0.0, 0.495)
 DENSITY_BOUNDS = (50.0, 5000.0)
 FORM_BOUNDS = (-5.0, 5.0)
 LINK_DEVIATION = 1.2
-"""Deviation of the logarithm of the ratio of two neighbouring moduli, before anything is measured:
-the nine ratios in the paper's table have a root mean square of 1.1."""
+"""Deviation of the logarithm of the ratio of two neighbouring moduli before any measurement: the
+nine ratios in the paper's table have a root mean square of 1.1.
+"""
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,8 @@ class Values:
         poisson: Poisson's ratio.
         density: [kg/m^3].
         damping: Rayleigh's alpha [1/s] and beta [s].
-        form: How the modulus runs between the control points, in deviations from what is
-            expected (:mod:`limber.estimation.interpolation_prior`); empty: as expected.
+        form: Interpolation of the modulus between the control points, in deviations from the
+            expected one (:mod:`limber.estimation.interpolation_prior`); empty: as expected.
     """
 
     young: np.ndarray
@@ -37,18 +38,18 @@ class Values:
 class ParameterSpace:
     """The free parameters, and the control points that share one modulus.
 
-    The free vector holds log E of each group, then the form of the field, Poisson's ratio, log
-    density, log alpha and log beta as far as they are free.
+    The free vector contains log E of each group, then those of the form of the field, Poisson's
+    ratio, log density, log alpha and log beta that are free.
 
     Attributes:
         base: Values of the fixed parameters, and initial values of the free ones.
         groups: Group of each control point, shape [K]; groups are numbered from 0.
-        extra: Free ones: all that describe the form, named "form ...", or none; then out of
-            "poisson", "density", "alpha", "beta", in this order.
-        links: Pairs of groups of which the data do not tell the first: it is taken to differ from
-            the second as neighbours do.
-        priors: Names out of ``extra`` with what is known of their free value beforehand: its mean
-            and standard deviation.
+        extra: Names of the free ones: all that describe the form, named "form ...", or none; then
+            out of "poisson", "density", "alpha", "beta", in this order.
+        links: Pairs of groups of which the data do not determine the first: it is assumed to differ
+            from the second as neighbours do.
+        priors: Names out of ``extra`` with the prior of their free value: its mean and standard
+            deviation.
     """
 
     base: Values
@@ -72,7 +73,7 @@ class ParameterSpace:
 
     @property
     def membership(self) -> np.ndarray:
-        """1 where a control point is in a group, shape [K, groups]."""
+        """1 if a control point is in a group, shape [K, groups]."""
         return np.eye(self.group_count)[list(self.groups)]
 
     @property
@@ -122,7 +123,7 @@ class ParameterSpace:
         return rows
 
     def own_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """What is known beforehand as standardised rows: priors, then links; R and d of R x - d.
+        """Prior information as standardised rows: priors, then links; R and d of R x - d.
 
         Shapes [priors + links, p] and [priors + links].
         """

@@ -30,23 +30,23 @@ def require_one_load(settings: PredictSettings) -> None:
 
 def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down: np.ndarray,
                  settings: PredictSettings, progress: Progress = SILENT) -> dict[str, Any]:
-    """Simulate the branch at rest under another load than the recorded one.
+    """Simulate the branch at rest under a load other than the recorded one.
 
     Args:
         known: Content of ``estimate.json``.
         subject: The branch that was estimated.
-        entry: The pull whose points and grasp are taken.
+        entry: The pull that supplies the points and the grasp.
         down: Direction of gravity, unit vector [3].
 
     Returns:
         ``load_n`` [3], ``points_m`` and ``displacement_m`` [m][3] of the pull's points,
-        ``displacement_sigma_m`` [m] (of its size, from Young's modulus' covariance), ``drops_m``
-        [m] (along gravity), ``drop_m`` (their mean over the points that move at least half as far
-        as the farthest) with ``drop_interval_m`` (95 %),
-        ``grasp_displacement_m`` [3], ``young_pa``.
+        ``displacement_sigma_m`` [m] (of its magnitude, from Young's modulus' covariance),
+        ``drops_m`` [m] (along gravity), ``drop_m`` (their mean over the points that move at least
+        half as far as the farthest) with ``drop_interval_m`` (95 %), ``grasp_displacement_m`` [3],
+        ``young_pa``.
 
     Raises:
-        WorkError: the branch finds no equilibrium under the load.
+        WorkError: no equilibrium of the branch was found under the load.
     """
     load = np.array(settings.load) if settings.load else settings.weight * down
     forward, values = _forward(known, subject, entry, load)
@@ -71,7 +71,7 @@ def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down
 
 def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np.ndarray,
              ) -> tuple[QuasiStaticForward, Values]:
-    # The modulus with which this mesh bends as the branch does.
+    # The modulus for which this mesh bends as the branch does.
     values = Values(np.array(known.get("young_mesh_pa", known["young_pa"])),
                     float(known["poisson"]), float(known.get("density", subject.start.density)),
                     form=tuple(known.get("field_form", ())))
@@ -84,7 +84,7 @@ def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np
                     np.broadcast_to(np.eye(3), (2, len(points), 3, 3)))
     driven = entry.model_copy(update={"drive": "force", "motion": "quasi_static"})
     if entry.grasp.mode == "clamped":
-        # A force alone does not hold a hand's rotation.
+        # A force alone does not determine a hand's rotation.
         driven = driven.model_copy(update={
             "grasp": entry.grasp.model_copy(update={"mode": "pinned"})})
     return QuasiStaticForward("prediction", subject.model, subject.weights, driven, frames,
@@ -92,7 +92,7 @@ def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np
 
 
 def _space(known: dict[str, Any], values: Values) -> ParameterSpace:
-    """The parameters that the estimate's covariance is about."""
+    """The parameters of the estimate's covariance."""
     groups = tuple(known.get("groups") or range(len(values.young)))
     extra = tuple(name for name in known.get("parameters", ())
                   if name.startswith("form") or name in ("poisson", "density"))
@@ -103,9 +103,9 @@ def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: Pa
                known: dict[str, Any]) -> tuple[float, np.ndarray, float]:
     """Mean drop [m], standard deviations of each point's displacement and of the drop [m].
 
-    Of the modulus only what the data leave open: an error of radius or mesh is in the modulus
-    and in this prediction with opposite signs. Under another load the branch is another time as
-    much stiffer or softer as it is from recording to recording.
+    Only the uncertainty of the modulus from the data: an error of radius or mesh is in the modulus
+    and in this prediction with opposite signs. Under another load the stiffness varies again as it
+    does between recordings.
     """
     count = len(space.groups)
     free = np.concatenate([slope[..., :count] @ space.membership, slope[..., count:]], axis=-1)

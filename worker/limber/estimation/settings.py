@@ -1,4 +1,4 @@
-"""Settings of estimates, of virtual pulls and of predictions; they load nothing heavy."""
+"""Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class EstimateSettings(Settings):
-    """How Young's modulus is found from pulls."""
+    """Options for estimating Young's modulus from pulls."""
 
     groups: ClassVar[Groups] = {
         "input": ("pull", "drive", "motion", "fractions"),
@@ -94,7 +94,7 @@ class EstimateSettings(Settings):
 
 
 class SwingSettings(Settings):
-    """How Young's modulus and damping are found from a free swing."""
+    """Options for estimating Young's modulus and damping from a free swing."""
 
     groups: ClassVar[Groups] = {
         "input": ("pull", "periods"),
@@ -210,7 +210,7 @@ class VirtualPullSettings(Settings):
 
     @property
     def calibration(self) -> "CalibrationEntry":
-        """Standard deviations of the cell's errors; what was not asked for is exact."""
+        """Standard deviations of the cell's errors; those not requested are exact."""
         from limber.recordings.cell_errors import EXACT, CalibrationEntry
 
         begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT

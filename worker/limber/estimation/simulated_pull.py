@@ -1,8 +1,8 @@
 """Simulated pulls with a known Young's modulus and sensor noise, without a robot.
 
-The truth lives on another mesh than the fit: finer, swept along the axes, of the true geometry
-where the branch was generated. What is known of it goes into ``pull.toml`` under ``truth``, so
-that an estimate can be scored; nothing that estimates reads it.
+The truth is on another mesh than the fit: finer, swept along the axes, with the true geometry if
+the branch was generated. The known truth is stored in ``pull.toml`` under ``truth``, so that an
+estimate can be scored; no estimate reads it.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ from limber.recordings.recording import (
 )
 
 BODY_LIMIT = 25_000
-"""Most tetrahedra of a meshed body's truth: a finer one takes minutes a pull."""
+"""Most tetrahedra of a meshed body's truth: a finer one takes minutes per pull."""
 SHAPE_TRIES = 8
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
@@ -59,11 +59,11 @@ class TrueBranch:
         mesh: With point data ``fixed``.
         skeleton: True axes.
         control_points: [m], shape [K, 3].
-        fractions: Their places on the main path.
+        fractions: Positions of the control points on the main path.
         young: [Pa], shape [K].
         gravity: In the branch's frame [m/s^2].
-        is_weightless: Whether it has no weight, whatever the settings ask for.
-        is_assumed: Whether its moduli are assumed: the scan is of a branch that nobody pulled.
+        is_weightless: Whether it has no weight, regardless of the settings.
+        is_assumed: Whether its moduli are assumed: the scan is of a branch without pulls.
     """
 
     mesh: TetMesh
@@ -81,16 +81,16 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
                 fractions: tuple[float, ...] = FRACTIONS,
                 young: Sequence[float] = DEFAULT_YOUNG_PA,
                 gravity: tuple[float, float, float] = GRAVITY) -> TrueBranch:
-    """Return the branch of true axes, on a mesh of its own; the settings' moduli come first.
+    """Return the branch of true axes, on a mesh of its own; the settings' moduli take precedence.
 
     Args:
-        body: Tetrahedra of a body that was meshed as it is: it is the truth then, each cut in eight
-            where that stays small, and not the round branch of its axes.
-        scan: The points that the axes were fitted to [m], shape [n, 3]: the branch is another
-            one then that they allow as well (:mod:`limber.geometry.shape_samples`).
+        body: Tetrahedra of a body that was meshed directly. It is then the truth, with each
+            tetrahedron cut in eight if that stays small, instead of the round branch of its axes.
+        scan: The points that the axes were fitted to [m], shape [n, 3]: the branch is then another
+            one that fits them as well (:mod:`limber.geometry.shape_samples`).
 
     Raises:
-        InputError: not one modulus a control point. WorkError: no other shape can be meshed.
+        InputError: not one modulus per control point. WorkError: no other shape can be meshed.
     """
     if settings.young:
         young = settings.young
@@ -100,7 +100,7 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
     if body is not None:
         mesh = refined(body) if 8 * body.tet_count <= BODY_LIMIT and body.is_quadratic else body
     else:
-        # Reconstructed branches have sections four radii apart, of six sides.
+        # Reconstructed branches have six-sided sections four radii apart.
         mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)
                            ).mesh
     if scan is not None and body is None:
@@ -112,7 +112,7 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
 
 def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random.Generator,
              ) -> tuple[Skeleton, TetMesh]:
-    """Axes and tetrahedra of a branch that the scan allows as well."""
+    """Axes and tetrahedra of a different branch that fits the scan as well."""
     for shape in sample_skeletons(skeleton, scan, SHAPE_TRIES, rng):
         moved = reshaped(mesh, skeleton, shape)
         if moved.volumes.min() > 0:
@@ -248,7 +248,7 @@ def viewing(nodes: np.ndarray, displacements: list[np.ndarray], distance: float 
     everything = np.vstack([nodes + moved for moved in displacements])
     middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
     _, _, axes = np.linalg.svd(everything - middle, full_matrices=False)
-    # The direction in which the motion spreads least: nothing hides behind anything else.
+    # The direction in which the motion spreads least, so that points do not hide each other.
     across = axes[2] * [1.0, 1.0, 0.0]
     if np.linalg.norm(across) < 0.3:
         across = np.array([0.0, -1.0, 0.0])

@@ -1,4 +1,4 @@
-"""What a cell gets wrong: errors of its calibration, drawn once, and what it then records."""
+"""Simulated errors of a cell: drawn once, then applied to its recordings."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,9 +17,9 @@ class CellErrors:
 
     Attributes:
         calibration: Their standard deviations.
-        gripper_place, gripper_turn: Of the gripper's frame [m, rad], shape [3] each.
+        gripper_place, gripper_turn: Errors of the gripper's frame [m, rad], shape [3] each.
         force_gain: Factor of the force.
-        camera_place, camera_turn: Of the observer's frame [m, rad], shape [3] each.
+        camera_place, camera_turn: Errors of the observer's frame [m, rad], shape [3] each.
     """
 
     calibration: CalibrationEntry
@@ -31,7 +31,7 @@ class CellErrors:
 
     @classmethod
     def drawn(cls, calibration: CalibrationEntry, rng: np.random.Generator) -> "CellErrors":
-        """Draw the errors that a calibration leaves."""
+        """Draw the errors that remain after a calibration."""
         return cls(calibration, calibration.pose_sigma_m * rng.standard_normal(3),
                    calibration.pose_sigma_rad * rng.standard_normal(3),
                    1 + calibration.force_gain_sigma * rng.standard_normal(),
@@ -49,8 +49,8 @@ class CellErrors:
     def recorded(self, pull: Pull, rng: np.random.Generator) -> Pull:
         """Return an exact pull as the cell records it, with zero and drift of this recording.
 
-        Noise of the sensors is not included. The gripper's frame is turned about the grasp, the
-        observer's about the middle of the points.
+        Noise of the sensors is not included. The gripper's frame is rotated about the grasp, the
+        observer's about the centre of the points.
         """
         known, times = self.calibration, pull.times
         wrenches = pull.wrenches.copy()

@@ -1,6 +1,6 @@
 """Geometry of a branch: from points to skeleton, surface and tetrahedra.
 
-A generated branch and its scan, with the truth beside it:
+A generated branch and its scan, with the ground truth:
 
 >>> from limber.geometry import generate_branch
 >>> branch = generate_branch(1, length=0.3, fork_count=0)

@@ -1,4 +1,4 @@
-"""Generated branches: true axes, radii and Young's modulus, and a scan of them with faults."""
+"""Generated branches: true axes, radii and Young's modulus, and a scan of them with defects."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +23,11 @@ _STEP = 0.004  # [m] between nodes of the true axes
 
 @dataclass(frozen=True)
 class GeneratedBranch:
-    """A branch whose truth is known, and its scan, in one frame (root at the origin, z up).
+    """A branch of known ground truth, and its scan, in one frame (root at the origin, z up).
 
     Attributes:
-        seed: What it was made from, with ``spec``.
-        spec: How it was made.
+        seed: Seed from which it was made, with ``spec``.
+        spec: Specification from which it was made.
         skeleton: True axes and radii.
         surface: True surface.
         young: True Young's modulus [Pa] at ``control_points``, shape [K].
@@ -50,7 +50,7 @@ def generate_branch(seed: int, **spec: object) -> GeneratedBranch:
     """Make a branch with known truth; the same seed and spec give the same branch.
 
     Args:
-        seed: Seed of all that is random.
+        seed: Seed of all random numbers.
         spec: Fields of :class:`BranchSpec`.
     """
     from limber.geometry.surface.tubes import branch_surface
@@ -139,7 +139,7 @@ def _axis(rng: np.random.Generator, start: np.ndarray, direction: np.ndarray, le
 def _surface_points(skeleton: Skeleton, spec: BranchSpec, rng: np.random.Generator,
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Points spread evenly over the cylinders' sides and tips, with normals, run, arc length."""
-    # Thinned afterwards by unevenness, so more are drawn.
+    # Thinned afterwards for unevenness, so more points are drawn.
     density = 1.0 / spec.point_spacing**2 / (1 - 0.5 * spec.unevenness)
     parts = []
     for run in range(skeleton.branch_count):
@@ -170,7 +170,7 @@ def _surface_points(skeleton: Skeleton, spec: BranchSpec, rng: np.random.Generat
 
 
 def _outside_others(skeleton: Skeleton, points: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Whether each point lies outside the cylinders of the other runs."""
+    """Whether each point is outside the cylinders of the other runs."""
     keep = np.ones(len(points), bool)
     for other in range(skeleton.branch_count):
         fine, radius = (np.repeat(values, 4, axis=0) for values in skeleton.curve(other))
@@ -231,7 +231,7 @@ def read_truth(path: Path) -> dict[str, Any]:
     """Return the content of ``truth.json``: the description of a generated branch.
 
     Raises:
-        InputError: it cannot be read, or is not such a file.
+        InputError: the file cannot be read, or is not such a file.
     """
     content = read_json(path, "a description of a generated branch")
     checked_as(path, _Truth, content, "a description of a generated branch")

@@ -19,12 +19,12 @@ UNASKED = 0.1
 """Fraction of the points up to which leaves are removed without the user's consent."""
 
 _LEAST = 0.05  # of the points, that leaves must be to be cut off
-# Of its radius, up to which a point lies on a round axis; a filled blade that a rod was fitted to
+# Distance in radii up to which a point is on a round axis; a filled blade to which a rod was fitted
 # has a third of its points there.
 _ON_AXIS = 0.15
 _MOST = 0.5  # of a piece's points, that decide
-# Mean of the unit vectors from the axis: of an evenly seen arc of 120 degrees. One view of a stem
-# shows pi/4, since a sensor's points thin out towards the rim; a rod through a blade 0.83 to 0.97.
+# Mean of the unit vectors from the axis, for an evenly seen arc of 120 degrees. One view of a stem
+# gives pi/4, since a sensor's points thin out towards the rim; a rod through a blade 0.83 to 0.97.
 _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 
@@ -35,7 +35,7 @@ def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonRes
     Args:
         prepared: The scan.
         least: Fraction of the points below which leaves are kept.
-        found: The skeleton of the whole scan: what its axes show to be round is no leaf.
+        found: The skeleton of the whole scan: parts that its axes show to be round are not leaves.
 
     Returns:
         The wood, and the removed leaves.
@@ -51,7 +51,7 @@ def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonRes
 
 
 def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf]]:
-    """Return a scan without these leaves, and the leaves; whole and none if too little remains."""
+    """Return a scan without these leaves, and the leaves; no change if too little remains."""
     wood = ~leaf_mask(leaves, len(prepared.cloud))
     if wood.sum() < POINT_MINIMUM:
         return prepared, []
@@ -59,11 +59,11 @@ def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf
 
 
 def _leaves_of(points: np.ndarray) -> list[Leaf]:
-    """Find the leaves of a scan, among as many of its points as its axes are fitted to.
+    """Find the leaves of a scan, on at most as many of its points as a fit of axes uses.
 
-    Leaves are told by neighbourhoods some spacings wide. Where points lie closer than a leaf needs
-    these show the scan's noise, and pairs of neighbours take memory without end. Every other point
-    goes with the nearest of those looked at.
+    Leaves are recognised by neighbourhoods a few spacings wide. If points are closer together than
+    a leaf needs, these neighbourhoods show the scan's noise, and pairs of neighbours take too much
+    memory. Each remaining point is assigned to the nearest of those examined.
     """
     some = thinned(points, FIT_POINT_LIMIT)
     leaves = find_leaves(points[some])
@@ -81,17 +81,17 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
 
     Args:
         prepared: The whole scan.
-        leaves: What looks like leaves.
-        unit: Of the file, as the settings name it.
+        leaves: Points that look like leaves.
+        unit: Unit of the file, as the settings name it.
 
     Raises:
-        InputError: they are more.
+        InputError: the leaves are more than that.
     """
     share = float(leaf_mask(leaves, len(prepared.cloud)).mean())
     if share <= UNASKED:
         return
     largest = max(leaves, key=lambda leaf: leaf.area)
-    # The median point: the middle of a curled blade lies on no point.
+    # The median point: the middle of a curled blade is not on a point.
     blade = prepared.cloud.points[largest.points]
     nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
     place = (nearest + prepared.origin) / UNIT_METRES[unit]
@@ -107,9 +107,9 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
-    """Which points [n, 3] lie on an axis whose points show that it is round, shape [n].
+    """Which points [n, 3] are on an axis whose points show that it is round, shape [n].
 
-    They must lie on its surface, and on enough of its circumference: any narrow strip lies on some
+    They must be on its surface and cover enough of its circumference: any narrow strip fits some
     cylinder. A radius at its limit was not measured.
     """
     skeleton, node = found.skeleton, found.node_of_point
@@ -126,7 +126,7 @@ def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
 
 
 def leaf_mask(leaves: list[Leaf], count: int) -> np.ndarray:
-    """Return which of ``count`` points lie on leaves, shape [count]."""
+    """Return which of ``count`` points are on leaves, shape [count]."""
     found = np.zeros(count, bool)
     for leaf in leaves:
         found[leaf.points] = True
@@ -135,13 +135,13 @@ def leaf_mask(leaves: list[Leaf], count: int) -> np.ndarray:
 
 def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, density: float,
                 ) -> list[dict[str, Any]]:
-    """Return what leaves weigh and where: sheets of even thickness on the nearest axes.
+    """Return the masses and positions of leaves: sheets of even thickness on the nearest axes.
 
     Args:
-        leaves: Of the scan.
+        leaves: Leaves of the scan.
         points: The scan [m], shape [n, 3], in the skeleton's frame.
-        skeleton: The wood.
-        density: Mass of a leaf's area [kg/m^2].
+        skeleton: Skeleton of the wood.
+        density: Mass of a leaf per area [kg/m^2].
 
     Returns:
         For each leaf ``kind`` ("leaf"), ``mass_kg``, ``area_m2``, ``centre_m``, ``attached_m``
@@ -162,7 +162,7 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, dens
 
 
 def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
-    """Warning about removed leaves, which are the fraction ``share`` of the points."""
+    """Warning about removed leaves, the fraction ``share`` of the points."""
     count = f"{len(masses)} {'leaf' if len(masses) == 1 else 'leaves'}"
     return (f"Limber detected and removed {count} ({100 * share:.0f} % of the points, "
             f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2). Their mass of "

@@ -1,4 +1,4 @@
-"""A cylinder model alone, without its scan, to a closed surface and tetrahedra."""
+"""From a cylinder model alone, without its scan, to a closed surface and tetrahedra."""
 
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,10 @@ from limber.geometry.skeleton.upright import upright_rotation
 
 
 def body_format(path: Path) -> Format:
-    """Return what a file that `limber mesh` is given is: a cylinder model, sections or a surface.
+    """Return the kind of a file given to `limber mesh`: a cylinder model, sections or a surface.
 
     Raises:
-        InputError: none is known.
+        InputError: the kind is not known.
     """
     return known_format(path, "body", [*SKELETONS.readers(), SECTIONS, *SURFACES.readers()])
 
@@ -35,12 +35,14 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
     """Return the branch of a cylinder model, and the masses of the pruned twigs.
 
     Args:
-        path: In a format of :data:`~limber.geometry.io.skeletons.SKELETONS`.
-        settings: ``unit``, ``up``, ``upright`` and the wood; the model has its own root.
-        progress: Called as it goes; gets what the user should know.
+        path: File in a format of :data:`~limber.geometry.io.skeletons.SKELETONS`.
+        settings: ``unit``, ``up``, ``upright`` and settings of the wood; the model has its own
+        root.
+        progress: Called during the work; receives warnings for the user.
 
     Raises:
-        InputError: it cannot be read, a radius is 0, its size is no branch's, or a root is given.
+        InputError: it cannot be read, a radius is 0, its size is not a branch's, or a root is
+        given.
         MeshingError: it cannot be meshed.
     """
     if settings.root is not None:

@@ -91,7 +91,7 @@ def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: A
 def section_axis(surface: Surface, root: np.ndarray | None) -> Skeleton:
     """Return the axis of a slender solid: centroids of its cross-sections along its length.
 
-    Radii are those of circles of the sections' areas. The body is one unforked run; it starts at
+    Radii are those of circles with the sections' areas. The body is one unforked run that starts at
     ``root``, or at the thicker end.
 
     Args:

@@ -1,22 +1,22 @@
-"""Sizes that a branch can have; what is outside is asked about, what nothing can have refused."""
+"""Plausible sizes of a branch: outside them the user is asked; impossible sizes are refused."""
 
 import numpy as np
 
 from limber.core.errors import InputError
 
 LONGEST, SHORTEST = 30.0, 0.01
-"""[m]: outside, the unit is asked about."""
+"""Largest and smallest size [m] without a question about the unit."""
 _POSSIBLE = (1e-5, 1e4)  # m
 
 
 def size_doubts(points: np.ndarray, what: str) -> list[str]:
-    """Return a question about the unit of positions [m], shape [n, 3], that are far apart or near.
+    """Return a question about the unit of positions [m], shape [n, 3], of unusual extent.
 
     Args:
         what: "surface"; for messages.
 
     Raises:
-        InputError: nothing that bends under its weight has such a size.
+        InputError: a body that bends under its weight cannot have this size.
     """
     extent = float(np.ptp(points, axis=0).max())
     if not _POSSIBLE[0] <= extent <= _POSSIBLE[1]:

@@ -37,7 +37,7 @@ def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
 
 def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | None = None,
               ) -> dict[str, Any]:
-    """Return what a run weighs that is not meshed: a rod on the axis that carries it.
+    """Return the mass of a run that is not meshed, as a rod on the axis that carries it.
 
     ``mass_kg``, ``length_m``, ``centre_m``, ``attached_m`` (the point on the kept axis),
     ``inertia_kg_m2`` about the centre, shape [3, 3], and ``branch``, its run in the skeleton.
@@ -53,7 +53,7 @@ def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | N
     middle = (skeleton.nodes[own] + skeleton.nodes[up]) / 2
     centre = np.average(middle, axis=0, weights=part)
     offset = middle - centre
-    # Each piece is a slender rod: m (r r^T + l l^T / 12) of its middle and its length.
+    # Each piece is a slender rod: m (r r^T + l l^T / 12) with its middle r and its length l.
     second = np.einsum("k,ki,kj->ij", part, offset, offset) + np.einsum(
         "k,ki,kj->ij", part, way, way) / 12
     return {"mass_kg": float(part.sum()), "length_m": float(length.sum()),
@@ -69,7 +69,7 @@ def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: Reconst
         masses: The twigs that are not in the mesh.
         meshed: Mass of the mesh [kg].
         settings: Whether the user accepts it.
-        progress: Gets what the user should know.
+        progress: Receives warnings for the user.
 
     Raises:
         MeshingError: they hold more than 3 % of the mass, and the user did not accept that.
@@ -112,7 +112,7 @@ def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
     for place in np.flatnonzero((one != other) & (overlap > 0)):
         key = tuple(sorted((int(one[place]), int(other[place]))))
         at = skeleton.nodes[pairs[place]].mean(axis=0)
-        # Around the fork that joins them, or that both start from, they overlap as they should.
+        # They overlap as expected around the fork that joins them, or from which both start.
         own = 3 * float(skeleton.radius[start[list(key)]].max())
         if np.linalg.norm(skeleton.nodes[start[list(key)]] - at, axis=1).min() < own:
             continue

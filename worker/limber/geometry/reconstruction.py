@@ -48,12 +48,12 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
 
 Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
-"""Takes in a skeleton as it was found, and all that the search for it came to."""
+"""Receives a skeleton as found, and the full result of the search for it."""
 
 _OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # of cloud.ply, whatever the scan's are
 _LEAVES_ASKED = 0.2  # fraction of points on no round axis, above which leaves are searched for
-# From this fraction of flat points on, shape alone shows leaves. Bare branches seen from one side
-# have up to 0.11, leafy seedlings 0.6 and more.
+# Fraction of flat points from which shape alone shows leaves. Bare branches seen from one side have
+# up to 0.11, leafy seedlings 0.6 and more.
 _MOSTLY = 0.3
 
 
@@ -66,7 +66,7 @@ class MeshedBranch:
         surface: Closed.
         mesh: Marked with material, base, control points and grasp.
         masses: Pruned twigs, see :func:`leave_out_twigs`.
-        numbers: The stage's result as far as it is about them.
+        numbers: Part of the stage's result about them.
     """
 
     skeleton: Skeleton
@@ -78,13 +78,13 @@ class MeshedBranch:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a scan became.
+    """Result of reconstructing a scan.
 
     Attributes:
         alignment: From the scan's coordinates to the branch's.
         cloud: The prepared scan in the branch's frame.
         meshed: Skeleton, surface and tetrahedra.
-        gravity: [m/s^2] in the branch's frame, shape [3].
+        gravity: Gravity [m/s^2] in the branch's frame, shape [3].
         numbers: The stage's result.
     """
 
@@ -103,15 +103,15 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
 
     Args:
         raw: The scan, in the file's unit.
-        settings: How.
+        settings: Settings to use.
         own: The user's own skeleton in the scan's frame [m], instead of ours.
-        edits: What its user changed in the skeleton, in the file's coordinates; those that no
-            longer fit are skipped and reported.
-        eye: Where the depth camera stood [m], shape [3], if the scan is its image.
-        known: What an earlier run found of this scan with these settings, and did not come to use.
+        edits: Changes of the user to the skeleton, in the file's coordinates; those that no longer
+            fit are skipped and reported.
+        eye: Position of the depth camera [m], shape [3], if the scan is its image.
+        known: Result of an earlier run on this scan with these settings that was not used further.
         keep: Receives the alignment, the skeleton and the result of the search as soon as found,
-            before anything that may still refuse it or fail; not what is ``known``.
-        progress: Called as it goes; gets what the user should know.
+            before later steps that may fail or refuse it; not called for ``known``.
+        progress: Called during the work; receives warnings for the user.
 
     Raises:
         InputError: the scan or the skeleton cannot be used. WorkError: the work failed.
@@ -134,7 +134,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     if own is None:
         check_explained(whole, settings.unexplained)
-    # Kept beside the mesh's own, which edits of the skeleton make anew.
+    # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     told = list(prepared.warnings)
     for text in found.warnings_at(alignment.undo):
         told.append(text)
@@ -161,15 +161,15 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
 
 def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
               progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
-    """The skeleton, the part of the scan that it was found of, and the leaves cut off that."""
+    """The skeleton, the part of the scan in which it was found, and the leaves removed from it."""
     found = _skeleton(prepared, settings, own, progress)
     if own is not None or settings.leaves == "keep":
         return found, prepared, []
     if _may_be_leafy(found, prepared, settings):
         wood, leaves = without_leaves(prepared, found=found)
     elif prepared.view is None:
-        # A few fat rods may explain leaves that curl, in few points: what most of a scan is, its
-        # shape tells.
+        # A few fat rods may explain curled leaves of few points, so the shape of most of a scan
+        # decides.
         wood, leaves = without_leaves(prepared, _MOSTLY, found)
     else:
         return found, prepared, []
@@ -199,11 +199,12 @@ def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
 
 
 def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: ReconstructSettings) -> bool:
-    """Whether so much lies on no round axis that leaves are looked for.
+    """Whether so many points are on no round axis that leaves are searched for.
 
-    Leaves can swell the axes until half of what is on them counts as wood: a scan that would be
-    taken is asked too, whatever share its user allows. A depth camera's scatter alone does that
-    without a leaf; 3 mm of noise on branches of 3 mm radius leaves 15 % off the axes.
+    Leaves can thicken the axes until half of the points on them count as wood. So a scan that would
+    be accepted is checked too, whatever fraction its user allows. A depth camera's scatter alone
+    has this effect without a leaf; 3 mm of noise on branches of 3 mm radius leaves 15 % off the
+    axes.
     """
     if found.leafy or (prepared.view is None and unexplained_share(found) > min(
             settings.unexplained, _LEAVES_ASKED)):
@@ -217,7 +218,7 @@ def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: Reconstru
 
 def _with_leaves(prepared: Prepared, leaves: list[Leaf], alignment: Alignment, skeleton: Skeleton,
                  ) -> Cloud:
-    """The whole aligned scan, with ``leaf`` 1 where its points lie on leaves."""
+    """The whole aligned scan, with ``leaf`` 1 where its points are on leaves."""
     turn = np.array(alignment.rotation)
     points = alignment.apply((prepared.cloud.points + prepared.origin) / alignment.scale)
     attributes = dict(prepared.cloud.attributes)
@@ -236,7 +237,7 @@ def _edited(found: SkeletonResult, edits: Sequence[Edit], progress: Progress) ->
 
 
 def gravity_after(alignment: Alignment, up: tuple[float, float, float]) -> np.ndarray:
-    """Return gravity [m/s^2] in the branch's frame, of a file in whose axes ``up`` is up."""
+    """Return gravity [m/s^2] in the branch's frame; ``up`` is up in the file's axes."""
     unit = np.array(up) / np.linalg.norm(up)
     return -STANDARD_GRAVITY * np.array(alignment.rotation) @ unit
 
@@ -286,7 +287,7 @@ def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed
 
 
 def peak_memory_mb() -> float:
-    """Most memory that this process has held [MB]."""
+    """Peak memory of this process [MB]."""
     try:
         import resource
     except ImportError:  # Windows
@@ -305,7 +306,7 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
 
     Args:
         found: The skeleton of the cloud.
-        prepared: The cloud, and where it was seen from.
+        prepared: The cloud, and the view from which it was seen.
         reach: ``silhouette_reach`` of the settings.
     """
     skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
@@ -348,7 +349,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
 
 def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,
              ) -> tuple[Alignment, Cloud, SkeletonResult]:
-    """Move the root to the origin and turn the branch upright."""
+    """Move the root to the origin and rotate the branch upright."""
     root = found.skeleton.nodes[0]
     rotation = upright_rotation(found.skeleton, np.array(settings.up), settings.upright)
     attributes = dict(prepared.cloud.attributes)

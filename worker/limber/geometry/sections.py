@@ -1,7 +1,7 @@
-"""A body drawn as sections along its axis, of width and height, to tetrahedra.
+"""From a body drawn as sections along its axis, of width and height, to tetrahedra.
 
-Not every branch is round, and a beam made for a test is drawn, not scanned: a table has the axis,
-at each place the width and the height of the ellipse across it, and what hangs there.
+Not every branch is round, and a test beam is drawn, not scanned. A table has the axis, at each
+position the width and the height of the ellipse across it, and the mass attached there.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,9 @@ from limber.geometry.tets.tet_mesh import TetMesh
 COLUMNS = ("x", "y", "z", "width", "height")
 MASS = "mass_kg"
 SLICE, SIDES = 5.0, 8 / 3
-"""Length of a slice in half the smaller thickness, over the elements across; corners of a section,
-for each of them."""
+"""Length of a slice for one element across, in half the smaller thickness; corners of a section per
+element across.
+"""
 _UPWARDS = 0.3  # sine of the angle between axis and up, below which the axis has no upper side
 
 
@@ -40,7 +41,7 @@ class Sections:
         axis: Their centres [m], shape [n, 3].
         width: Their thickness sideways [m], shape [n].
         height: Their thickness upwards [m], shape [n].
-        mass: What hangs at each beside the body itself [kg], shape [n].
+        mass: Mass attached at each in addition to the body itself [kg], shape [n].
     """
 
     axis: np.ndarray
@@ -50,12 +51,12 @@ class Sections:
 
     @property
     def radius(self) -> np.ndarray:
-        """Of circles of their areas [m], shape [n]."""
+        """Radii of circles of the same areas [m], shape [n]."""
         return np.sqrt(self.width * self.height) / 2
 
 
 def read_sections(path: Path, unit: str) -> Sections:
-    """Read a table with the columns x, y, z, width, height and perhaps mass_kg.
+    """Read a table with the columns x, y, z, width, height and optionally mass_kg.
 
     Lengths are in ``unit``, or in that of a column's name (``width_mm``).
 
@@ -104,11 +105,11 @@ def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
                   ) -> tuple[MeshedBody, list[dict[str, Any]]]:
     """Sweep tetrahedra along drawn sections and mark base, control points and grasp.
 
-    Width lies across axis and up, height across axis and width; of an axis that starts upwards,
-    width lies along x as far as it can. From there both are carried along without a twist.
+    Width is across axis and up, height across axis and width. If the axis starts upwards, width is
+    along x as far as possible. From there both follow the axis without a twist.
 
     Returns:
-        The body, and the masses that hang on it, as ``point_masses.json`` has them.
+        The body, and the masses attached to it, as in ``point_masses.json``.
     """
     skeleton = Skeleton.from_edges(sections.axis, np.arange(len(sections.axis)) - 1,
                                    sections.radius)
@@ -140,7 +141,8 @@ def _swept(sections: Sections, settings: MeshSurfaceSettings) -> TetMesh:
     upper, across = frames(centres, tangent, _upper(tangent[0], np.array(settings.up)))
     ring = rings(np.zeros_like(centres), np.ones(len(centres)), upper, across, sides,
                  bending_factor(sides))
-    # Squeezed in each direction alone, a polygon keeps the second moments that it has of a circle.
+    # If scaled in each direction separately, a polygon keeps the second moments that it has of a
+    # circle.
     stretched = (np.einsum("nsj,nj->ns", ring, upper)[..., None] * upper[:, None]
                  * height[:, None, None]
                  + np.einsum("nsj,nj->ns", ring, across)[..., None] * across[:, None]

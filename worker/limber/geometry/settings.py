@@ -1,4 +1,4 @@
-"""Settings of what scans and surfaces become; they load nothing heavy."""
+"""Settings of reconstruction from scans and surfaces; this module imports nothing heavy."""
 
 from typing import ClassVar, Literal
 
@@ -7,11 +7,11 @@ from pydantic import Field, field_validator
 from limber.core.settings import Direction, Groups, Settings, possible_density, possible_young
 
 GRASP_FRACTION = 2.0 / 3.0
-"""Where a branch is held, along its main path, if nothing is said."""
+"""Position along the main path at which a branch is held by default."""
 
 
 class PreparationSettings(Settings):
-    """How the cloud is cleaned."""
+    """Settings of the cloud's cleaning."""
 
     groups: ClassVar[Groups] = {
         "input": ("crop_low", "crop_high", "camera_at"),
@@ -51,7 +51,7 @@ class PreparationSettings(Settings):
 
 
 class SkeletonSettings(Settings):
-    """How the skeleton is made."""
+    """Settings of the skeleton."""
 
     groups: ClassVar[Groups] = {
         "shape": ("contraction_points", "attraction", "gap_factor", "bridge_limit",
@@ -91,7 +91,7 @@ class SkeletonSettings(Settings):
 
 
 class MeshSettings(Settings):
-    """How the tetrahedra are made."""
+    """Settings of the tetrahedra."""
 
     groups: ClassVar[Groups] = {
         "mesh": ("mesher", "mesh_sides", "mesh_spacing", "mesh_time_limit", "mesh_memory_limit_mb"),
@@ -111,7 +111,7 @@ class MeshSettings(Settings):
 
 
 class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
-    """Everything that decides what a scan becomes."""
+    """All settings of a scan's reconstruction."""
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
@@ -161,7 +161,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
 
 
 class MeshSurfaceSettings(Settings):
-    """What a closed surface becomes."""
+    """Settings of a closed surface."""
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
@@ -193,7 +193,7 @@ class MeshSurfaceSettings(Settings):
 
 
 class BranchSpec(Settings):
-    """What a generated branch is like and how it is scanned."""
+    """Settings of a generated branch and its scan."""
 
     groups: ClassVar[Groups] = {
         "shape": ("length", "radius_root", "radius_tip", "bend", "fork_count"),

@@ -1,9 +1,9 @@
-"""Branches as likely as the fitted one: axes and radii drawn from what a scan leaves open.
+"""Samples of branches as likely as the fitted one: axes and radii within the scan's uncertainty.
 
-Where a scan's axis runs and how thick the branch is are known to the points' noise, averaged over
-a length of the branch. Errors of neighbouring places go together, and where only one side was
-seen, an axis too near goes with a radius too small: drawn together, all that is kept. Twigs that
-may not be there at all are missing in as many of the shapes as their probability says.
+A scan's axis and the thickness of its branch are known to the points' noise, averaged over a length
+of the branch. Errors of neighbouring positions are correlated, and where only one side was seen, an
+axis too near goes with a radius too small. Drawing them together keeps these correlations. Twigs
+that may not exist are missing in as many of the shapes as their probability implies.
 """
 
 from dataclasses import replace
@@ -19,10 +19,10 @@ from limber.geometry.skeleton.sweep import tangents
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 POINT_LIMIT = 60_000
-"""As many points as the fit itself looks at: more share their errors."""
+"""Most points used, as many as in the fit itself: more share their errors."""
 _LEAST, _MOST = 0.5, 2.0
-# Radius of a twig that is not there, over the fitted one: a shape has the same tetrahedra. What
-# follows shapes to first order, as estimates do, loses 2 (1 - 0.5), all, of the twig's mass.
+# Radius of a missing twig over the fitted one: a shape has the same tetrahedra. Results linear in
+# the shape, such as estimates, lose 2 (1 - 0.5), all, of the twig's mass.
 _MISSING = 0.5
 _LEAST_VOLUME = 0.1  # of a tetrahedron's own, below which its corners go half as far
 _HALVINGS = 30
@@ -32,20 +32,21 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
                      rng: np.random.Generator) -> list[Skeleton]:
     """Draw ``count`` skeletons from the fit's covariance and the twigs' probabilities.
 
-    Nodes move across their axis only; a twig that is not there, and what it carries, is thin.
+    Nodes move only across their axis; a missing twig, and what it carries, is made thin.
 
     Args:
         skeleton: Fitted to the points.
         points: The scan [m], shape [m, 3], in the skeleton's frame.
-        count: How many.
-        rng: Source of what is random.
+        count: Number of skeletons.
+        rng: Random number generator.
     """
     chosen = points[::max(1, -(-len(points) // POINT_LIMIT))]
-    # Fewer points of the same noise hold the axis less firmly than the fit's were.
+    # Fewer points of the same noise hold the axis less firmly than those of the fit.
     matrix, noise = fit_precision(skeleton, chosen)
     factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                   options={"SymmetricMode": True})
-    # Of A = L D L^T, L sqrt(D) times white noise has the covariance A; solved for, its inverse.
+    # With A = L D L^T, L sqrt(D) times white noise has the covariance A; solving instead gives its
+    # inverse.
     pivots = np.sqrt(np.abs(factor.U.diagonal()))
     white = rng.standard_normal((len(pivots), count)) * pivots[:, None]
     coloured = (factor.L @ white)[factor.perm_r]
@@ -57,14 +58,14 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     across = moves[..., :3] - np.einsum("snj,nj->sn", moves[..., :3], along)[..., None] * along
     radius = np.clip(skeleton.radius + moves[..., 3], _LEAST * skeleton.radius,
                      _MOST * skeleton.radius)
-    # Drawn last: where all twigs are sure, shapes are as without them.
+    # Drawn last: where all twigs are certain, shapes are the same as without them.
     radius = np.where(_there(skeleton, count, rng), radius, _MISSING * skeleton.radius)
     return [replace(skeleton, nodes=skeleton.nodes + move, radius=thick)
             for move, thick in zip(across, radius, strict=True)]
 
 
 def _there(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Whether each node's run is there in each draw, shape [count, n]."""
+    """Whether each node's run exists in each draw, shape [count, n]."""
     chance, runs = given_carrier(skeleton), skeleton.runs()
     there = np.ones((count, len(runs)), bool)
     for run, members in enumerate(runs[1:], start=1):
@@ -76,9 +77,9 @@ def _there(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarr
 def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
     """Return a skeleton's mesh moved to another skeleton of the same tree.
 
-    Nodes go with the axis, and away from it as the radius grows; edges stay straight. Where a
-    tetrahedron would turn inside out or nearly vanish (twigs that the scan leaves wide open, side
-    by side at a fork), its corners go a shorter way.
+    Nodes move with the axis, and away from it as the radius grows; edges stay straight. Where a
+    tetrahedron would turn inside out or nearly vanish (uncertain twigs side by side at a fork), its
+    corners move less.
     """
     low, high, share, offset = on_cylinders(skeleton, mesh.nodes)
     moves, growth = other.nodes - skeleton.nodes, other.radius / skeleton.radius - 1

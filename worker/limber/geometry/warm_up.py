@@ -13,7 +13,7 @@ from limber.geometry.surface.tubes import branch_surface
 
 
 def warm_up(progress: Progress = SILENT) -> None:
-    """Fit and surface one fork; about 10 s where nothing is compiled yet."""
+    """Fit and surface one fork; takes about 10 s if nothing is compiled yet."""
     skeleton = Skeleton.from_edges(
         np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.05, 0, 0.15]]),
         np.array([-1, 0, 1, 1]), np.array([0.01, 0.01, 0.01, 0.005]))

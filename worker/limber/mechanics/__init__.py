@@ -1,6 +1,6 @@
 """Mechanics of a branch: finite elements, statics, dynamics, sensitivities.
 
-A beam of 20 cm, its end pushed aside by a centimetre:
+A 20 cm beam whose end is displaced sideways by 1 cm:
 
 >>> from limber.geometry import straight_beam
 >>> from limber.mechanics import BranchModel, Grasp, solve_static

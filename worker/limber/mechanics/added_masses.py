@@ -1,11 +1,11 @@
-"""What hangs on a branch beside its mesh: point masses, and stiff twigs with their own inertia.
+"""Masses on a branch that are not meshed: point masses, and rigid twigs with their own inertia.
 
-A twig that the mesh leaves out moves and turns with the section that carries it: a place p of it is
-at x(c) + F (p - c), with c the middle of an element there and F that element's mean deformation
-gradient. For a turn of any size that is exact, and linear in the nodes' displacements: its weight
-is a constant load (with the moment of its arm), its inertia a constant part of the mass matrix,
-both the same in each axis. The twig is shared out over the elements around its foot, so that it
-couples no nodes that the stiffness does not couple.
+A twig outside the mesh moves and rotates with the section that carries it: a point p of it moves to
+x(c) + F (p - c), with c the centre of an element there and F its mean deformation
+gradient. This is exact for a rotation of any size, and linear in the nodes' displacements. The
+weight of the twig is therefore a constant load (with the moment of its arm), and its inertia a
+constant part of the mass matrix, both the same in each axis. The twig is distributed over the
+elements around its foot, so that it couples no nodes that the stiffness does not couple.
 """
 
 from collections.abc import Iterable
@@ -23,10 +23,10 @@ Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PointMass:
-    """A mass that hangs on the branch (a fruit, a flower).
+    """A point mass on the branch (a fruit, a flower).
 
     Attributes:
-        position: Where [m]; it is tied to the nearest node.
+        position: Position [m]; the mass is tied to the nearest node.
         mass: [kg].
     """
 
@@ -34,25 +34,25 @@ class PointMass:
     mass: float
 
     def heavier(self, factor: float) -> "PointMass":
-        """Return it ``factor`` times as heavy."""
+        """Return the mass times ``factor``."""
         return replace(self, mass=factor * self.mass)
 
 
 @dataclass(frozen=True)
 class HungTwig(PointMass):
-    """A twig that is not meshed: a stiff body that goes with the section it grows from.
+    """A twig that is not meshed: a rigid body that moves with the section it grows from.
 
     Attributes:
-        position: Its centre of mass [m].
-        attached: Where it grows from [m].
-        inertia: About its centre of mass [kg m^2], three rows.
+        position: Centre of mass [m].
+        attached: Point [m] where it grows from the branch.
+        inertia: Inertia about its centre of mass [kg m^2], three rows.
     """
 
     attached: Place
     inertia: tuple[Place, Place, Place]
 
     def heavier(self, factor: float) -> "HungTwig":
-        """Return it ``factor`` times as dense."""
+        """Return the twig with its density times ``factor``."""
         x, y, z = (_scaled(row, factor) for row in self.inertia)
         return replace(self, mass=factor * self.mass, inertia=(x, y, z))
 
@@ -64,14 +64,14 @@ def _scaled(row: Place, factor: float) -> Place:
 
 @dataclass(frozen=True)
 class Tied:
-    """How an added mass goes with the nodes, over the t elements (or one node) that carry it.
+    """How an added mass follows the nodes of the t elements (or the one node) that carry it.
 
     Attributes:
-        added: What is tied.
+        added: The mass.
         nodes: Shape [t, a].
-        share: Of the mass, shape [t].
-        centre: Weights of the nodes' displacements in the centre of mass's, shape [t, a].
-        slopes: Weights of the nodes' displacements in their gradient [1/m], shape [t, 3, a].
+        share: Fraction of the mass, shape [t].
+        centre: Weights of the nodes in the displacement of the centre of mass, shape [t, a].
+        slopes: Weights of the nodes in the displacement gradient [1/m], shape [t, 3, a].
     """
 
     added: PointMass
@@ -81,7 +81,7 @@ class Tied:
     slopes: np.ndarray
 
     def entries(self) -> np.ndarray:
-        """Its part of the mass matrix [kg] of each axis, over ``nodes``, shape [t, a, a]."""
+        """Contribution to the mass matrix of each axis [kg], over ``nodes``, shape [t, a, a]."""
         blocks = self.added.mass * np.einsum("ta,tb->tab", self.centre, self.centre)
         if isinstance(self.added, HungTwig):
             inertia = np.array(self.added.inertia)
@@ -90,7 +90,7 @@ class Tied:
         return self.share[:, None, None] * blocks
 
     def moved(self, displacement: np.ndarray) -> PointMass:
-        """Return it where a displacement of the nodes [m], shape [node_count, 3], takes it."""
+        """Return the mass moved by a displacement of the nodes [m], shape [node_count, 3]."""
         local = displacement[self.nodes]
         way = np.einsum("t,ta,taj->j", self.share, self.centre, local)
         position = np.array(self.added.position) + way
@@ -111,9 +111,9 @@ def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weigh
 
     Args:
         mesh: The branch.
-        added: What hangs on it.
-        gradients: Of the shape functions at rest [1/m], shape [tet_count, q, 3, a].
-        weights: Of the quadrature points [m^3], shape [tet_count, q].
+        added: The masses.
+        gradients: Gradients of the shape functions at rest [1/m], shape [tet_count, q, 3, a].
+        weights: Weights of the quadrature points [m^3], shape [tet_count, q].
         volume_weights: Integrals of the shape functions [m^3], shape [tet_count, a].
 
     Raises:
@@ -142,7 +142,7 @@ def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weigh
 def nodal_masses(ties: Iterable[Tied], count: int) -> np.ndarray:
     """Return the mass that gravity acts on at each node [kg], shape [count].
 
-    With that of twigs goes the moment about their feet: some nodes have less than nothing.
+    The weight of twigs includes its moment about their base, so some nodes have a negative mass.
     """
     total = np.zeros(count)
     for one in ties:
@@ -151,7 +151,7 @@ def nodal_masses(ties: Iterable[Tied], count: int) -> np.ndarray:
 
 
 def mass_entries(ties: Iterable[Tied], count: int) -> sp.csr_matrix:
-    """Return their part of the mass matrix [kg] of each axis, shape [count, count]."""
+    """Return the contribution to the mass matrix of each axis [kg], shape [count, count]."""
     total = sp.csr_matrix((count, count))
     for one in ties:
         width = one.nodes.shape[1]
@@ -162,7 +162,9 @@ def mass_entries(ties: Iterable[Tied], count: int) -> sp.csr_matrix:
 
 
 def _around(mesh: TetMesh, foot: np.ndarray) -> np.ndarray:
-    """The elements of the section around a foot: within an edge's length, at least the nearest."""
+    """Elements of the section around a twig's base: within an edge length, at least the nearest
+    one.
+    """
     distance = np.linalg.norm(mesh.centroids - foot, axis=1)
     nearest = int(distance.argmin())
     corners = mesh.nodes[mesh.tets[nearest, :4]]

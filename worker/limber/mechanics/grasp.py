@@ -1,4 +1,4 @@
-"""A grasp: the patch of nodes that a gripper holds, and poses."""
+"""A grasp (the patch of nodes that a gripper holds) and its poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,40 +13,44 @@ from limber.mechanics.elements.shapes import node_weights
 from limber.mechanics.grip import nodes_between, parts_between
 
 RADIAN = 0.3
-"""What a turn by one radian counts as in distances of poses, as part of the branch's extent:
-chosen, not measured."""
+"""Distance that a rotation by one radian counts as between poses, as a fraction of the branch's
+extent. Chosen, not measured.
+"""
 
 _REACHED = 0.95
-"""Part of a patch's extent within which its centre may be moved: beyond, weights turn negative."""
+"""Fraction of a patch's extent within which its centre may be moved; beyond it, weights become
+negative.
+"""
 _FEWEST_HELD = 3
-"""Nodes that hold a rotation."""
+"""Fewest nodes that fix a rotation."""
 _BESIDE = 1.3
-"""A ring of nodes so many half lengths from a gripper's middle is held where none is nearer."""
+"""Distance from the gripper's middle, in half lengths, up to which a ring of nodes is held if none
+is nearer.
+"""
 _WIDER, _WIDEST = 1.25, 4.0
-"""By how much a patch is widened at a time, and at most."""
+"""Factor by which a patch is widened at a time, and at most."""
 
 
 @dataclass(frozen=True)
 class Grasp:
     """A patch of nodes held by a gripper.
 
-    A grasp is a place on the branch. Which nodes lie within its radius differs from mesh to mesh,
-    and the patch's own centre with it: a few millimetres along a branch change its stiffness by
-    percents. Where the place is known the weights are therefore corrected, as little as possible,
-    until their centre is that place.
+    A grasp is a position on the branch. The nodes within its radius, and so the centre of the
+    patch, differ from mesh to mesh, and a few millimetres along a branch change its stiffness by
+    percents. If the position is known, the weights are therefore corrected as little as possible
+    until their centre is that position.
 
     Attributes:
         nodes: Indices of the patch's nodes, sorted.
-        weights: Parts of a force that the nodes take, shape [k]; they sum to 1. The position of
-            a pinned grasp is the mean of the nodes with these weights, so that force and
-            position are work-conjugate.
-        centre: What a pose is the place of, at rest [m], shape [3]: the patch's weighted centre, or
-            the middle of a gripper that holds a piece of a length, which may lie beside it.
+        weights: Fractions of a force on the nodes, shape [k]; they sum to 1. The position of a
+            pinned grasp is the mean of the nodes with these weights, so that force and position are
+            work-conjugate.
+        centre: Position of the pose at rest [m], shape [3]: the patch's weighted centre, or the
+            middle of a gripper that holds a piece of the branch, which may lie beside it.
         mode: ``clamped``: the patch moves as a rigid body with the pose. ``pinned``: its mean
             position follows the pose, its rotation is free.
-        held: Part of each tetrahedron that is inside a clamping gripper, shape [tet_count], where
-            that is known; the model is to be
-            :meth:`limber.mechanics.model.BranchModel.gripped` then.
+        held: Fraction of each tetrahedron inside a clamping gripper, shape [tet_count], if known;
+            the model must then be :meth:`limber.mechanics.model.BranchModel.gripped`.
     """
 
     nodes: np.ndarray
@@ -57,7 +61,7 @@ class Grasp:
 
     @property
     def rest_pose(self) -> np.ndarray:
-        """Pose [m, rad] of the undeformed branch, shape [6]: the centre, not turned."""
+        """Pose [m, rad] of the undeformed branch, shape [6]: the centre without rotation."""
         return np.concatenate([self.centre, np.zeros(3)])
 
     @classmethod
@@ -65,12 +69,12 @@ class Grasp:
            mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
         """Return the grasp of all nodes within ``radius`` [m] of ``point`` [m], centred on it.
 
-        A radius of 0 takes the nearest node. What is pinned is widened where the mesh is so
-        coarse that its nodes do not surround the place.
+        A radius of 0 takes the nearest node. A pinned patch is widened if the mesh is so coarse
+        that its nodes do not surround the position.
 
         Raises:
-            InputError: no node is there (and the radius is not 0), or the patch touches the
-                fixed base.
+            InputError: no node is within the radius (and the radius is not 0), or the patch touches
+                the fixed base.
         """
         distance = np.linalg.norm(mesh.nodes - np.asarray(point, float), axis=1)
         nodes = np.flatnonzero(distance <= radius) if radius > 0 else distance.argmin()[None]
@@ -84,7 +88,7 @@ class Grasp:
         wider = radius
         while mode == "pinned" and wider < _WIDEST * radius and (
                 np.linalg.norm(grasp.centre - point) > 1e-6 * radius):
-            # A coarse mesh has nodes on one side of the place alone.
+            # A coarse mesh may have nodes on one side of the position only.
             wider *= _WIDER
             nodes = np.flatnonzero(distance <= wider)
             if mesh.point_data.get("fixed", np.zeros(mesh.node_count))[nodes].any():
@@ -95,14 +99,14 @@ class Grasp:
     @classmethod
     def gripping(cls, mesh: TetMesh, point: np.ndarray, half_length: float,
                  least: int = 1) -> "Grasp":
-        """Return the clamped grasp of a gripper that holds a piece of a length, not only nodes.
+        """Return the clamped grasp of a gripper that holds a piece of given length, not only nodes.
 
-        However coarse the mesh: what its nodes leave of that length is in ``held``.
+        It works on coarse meshes: the part of the length without nodes is in ``held``.
 
         Args:
-            point: The gripper's middle [m], on the branch.
-            half_length: Of the piece [m].
-            least: The nearest so many nodes are held where fewer are within.
+            point: Centre of the gripper [m], on the branch.
+            half_length: Half the length of the piece [m].
+            least: Fewest nodes to hold; the nearest ones are taken if fewer are within.
 
         Raises:
             InputError: as :meth:`at`.
@@ -130,7 +134,7 @@ class Grasp:
         """Return the grasp marked in the mesh's point data ``grasp``.
 
         Args:
-            point: The place that is held [m]; None: the patch's own centre.
+            point: Position of the grasp [m]; None: the patch's own centre.
 
         Raises:
             InputError: none is marked.
@@ -149,10 +153,10 @@ class Grasp:
         """Return the grasp of the given nodes.
 
         Args:
-            point: The place that is held [m]; None: the patch's own centre.
+            point: Position of the grasp [m]; None: the patch's own centre.
 
         Raises:
-            InputError: unknown mode, or a node is fixed.
+            InputError: the mode is unknown, or a node is fixed.
         """
         if mode not in ("clamped", "pinned"):
             raise InputError(f"Grasp mode {mode!r} is unknown.",
@@ -170,21 +174,21 @@ class Grasp:
         return cls(nodes, weights, weights @ mesh.nodes[nodes], mode)
 
     def holding(self, mesh: TetMesh, point: np.ndarray, half_length: float) -> "Grasp":
-        """Return the grasp of the same nodes, of a gripper that holds so long a piece.
+        """Return the grasp of the same nodes by a gripper that holds a piece of this length.
 
-        Arguments as of :meth:`gripping`.
+        Arguments as for :meth:`gripping`.
         """
         return replace(self, held=parts_between(mesh, point, half_length))
 
     def elsewhere(self, mesh: TetMesh, point: np.ndarray) -> "Grasp":
-        """Return the grasp of the same nodes where these lie elsewhere, about the same point."""
+        """Return the grasp of the same nodes at other positions, about the same point."""
         grasp = Grasp.of_nodes(mesh, self.nodes, self.mode, point)
-        # How much of each tetrahedron is inside hardly changes.
+        # The fraction of each tetrahedron inside hardly changes.
         return grasp if self.held is None else replace(grasp, held=self.held,
                                                        centre=np.array(point, float))
 
     def key(self) -> tuple[str, bytes, bytes]:
-        """Return what tells constraints of different grasps apart."""
+        """Return a key that distinguishes the constraints of different grasps."""
         return self.mode, self.nodes.tobytes(), self.weights.tobytes()
 
     def displacement(self, rest: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -201,7 +205,7 @@ class Grasp:
         """Return the pose [m, rad] that fits a displaced patch best, shape [6].
 
         Args:
-            rest, displacement: Of all nodes [m], shape [node_count, 3].
+            rest, displacement: Values for all nodes [m], shape [node_count, 3].
         """
         arm = rest[self.nodes] - self.centre
         positions = rest[self.nodes] + displacement[self.nodes]
@@ -215,10 +219,11 @@ class Grasp:
 
     def place_slopes(self, rest: np.ndarray, displacement: np.ndarray, changes: np.ndarray,
                      ) -> np.ndarray:
-        """Return how the pose's place changes with p changes of the displacement, shape [3, p].
+        """Return the change of the pose's position with p changes of the displacement, shape [3,
+        p].
 
         Args:
-            rest, displacement: Of all nodes [m], shape [node_count, 3].
+            rest, displacement: Values for all nodes [m], shape [node_count, 3].
             changes: Shape [node_count, 3, p].
         """
         patch = changes[self.nodes]
@@ -235,10 +240,10 @@ class Grasp:
 
 
 def check_pose(pose: np.ndarray) -> np.ndarray:
-    """Return a pose as float array of shape [6].
+    """Return a pose as a float array of shape [6].
 
     Raises:
-        InputError: wrong shape or not finite.
+        InputError: the shape is wrong, or a value is not finite.
     """
     pose = np.asarray(pose, float)
     if pose.shape != (6,) or not np.isfinite(pose).all():
@@ -249,15 +254,15 @@ def check_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def _centred(weights: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return weights that sum to 1 and whose centre is the grasp's place.
+    """Return weights that sum to 1 and whose centre is the grasp's position.
 
     Args:
-        offset: Of the nodes from that place [m], shape [k, 3]. In directions in which the patch
-            does not reach to both sides of it, the centre stays.
+        offset: Of the nodes from that position [m], shape [k, 3]. In directions in which the patch
+            does not extend to both sides of it, the centre stays.
     """
     centre = weights @ offset
     arm = offset - centre
-    # The weights' change is linear in the place, so their sum stays 1.
+    # The change of the weights is linear in the position, so their sum stays 1.
     variance, axes = np.linalg.eigh((weights[:, None] * arm).T @ arm)
     along = arm @ axes
     wanted = -centre @ axes

@@ -1,11 +1,11 @@
-"""The piece of a branch inside a clamping gripper, on whatever mesh.
+"""The piece of a branch inside a clamping gripper, on any mesh.
 
-Inside its gripper a branch does not bend, and how long that piece is counts: held over 5 mm less, a
-branch is softer by percents, and where little of it is left between gripper and the next point, by
-a half. On a mesh the held nodes end up to an element short of where the gripper does; and where the
-gripper's force and torque lead, no node is held at all. So the tetrahedra in the gripper are as
-stiff as they have to be: of one that is inside with the part p of its length along the branch,
-only the rest bends, which is in series with it: its compliance is 1 - p of the material's.
+A branch does not bend inside the gripper, and the length of that piece matters: held over 5 mm
+less, a branch is softer by several percent, and by a half if the piece between gripper and the next
+point is short. On a mesh the held nodes end up to an element short of the gripper's end; if force
+and torque drive the pull, no node is held at all. The tetrahedra in the gripper are therefore
+made stiffer: of a tetrahedron with the fraction p of its length along the branch inside,
+only the remainder bends, in series with it. Its compliance is 1 - p of the material's.
 """
 
 import numpy as np
@@ -14,19 +14,21 @@ from limber.core.numerics.rigid import principal_axes
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 STIFFEST = 100.0
-"""What is all inside is so much stiffer than its material: of its length a hundredth bends."""
+"""Stiffness factor of elements that are entirely inside: a hundredth of their length bends."""
 _NEAR_RADII, _NEAR_NODES = 4.0, 30
-"""Nodes nearer than so many half lengths, at least so many, tell the branch's axis there."""
+"""Distance in half lengths, and fewest nodes, that define the branch's axis there."""
 _BESIDE = 3.0
-"""What is farther from the axis than so many times its neighbours' mean distance is a twig."""
+"""Distance from the axis, relative to the mean of the neighbours, above which a node belongs to a
+twig.
+"""
 
 
 def parts_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.ndarray:
-    """Return how much of each tetrahedron's length along the branch is in a gripper, [tet_count].
+    """Return the fraction of each tetrahedron's length along the branch in a gripper, [tet_count].
 
     Args:
-        point: The gripper's middle [m], on the branch.
-        half_length: Of the piece that it holds [m].
+        point: Centre of the gripper [m], on the branch.
+        half_length: Half the length of the piece that it holds [m].
     """
     along, is_beside = _placed(mesh, point, half_length)
     corners = mesh.tets[:, :4]
@@ -38,10 +40,10 @@ def parts_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.nd
 
 
 def nodes_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.ndarray:
-    """Return the nodes of what a gripper holds, arguments as of :func:`parts_between`.
+    """Return the nodes that a gripper holds; arguments as for :func:`parts_between`.
 
-    Those halfway along an edge of which only one end is in there are left out: they would hold
-    more of a tetrahedron that the gripper's end cuts than its part inside.
+    Midside nodes of an edge with only one end inside are left out: they would hold more of a
+    tetrahedron cut by the gripper's end than its part inside.
     """
     along, is_beside = _placed(mesh, point, half_length)
     held = (np.abs(along) <= half_length) & ~is_beside
@@ -52,7 +54,9 @@ def nodes_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.nd
 
 
 def _placed(mesh: TetMesh, point: np.ndarray, half_length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where nodes are along the branch's axis at a point [m], and which are not of this branch."""
+    """Positions of nodes along the branch's axis at a point [m], and which nodes belong to another
+    branch.
+    """
     away = mesh.nodes - np.asarray(point, float)
     distance = np.linalg.norm(away, axis=1)
     reach = max(_NEAR_RADII * half_length, np.sort(distance)[min(
@@ -65,6 +69,6 @@ def _placed(mesh: TetMesh, point: np.ndarray, half_length: float) -> tuple[np.nd
 
 
 def stiffening(parts: np.ndarray) -> np.ndarray:
-    """Return by how much tetrahedra with these parts in a gripper are stiffer than their material.
+    """Return the stiffness factors of tetrahedra with these fractions inside a gripper.
     """
     return 1.0 / np.maximum(1.0 - parts, 1.0 / STIFFEST)

@@ -48,9 +48,9 @@ class InternalState:
 
     Attributes:
         force: Internal force on the nodes [N], shape [node_count, 3]; the gradient of ``energy``.
-        tet_energy: Energy of each tetrahedron's strain since the mesh's shape [J], [tet_count].
+        tet_energy: Strain energy of each tetrahedron relative to the mesh's shape [J], [tet_count].
         min_det_f: Smallest determinant of the deformation gradient at a quadrature point.
-        weight_energy: What the weight of a hanging branch adds to the potential [J].
+        weight_energy: Contribution of the weight of a hanging branch to the potential [J].
     """
 
     force: np.ndarray
@@ -64,38 +64,38 @@ class InternalState:
 
     @property
     def energy(self) -> float:
-        """Potential above the mesh's shape [J]: strain and, where it hangs so, its weight."""
+        """Potential above the mesh's shape [J]: strain and the weight of a hanging branch."""
         return self.strain_energy + self.weight_energy
 
 
 class BranchModel:
-    """A branch of tetrahedra: immutable; variants share what the mesh determines.
+    """A branch of tetrahedra. It is immutable; variants share the data that the mesh determines.
 
     Args:
         mesh: Linear or quadratic tetrahedra, positively oriented, in one piece.
-        young: Young's modulus [Pa], a number or one a tetrahedron.
+        young: Young's modulus [Pa], one number or one per tetrahedron.
         poisson: Poisson's ratio, likewise.
         density: Density [kg/m^3], likewise.
         fixed: Fixed nodes, mask [node_count] or indices; default the mesh's point data ``fixed``.
         gravity: Acceleration [m/s^2], or None.
-        material: A law (limber.mechanics.materials), or the name of one.
+        material: A law (:mod:`limber.mechanics.materials`), or the name of one.
         damping: Rayleigh damping, used in dynamics.
         point_masses: Added masses, and twigs (:class:`limber.mechanics.added_masses.HungTwig`).
-        lumped_mass: Diagonal mass matrix instead of the consistent one, but for twigs.
+        lumped_mass: Diagonal mass matrix instead of the consistent one, except for twigs.
 
     Attributes:
         young: Young's modulus of the material [Pa], shape [tet_count].
-        stiffening: By how much a tetrahedron is stiffer than its material, as a gripper holds it
-            (see :meth:`gripped`), shape [tet_count]; 1 without.
+        stiffening: Factor on the stiffness of a tetrahedron that a gripper holds (see
+            :meth:`gripped`), shape [tet_count]; 1 without a gripper.
         lame_lambda, lame_mu: Lamé coefficients [Pa] with the stiffening, shape [tet_count].
-        hanging: How the mesh's shape carries the weight; None where the mesh is the shape without
-            load, which gravity bends. See :meth:`as_scanned`.
+        hanging: How the mesh's shape carries the weight; None if the mesh is the unloaded shape,
+            which gravity bends. See :meth:`as_scanned`.
         gradients, weights: Strain operators at the quadrature points, from
-            limber.mechanics.elements.shapes.
+            :mod:`limber.mechanics.elements.shapes`.
 
     Raises:
-        InputError: elements inverted or flat, several pieces, nodes without tetrahedra, too few
-            fixed nodes, material values out of range.
+        InputError: elements are inverted or flat, the mesh has several pieces or nodes without
+            tetrahedra, too few nodes are fixed, or material values are out of range.
     """
 
     def __init__(self, mesh: TetMesh, *, young: float | np.ndarray, poisson: float | np.ndarray,
@@ -112,7 +112,7 @@ class BranchModel:
         self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
         self.prestress: Prestress | None = None
-        # Not known yet: whatever comes is a change of it.
+        # Not known yet: any value counts as a change.
         self.density = np.zeros(0)
         self.stiffening: np.ndarray | float = 1.0
         self._set(young, poisson, density)
@@ -145,7 +145,7 @@ class BranchModel:
         return self._data.edge
 
     def with_young(self, young: float | np.ndarray) -> "BranchModel":
-        """Return the model with another Young's modulus [Pa], sharing all that stays."""
+        """Return the model with another Young's modulus [Pa], sharing all unchanged data."""
         return self.with_parameters(young=young)
 
     def with_parameters(self, *, young: float | np.ndarray | None = None,
@@ -153,12 +153,12 @@ class BranchModel:
                         density: float | np.ndarray | None = None,
                         damping: RayleighDamping | None = None,
                         gravity: Sequence[float] | None = None) -> "BranchModel":
-        """Return the model with other parameters, sharing what depends on the mesh alone."""
+        """Return the model with other parameters, sharing data that depend on the mesh alone."""
         other = copy.copy(self)
         if damping is not None:
             other.damping = damping
         if gravity is not None:
-            # What carries the weight now is not what carried it on the scan.
+            # The stress that carries the weight now is not the one that carried it during the scan.
             other.gravity, other.prestress = np.asarray(gravity, float), None
         other._set(self.young if young is None else young,
                    self.poisson if poisson is None else poisson,
@@ -166,9 +166,9 @@ class BranchModel:
         return other
 
     def gripped(self, *grasps: Grasp) -> "BranchModel":
-        """Return the model that is as stiff as these clamping grippers hold it, and no others.
+        """Return the model stiffened by these clamping grippers, and no others.
 
-        See :mod:`limber.mechanics.grip`. Pinned grasps, and those of which only the nodes are
+        See :mod:`limber.mechanics.grip`. Pinned grasps, and grasps of which only the nodes are
         known, change nothing.
         """
         held = [grasp.held for grasp in grasps
@@ -186,17 +186,17 @@ class BranchModel:
         other.prestress = None
         other._data = self._data.moved(nodes)
         other._mass = {}
-        # Added masses stay with their nodes, not with the place in space.
+        # Added masses stay with their nodes, not at their positions in space.
         other.point_masses = tuple(one.moved(nodes - self.mesh.nodes) for one in self._ties)
         return other
 
     def as_scanned(self) -> "BranchModel":
         """Return the model that hangs in its mesh's shape: weight acts, and is carried there.
 
-        Weight of what is hung on later bends it further. See :mod:`limber.mechanics.prestress`.
+        The weight of masses added later bends it further. See :mod:`limber.mechanics.prestress`.
 
         Raises:
-            NotPositiveDefiniteError: the mesh cannot bear anything.
+            NotPositiveDefiniteError: the mesh cannot carry any load.
         """
         other = copy.copy(self)
         other.prestress = None
@@ -204,7 +204,7 @@ class BranchModel:
         return other
 
     def linear(self, young: float, poisson: float) -> "BranchModel":
-        """Return the branch of one linear material, without what it carries and what grips it."""
+        """Return the branch of one linear material, without carried weight and grippers."""
         other = copy.copy(self)
         other.prestress, other.stiffening = None, 1.0
         other.material = material_named("linear")
@@ -218,15 +218,15 @@ class BranchModel:
         return other
 
     def with_point_masses(self, masses: Iterable[PointMass]) -> "BranchModel":
-        """Return the model with more masses hanging on it."""
+        """Return the model with more added masses."""
         other = copy.copy(self)
         other.point_masses, other._mass = (*self.point_masses, *masses), {}
         return other
 
     def with_hung_mass(self, factor: float) -> "BranchModel":
-        """Return the model with all that hangs on it ``factor`` times as heavy.
+        """Return the model with all added masses ``factor`` times as heavy.
 
-        A branch that hung as it was scanned carried that too.
+        In a branch that hangs as scanned, the scanned shape carries that weight too.
         """
         other = copy.copy(self)
         other.point_masses = tuple(one.heavier(factor) for one in self.point_masses)
@@ -236,21 +236,21 @@ class BranchModel:
         return other
 
     def without_point_masses(self) -> "BranchModel":
-        """Return the model with nothing hanging on it."""
+        """Return the model without added masses."""
         if not self.point_masses:
             return self
         other = copy.copy(self)
-        # Made once, too: each step of a motion asks for it where the density is sought.
+        # Cached as well: each step of a motion requests it when the density is estimated.
         other.point_masses, other._mass = (), self._mass.setdefault("bare", {})
         if other.prestress is not None:
             other.prestress = replace(other.prestress, added=None, mass_count=0)
         return other
 
     def equations(self, grasps: Sequence[Grasp] = ()) -> Equations:
-        """Return the equations with these grasps held; made once for each set of patches.
+        """Return the equations with these grasps held; cached for each set of patches.
 
         Raises:
-            InputError: a grasp lies in the fixed base, or two overlap.
+            InputError: a grasp is in the fixed base, or two overlap.
         """
         return self._data.equations_of(grasps)
 
@@ -304,12 +304,12 @@ class BranchModel:
 
     def bearing_strain(self, strain: np.ndarray, viscous: Viscous | None = None,
                        lame_pair: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
-        """Return the strain at which Hooke's stress is the law's at ``strain``, [tet_count, q, 6].
+        """Return the strain for which Hooke's stress is the law's at ``strain``, [tet_count, q, 6].
 
-        The kernels take the stress of a law that they do not know in this form.
+        The kernels take the stress of a law that is not compiled in this form.
 
         Args:
-            strain: As of :meth:`strains`.
+            strain: As for :meth:`strains`.
             viscous: Viscous part in motion.
             lame_pair: Lamé coefficients of the stress instead of the model's.
         """
@@ -330,7 +330,7 @@ class BranchModel:
         bearing = hooke_strain(self.material.stress_change(strain, change, lam, mu), lam, mu)
         if viscous is not None:
             bearing = bearing + (viscous.growth - 1) * change
-        # Lamé coefficients that are given leave the weight out.
+        # With given Lamé coefficients the weight is left out.
         return self.with_material("st_venant_kirchhoff").internal(
             displacement, viscous=Viscous(0.0, bearing),
             lame_pair=(self.lame_lambda, self.lame_mu)).force
@@ -344,7 +344,7 @@ class BranchModel:
         return out
 
     def largest_stretch(self, displacement: np.ndarray) -> tuple[float, int]:
-        """Return the largest principal stretch of the mean deformation of an element, and which."""
+        """Return the largest principal stretch of an element's mean deformation, and which."""
         layout = self._data.layout
         stretch, tet = largest_stretch(for_kernels(displacement),
                                        layout.mean_gradients, layout.nodes)
@@ -354,11 +354,11 @@ class BranchModel:
                                   carried: np.ndarray | None = None) -> np.ndarray:
         """Return the largest principal Green-Lagrange strain of each element, [tet_count].
 
-        Of its mean deformation, as :meth:`largest_stretch`; in a millisecond for thousands.
+        From its mean deformation, as :meth:`largest_stretch`; takes a millisecond for thousands.
 
         Args:
-            carried: Strain that carries the weight in the mesh's shape, [tet_count, 6], to be
-                added (limber.mechanics.strain.carried_strain).
+            carried: Strain that carries the weight in the mesh's shape, [tet_count, 6], to be added
+                (:func:`limber.mechanics.strain.carried_strain`).
         """
         layout, out = self._data.layout, np.empty(self.mesh.tet_count)
         largest_principal_strains(for_kernels(displacement), layout.mean_gradients, layout.nodes,
@@ -376,9 +376,9 @@ class BranchModel:
 
     @property
     def weight_stiffness(self) -> sp.csr_matrix | None:
-        """Geometric stiffness of the carried weight [N/m], each axis; None where it carries none.
+        """Geometric stiffness of the carried weight [N/m], each axis; None if no weight is carried.
 
-        At small strains a weight that is carried has no effect.
+        At small strains a carried weight has no effect.
         """
         if self.prestress is None or self.material.is_linear:
             return None
@@ -389,7 +389,7 @@ class BranchModel:
 
     @property
     def weight_force(self) -> np.ndarray:
-        """Weight that the mesh's shape does not carry already [N], shape [node_count, 3]."""
+        """Weight that the mesh's shape does not carry [N], shape [node_count, 3]."""
         if self.prestress is None:
             return self.mass_load[:, None] * self.gravity
         later = nodal_masses(self._ties[self.prestress.mass_count:], self.mesh.node_count)
@@ -397,7 +397,7 @@ class BranchModel:
 
     @property
     def nodal_masses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mass of the branch, and of what hangs on it, at each node [kg]: each [node_count]."""
+        """Mass of the branch, and of the added masses, at each node [kg]: each [node_count]."""
         own = np.bincount(self.mesh.tets.ravel(),
                           (self._data.volume_weights * self.density[:, None]).ravel(),
                           self.mesh.node_count)
@@ -411,7 +411,7 @@ class BranchModel:
 
     @property
     def total_mass(self) -> float:
-        """Mass of the branch with all that hangs on it [kg]."""
+        """Mass of the branch including all added masses [kg]."""
         return float(self.mass_load.sum())
 
     @property
@@ -451,7 +451,7 @@ class BranchModel:
                              "Green wood has 500 to 1100 kg/m3.")
         self.lame_lambda, self.lame_mu = lame(self.young * self.stiffening, self.poisson)
         if changed:
-            # Shared by the models that are made of this one with the same density.
+            # Shared by the models derived from this one with the same density.
             self._mass: dict[str, Any] = {}
         if changed and self.prestress is not None:
             ratio = self.density / before
@@ -459,7 +459,7 @@ class BranchModel:
                             else carried(self))
 
 def product_with(matrix: sp.csr_matrix, field: np.ndarray) -> np.ndarray:
-    """Return a matrix of each axis times a nodal field of shape [node_count, 3]."""
+    """Return the product of a matrix for each axis and a nodal field of shape [node_count, 3]."""
     product = np.empty((matrix.shape[0], 3))
     sparse_times(matrix.indptr, matrix.indices, matrix.data, for_kernels(field), product)
     return product

@@ -1,4 +1,4 @@
-"""One instant of a motion: what dynamics steps through and its derivatives are taken of."""
+"""One instant of a motion: the state for time steps and derivatives."""
 
 from dataclasses import dataclass
 
@@ -12,9 +12,9 @@ class MotionState:
     Attributes:
         time: [s].
         displacement, velocity, acceleration: [m, m/s, m/s^2], shape [node_count, 3].
-        strain, strain_before: At the quadrature points now and a step before (or their
-            derivatives), shape [tet_count, q, 6]; empty where there is no viscosity.
-        step_before: That step [s]; infinite where nothing is known of before.
+        strain, strain_before: Strain at the quadrature points now and one step earlier (or their
+            derivatives), shape [tet_count, q, 6]; empty if there is no viscosity.
+        step_before: Length of that step [s]; infinite if there is no earlier state.
     """
 
     time: float
@@ -26,9 +26,10 @@ class MotionState:
     step_before: float = np.inf
 
     def rate_formula(self, dt: float) -> tuple[float, float, float]:
-        """Return factors [1/s] of the strains next, now and before in the rate after ``dt``.
+        """Return factors [1/s] of the next, current and previous strains in the rate after ``dt``.
 
-        The second-order backward difference for unequal steps; of first order without a past.
+        The second-order backward difference for unequal steps; first-order if there is no previous
+        state.
         """
         ratio = dt / self.step_before
         return ((1 + 2 * ratio) / ((1 + ratio) * dt), -(1 + ratio) / dt,

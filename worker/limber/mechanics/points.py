@@ -13,10 +13,10 @@ _CANDIDATES = 40
 def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
     """Return B, shape [3 m, 3 n], with displacements of the points = B @ displacements.ravel().
 
-    A point inside a tetrahedron moves as its shape functions say. One outside, such as a marker
-    on a stalk, moves with the nearest point inside and turns with the section there: by the mean
-    gradient of the displacement over it, in which the strains of bending cancel. The gradient at
-    the foot itself would stretch the stalk by the strain of the skin.
+    A point inside a tetrahedron moves with its shape functions. A point outside, such as a marker
+    on a stalk, moves with the nearest point inside and rotates with the section there: by the mean
+    gradient of the displacement over the section, in which the strains of bending cancel. The
+    gradient at the foot itself would stretch the stalk by the strain of the skin.
 
     Args:
         mesh: Linear or quadratic tetrahedra at rest.
@@ -33,7 +33,7 @@ def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
 
 
 def nearest_inside(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
-    """Return the places of a mesh that are nearest to points [m], shape [m, 3]."""
+    """Return the points of a mesh that are nearest to given points [m], shape [m, 3]."""
     from trimesh.triangles import closest_point
 
     nearest = np.array(points, float)
@@ -46,11 +46,11 @@ def nearest_inside(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
 
 
 def _stalks(mesh: TetMesh, points: np.ndarray, outside: np.ndarray) -> sparse.csr_matrix:
-    """What the turn of the section adds to a point that lies off it, shape [m, n]."""
+    """Contribution of the section's rotation to a point off the section, shape [m, n]."""
     size = np.linalg.norm(outside, axis=1)
     corners = mesh.nodes[mesh.tets[:, :4]]
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
-    # About the thickness of a slender body.
+    # Approximate thickness of a slender body.
     thickness = float(np.sqrt(volume.sum() / np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
     tree, total = cKDTree(mesh.centroids), sparse.lil_matrix((len(points), mesh.node_count))
     for row in np.flatnonzero(size > 1e-3 * thickness):
@@ -78,7 +78,7 @@ def _slopes(mesh: TetMesh, tets: np.ndarray) -> np.ndarray:
 
 
 def _located(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tetrahedron, barycentric coordinates [m, 4] and what is left outside [m, 3] of each point."""
+    """Tetrahedron, barycentric coordinates [m, 4] and offset from the mesh [m, 3] of points."""
     count = min(_CANDIDATES, mesh.tet_count)
     near = cKDTree(mesh.centroids).query(points, k=count)[1].reshape(len(points), count)
     tets, local, outside = [], [], []

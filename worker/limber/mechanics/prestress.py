@@ -1,27 +1,27 @@
 """A rest shape prestressed by gravity: how the weight acts in later states.
 
-The scanned shape x is an equilibrium: some stress S0 in it carries the weight,
+The scanned shape x is an equilibrium: a stress S0 in it carries the weight,
 
     integral S0 : sym grad v = weight . v      for every displacement v from x.
 
-Taken as the reference, x needs no rest shape. With the Green-Lagrange strain E(u) of what a
-gripper does to it, E = sym grad u + (grad u)^T grad u / 2, the stress is S0 + C : E, and the
-potential energy above the hanging state is
+With x as the reference, no rest shape is needed. With the Green-Lagrange strain E(u) of the
+displacement u that a gripper causes, E = sym grad u + (grad u)^T grad u / 2, the stress is S0 + C :
+E, and the potential energy above the hanging state is
 
     integral C : E : E / 2  +  integral S0 : E  -  weight . u
         = strain energy of E  +  u . G u / 2,       G = integral (grad N)^T S0 grad N,
 
-since the part of S0 that is linear in u balances the weight. All that weight does is the geometric
-stiffness G: a constant, symmetric matrix, the same in each of the three axes. It stiffens what
-hangs and softens what stands. Young's modulus is not in it: whatever the modulus, the branch
-hangs as it was scanned, so estimates need no rest shape either, and no derivative of one.
+since the part of S0 that is linear in u balances the weight. The only effect of the weight is the
+geometric stiffness G: a constant, symmetric matrix, the same in each of the three axes. It stiffens
+a hanging branch and softens an upright one. It does not contain Young's modulus: for any modulus,
+the branch hangs as scanned, so estimates need neither a rest shape nor its derivative.
 
 S0 is that of linear elasticity in a branch of one material. In a branch (a tree of beams)
-equilibrium alone gives the forces and moments of each section, so Young's modulus along it does not
-change them. What is left out is of the order of the strain that the weight causes (0.1 to 1 %):
-against the stress-free shape by inverse statics, which limber.mechanics.statics.rest_shape finds,
-tests hold pulls of a sagging branch to that. Wood that grew while it hung has no stress-free shape
-at all, only S0.
+equilibrium alone determines the forces and moments of each section, so Young's modulus along it
+does not change them. The error is of the order of the strain that the weight causes (0.1 to 1 %).
+Tests check this for pulls of a sagging branch against the stress-free shape by inverse statics,
+from :mod:`limber.mechanics.statics.rest_shape`. Wood that grew while it hung has no stress-free
+shape at all, only S0.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel
 
 _YOUNG, _POISSON = 1e9, 0.35
-"""Of the branch of one material; the modulus cancels, the ratio hardly shows."""
+"""Values for a branch of one material; the modulus cancels, the ratio has almost no effect."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class CarriedWeight:
     Attributes:
         stress: S0 [Pa] at the quadrature points, shape [tet_count, q, 6] (00 11 22 01 02 12).
         stiffness: G [N/m] of each axis, sparse, shape [node_count, node_count].
-        base: What the base exerts on its nodes while the branch hangs [N], [node_count, 3].
+        base: Force of the base on its nodes while the branch hangs [N], [node_count, 3].
     """
 
     stress: np.ndarray
@@ -56,7 +56,7 @@ class CarriedWeight:
     base: np.ndarray
 
     def scaled(self, factor: float) -> "CarriedWeight":
-        """Return what carries ``factor`` times the load."""
+        """Return the prestress that carries ``factor`` times the load."""
         return CarriedWeight(factor * self.stress, factor * self.stiffness, factor * self.base)
 
     def __add__(self, other: "CarriedWeight") -> "CarriedWeight":
@@ -66,12 +66,12 @@ class CarriedWeight:
 
 @dataclass(frozen=True)
 class Prestress:
-    """How the weight of a hanging branch is carried.
+    """The prestress that carries the weight of a hanging branch.
 
     Attributes:
-        own: For the branch's own mass.
-        added: For what hung on it when it was scanned, None for nothing.
-        mass_count: How many of the model's added masses that were.
+        own: Prestress for the branch's own mass.
+        added: Prestress for the masses that hung on it when it was scanned; None: none.
+        mass_count: Number of the model's added masses included.
     """
 
     own: CarriedWeight
@@ -83,15 +83,15 @@ class Prestress:
         return self.own if self.added is None else self.own + self.added
 
     def with_density(self, factor: float) -> "Prestress":
-        """Return the same of a branch ``factor`` times as dense."""
+        """Return the same for a branch ``factor`` times as dense."""
         return replace(self, own=self.own.scaled(factor))
 
 
 def carried(model: "BranchModel") -> Prestress:
-    """Return how a model that is taken to hang in its mesh's shape carries its weight.
+    """Return the prestress of a model that is assumed to hang in its mesh's shape.
 
     Raises:
-        NotPositiveDefiniteError: the mesh cannot bear anything.
+        NotPositiveDefiniteError: the mesh cannot carry any load.
     """
     mesh = model.mesh
     plain = model.linear(_YOUNG, _POISSON)

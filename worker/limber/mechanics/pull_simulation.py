@@ -1,4 +1,4 @@
-"""A pull as settings describe it: the loaded branch, the grasp and its motion."""
+"""A pull as described by settings: the loaded branch, the grasp and its motion."""
 
 
 from collections.abc import Sequence
@@ -25,16 +25,16 @@ from limber.mechanics.settings import Point, SimulateSettings
 from limber.mechanics.statics.solve import solve_static
 
 _PROBE = 1e-6
-"""[N], so little that the branch answers linearly."""
+"""Force [N] small enough that the branch responds linearly."""
 _DEFAULT_BEND = 0.2
-"""Of the way from base to grasp: how far a branch is bent when nothing is asked for; chosen."""
+"""Default bending, as a fraction of the distance from base to grasp. Chosen, not measured."""
 
 
 def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
-    """Return the force across the branch that would bend it by a fifth of its reach [N], shape [3].
+    """Return the transverse force that bends the branch by a fifth of its reach [N], shape [3].
 
-    By the stiffness at rest. A motion along a line invented in space would buckle or stretch a
-    branch, whose length is fixed; under a force it goes where it can.
+    From the stiffness at rest. A motion along an arbitrary line in space would buckle or stretch a
+    branch, whose length is fixed; under a force it moves where it can.
     """
     axis = grasp.centre - model.mesh.nodes[model.fixed].mean(axis=0)
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -50,13 +50,13 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
     """Return the load case that settings request.
 
     Args:
-        model: Of the scan, on which places are given.
-        settings: How to pull.
-        along: The grasp's way instead of a motion of the settings.
-        grasp_point: The place of the marked grasp [m]; None: the patch's own centre.
+        model: Model of the scan, on which positions are given.
+        settings: Settings of the pull.
+        along: The grasp's path instead of a motion of the settings.
+        grasp_point: The position of the marked grasp [m]; None: the patch's centre.
 
     Raises:
-        InputError: options that do not fit. ConvergenceError: the branch finds no rest.
+        InputError: options do not fit. ConvergenceError: no equilibrium of the branch was found.
     """
     def patch(point: Point, mode: Literal["clamped", "pinned"]) -> Grasp:
         if mode == "clamped" and settings.grasp_radius > 0:
@@ -105,7 +105,7 @@ def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> No
 
 def motion_of(case: LoadCase, settings: SimulateSettings,
               progress: Progress = SILENT) -> SimulatedMotion:
-    """Pull, along equilibria or in time."""
+    """Pull, quasi-statically or in time."""
     if settings.kind == "static":
         return static_motion(case, progress)
     scheme: MotionSettings = EnergyMomentumSettings(max_step=settings.step)
@@ -116,9 +116,9 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
 
 
 def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and the part of the pull at each.
+    """Return times [s] and the fraction of the pull at each.
 
-    In motion it starts and ends at rest, and the end is held.
+    In motion it starts and ends at rest, and the end pose is held.
     """
     hold = settings.hold if settings.kind == "dynamic" else 0.0
     count = max(2, round((duration + hold) * settings.frame_rate) + 1)
@@ -128,7 +128,7 @@ def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.n
 
 
 def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
-    """Return the grasp's poses [frames, 6], from where the loaded branch holds it."""
+    """Return the grasp's poses [frames, 6], starting at its pose on the loaded branch."""
     if mode == "pinned":
         pose = np.concatenate([pose[:3], np.zeros(3)])
     return np.hstack([pose[:3] + changes[:, :3], composed(changes[:, 3:], pose[3:])])

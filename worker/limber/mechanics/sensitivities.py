@@ -1,9 +1,9 @@
-"""How displacements and reactions change with the parameters, exactly.
+"""Exact derivatives of displacements and reactions to the parameters.
 
 The internal force is linear in both Lamé coefficients, so its explicit derivative to any material
 parameter is the same kernel with other coefficients. The displacement's derivative solves the
-tangent equations at the converged state; where their factor is of a matrix nearby, each solve is
-refined against the exact directional derivative of the force.
+tangent equations at the converged state. If the factor is that of a nearby matrix, each solve is
+refined with the exact directional derivative of the force.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,24 +20,24 @@ from limber.mechanics.motion_state import MotionState
 from limber.mechanics.statics.result import StaticResult
 
 PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")
-"""What can be differentiated for. ``log_young`` is one column for each column of the weights."""
+"""Parameters for derivatives. ``log_young`` is one column for each column of the weights."""
 
 _REFINEMENTS = 12
-"""Of a solve, at most: a bound, refinement ends at round-off."""
+"""Most refinements of a solve: an upper bound, refinement ends at round-off."""
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Which derivatives are wanted.
+    """The requested derivatives.
 
     Attributes:
-        names: Out of PARAMETERS.
+        names: Names from PARAMETERS.
         weights: Young's modulus of the tetrahedra is ``weights @ young_at_control_points``,
             shape [tet_count, K]; None: one factor on the whole field.
-        control_young: Young's modulus at the control points [Pa], shape [K]; default: solved
-            from the model's field by least squares.
-        shares: Instead of both: d log E of the tetrahedra to each parameter of the field, shape
-            [K, tet_count].
+        control_young: Young's modulus at the control points [Pa], shape [K]; default: least-squares
+            fit to the model's field.
+        shares: Instead of both: derivative of log E of the tetrahedra to each parameter of the
+            field, shape [K, tet_count].
     """
 
     names: tuple[str, ...] = ("log_young",)
@@ -61,9 +61,9 @@ class StaticSensitivities:
     Attributes:
         labels: Name of each of the p columns.
         displacement: [m per parameter], shape [node_count, 3, p].
-        reaction_force: Of the gripper on the branch [N per parameter], shape [3, p], or
+        reaction_force: Force of the gripper on the branch [N per parameter], shape [3, p], or
             [grasps, 3, p] for several.
-        strain_energy: With that of a carried weight [J per parameter], shape [p].
+        strain_energy: Including that of a carried weight [J per parameter], shape [p].
     """
 
     labels: list[str]
@@ -80,9 +80,9 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
     """Differentiate a converged static state.
 
     Args:
-        grasp: As it was solved with.
+        grasp: The grasp of the solve.
         weights, control_young, shares: See :class:`ParameterSet`.
-        parameters: Out of PARAMETERS; the damping ones give 0.
+        parameters: Names from PARAMETERS; the derivatives to damping are 0.
         is_held: Whether the grasp was held at a pose; False for a force.
     """
     wanted = ParameterSet(checked_names(parameters), weights, control_young, shares)
@@ -95,7 +95,7 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(u, direction)
 
-    # One that was factorised as it is needs no refinement.
+    # A tangent factorised at this state needs no refinement.
     columns = (tangent.solve_all([-partial for partial in explicit])
                if tangent.is_positive_definite
                else [refined_solve(tangent, force, -partial) for partial in explicit])
@@ -113,13 +113,13 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
 
 @dataclass(frozen=True)
 class GraspSlopes:
-    """How a branch in a clamped grasp changes with the grasp's pose.
+    """The derivatives of a branch in a clamped grasp to the grasp's pose.
 
     Columns are position [m] and rotation [rad, about the axes of the branch's frame].
 
     Attributes:
-        wrench: Of force [N] and torque [N m] about the moved pose, shape [6, 6].
-        displacement: Of all nodes [m], shape [node_count, 3, 6].
+        wrench: Derivatives of force [N] and torque [N m] about the moved pose, shape [6, 6].
+        displacement: Derivatives of the displacement of all nodes [m], shape [node_count, 3, 6].
     """
 
     wrench: np.ndarray
@@ -127,7 +127,7 @@ class GraspSlopes:
 
 
 def grasp_slopes(model: BranchModel, grasp: Grasp, displacement: np.ndarray) -> GraspSlopes:
-    """Differentiate a state to the pose of the clamped grasp that holds it.
+    """Differentiate a state with respect to the pose of the clamped grasp that holds it.
 
     Args:
         model: In equilibrium at ``displacement`` [node_count, 3].
@@ -165,7 +165,7 @@ def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
         left = equations.free_part(right - force(solution))
         norm = float(np.linalg.norm(left))
         if norm <= tolerance * scale or norm >= 0.5 * last:
-            # Round-off is reached, or the factor is too far away to get nearer.
+            # Round-off is reached, or the factor is too far from the tangent to improve further.
             break
         last = norm
         solution = solution + tangent.solve(left)
@@ -174,7 +174,7 @@ def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
 
 def lame_changes(model: BranchModel, wanted: ParameterSet,
                  ) -> list[tuple[np.ndarray, np.ndarray] | None]:
-    """Return for each column the derivative of the Lamé coefficients, None where they stay."""
+    """Return for each column the derivative of the Lamé coefficients; None if they are constant."""
     changes: list[tuple[np.ndarray, np.ndarray] | None] = []
     for name in wanted.names:
         if name == "log_young":
@@ -207,13 +207,13 @@ def young_shares(model: BranchModel, wanted: ParameterSet) -> np.ndarray:
 def explicit_forces(model: BranchModel, wanted: ParameterSet, displacement: np.ndarray, *,
                     motion: MotionState | None = None,
                     viscous: Viscous | None = None) -> list[np.ndarray]:
-    """Return the derivative of internal and inertial force less load, the motion held.
+    """Return the derivative of internal and inertial force less load, at fixed motion.
 
     Each of shape [node_count, 3] [N per parameter].
 
     Args:
         displacement: [m], shape [node_count, 3].
-        motion: The instant of a motion that it belongs to; None: equilibrium.
+        motion: The instant of a motion; None: equilibrium.
         viscous: The viscous part of that instant.
     """
     changes, partials = lame_changes(model, wanted), []
@@ -233,7 +233,7 @@ def explicit_forces(model: BranchModel, wanted: ParameterSet, displacement: np.n
 
 def viscous_force(model: BranchModel, displacement: np.ndarray,
                   strain: np.ndarray) -> np.ndarray:
-    """Return the nodal forces [N] of the stress that belongs to ``strain`` [tet_count, q, 6]."""
+    """Return the nodal forces [N] of the stress for ``strain`` [tet_count, q, 6]."""
     return (model.internal(displacement, viscous=Viscous(1.0, strain)).force
             - model.internal(displacement).force)
 
@@ -243,7 +243,7 @@ def _density_force(model: BranchModel, displacement: np.ndarray,
     bare = model.without_point_masses()
     force = -bare.weight_force
     if bare.weight_stiffness is not None:
-        # What carries the weight grows with it.
+        # The prestress that carries the weight is proportional to it.
         force = force + product_with(bare.weight_stiffness, displacement)
     if motion is not None:
         force = force + bare.mass_times(
@@ -264,14 +264,14 @@ def _damping_force(model: BranchModel, name: str, motion: MotionState,
 
 def explicit_energies(model: BranchModel, wanted: ParameterSet,
                       displacement: np.ndarray) -> np.ndarray:
-    """Return the derivative of the strain energy [J per parameter] at a held displacement."""
+    """Return the derivative of the strain energy [J per parameter] at a fixed displacement."""
     return np.array([0.0 if change is None
                      else model.internal(displacement, lame_pair=change).strain_energy
                      for change in lame_changes(model, wanted)])
 
 
 def reactions(grasps: Sequence[Grasp], out: np.ndarray) -> np.ndarray:
-    """Return the force on each grasp [N], shape [grasps, 3], of forces ``out`` on all nodes."""
+    """Return the force on each grasp [N], shape [grasps, 3], from forces ``out`` on all nodes."""
     return np.array([
         grasp.weights @ out[grasp.nodes] / (grasp.weights @ grasp.weights)
         if grasp.mode == "pinned" else out[grasp.nodes].sum(axis=0)
@@ -282,7 +282,7 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     """Return the names as a tuple.
 
     Raises:
-        InputError: one is not in PARAMETERS.
+        InputError: a name is not in PARAMETERS.
     """
     for name in names:
         if name not in PARAMETERS:

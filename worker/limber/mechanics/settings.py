@@ -1,4 +1,4 @@
-"""Settings of a simulated pull; they load nothing heavy."""
+"""Settings of a simulated pull, without heavy imports."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -14,7 +14,7 @@ PlacedMass = tuple[float, float, float, float]
 
 
 class SimulateSettings(Settings):
-    """Options of `limber simulate`; with no motion and no force, one that bends it a little."""
+    """Options of `limber simulate`; without motion and force, it bends the branch a little."""
 
     groups: ClassVar[Groups] = {
         "output": ("name", "frame_rate", "vtu"),

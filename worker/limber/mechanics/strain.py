@@ -15,7 +15,7 @@ _NEAR_STRESS = 0.3  # less: the norm is taken of the stress before it is turned 
 
 @dataclass(frozen=True)
 class Place:
-    """A value and where it is: tetrahedron and rest position of its centroid [m]."""
+    """A value and its location: tetrahedron and rest position of its centroid [m]."""
 
     value: float
     tet: int
@@ -23,21 +23,21 @@ class Place:
 
     @property
     def at(self) -> str:
-        """In words."""
+        """Text with the location."""
         return "at ({:.3f}, {:.3f}, {:.3f}) m".format(*self.position)
 
 
 @dataclass(frozen=True)
 class StrainState:
-    """Mean over each tetrahedron, shape [tet_count] or [tet_count, 3].
+    """Means over each tetrahedron, shape [tet_count] or [tet_count, 3].
 
-    Strain and stress of a branch that hangs as it was scanned include those that carry its weight.
+    Strain and stress of a branch that hangs as scanned include those that carry its weight.
 
     Attributes:
-        energy_density: Strain energy density [J/m^3], of the strain since the model's mesh.
+        energy_density: Strain energy density [J/m^3], of the strain relative to the model's mesh.
         principal_strain: Principal Green-Lagrange strains, ascending.
         principal_stress: Principal Cauchy stresses [Pa], ascending.
-        det_f: Volume relative to that at rest, at the quadrature point where it is least.
+        det_f: Volume relative to that at rest, at the quadrature point with the smallest.
     """
 
     energy_density: np.ndarray
@@ -71,17 +71,17 @@ def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
 
 def peak_load(model: BranchModel, displacement: np.ndarray) -> tuple[float, int, float]:
     """Return the largest principal strain by magnitude, its tetrahedron, and the largest principal
-    stress by magnitude [Pa]: those of :func:`strain_state`, a tenth of the time.
+    stress by magnitude [Pa]: the same as from :func:`strain_state`, in a tenth of the time.
 
     A symmetric tensor's largest principal value is at least its norm over the root of 3: only
-    tetrahedra whose norm comes near the largest are looked at closely.
+    tetrahedra whose norm is near the largest are evaluated.
     """
     part = model.weights / model.weights.sum(axis=1, keepdims=True)
     green = np.einsum("eq,eqk->ek", part, model.strains(displacement))
     carried = carried_strain(model)
     strain = green if carried is None else green + carried
     stress = hooke_stress(strain, model.lame_lambda, model.lame_mu)
-    # A law from outside may be far from Hooke's: all of its tetrahedra are looked at.
+    # An external law may differ greatly from Hooke's, so all of its tetrahedra are evaluated.
     near = np.full(len(strain), not model.material.is_compiled)
     for size, enough in ((_norms(strain), _NEAR_STRAIN), (_norms(stress), _NEAR_STRESS)):
         near |= size >= enough * size.max()
@@ -123,7 +123,8 @@ def strain_of(model: BranchModel, stress: np.ndarray, tets: np.ndarray | slice =
 
 def carried_strain(model: BranchModel) -> np.ndarray | None:
     """Return the mean strain that carries the weight on the scan, [tet_count, 6] (00 11 22 01 02
-    12), None for a branch that carries none there."""
+    12); None if no weight is carried there.
+    """
     if model.prestress is None:
         return None
     part = model.weights / model.weights.sum(axis=1, keepdims=True)

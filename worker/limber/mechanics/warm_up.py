@@ -11,10 +11,11 @@ from limber.mechanics.sensitivities import ParameterSet
 
 
 def warm_up(progress: Progress = SILENT) -> None:
-    """Go through statics, motion and derivatives with one tetrahedron.
+    """Run statics, motion and derivatives with one tetrahedron.
 
-    That calls every kernel as users' branches do; the compiled code stays in the user's cache
-    folder. About a minute where nothing is compiled yet, under two seconds afterwards.
+    It calls every kernel with the same types as users' branches; the compiled code stays in the
+    user's cache folder. It takes about a minute if nothing is compiled yet, and under two seconds
+    afterwards.
     """
     corners = 0.01 * np.vstack([np.zeros(3), np.eye(3)])
     mesh = TetMesh(corners, np.array([[0, 1, 2, 3]])).quadratic()
@@ -24,6 +25,6 @@ def warm_up(progress: Progress = SILENT) -> None:
                             fixed=np.array([0, 1, 2]))
         simulate_dynamics(model, times=np.array([0.0, 0.01]), sensitivities=ParameterSet())
     rest = np.zeros_like(mesh.nodes)
-    # Nothing is solved for forces that are 0.
+    # Zero forces are not solved for.
     model.equations().tangent(model, rest).solve_all(3 * [rest + 1.0])
     progress(1.0, "compiling kernels")

@@ -17,7 +17,7 @@ from limber.recordings.masks import read_mask, segment_by_depth
 from limber.recordings.recording import Observations, Pull
 
 CAMERA_OFFSET_M = 4e-3
-"""A camera pose that is off by more at the branch is corrected, with a warning [m]."""
+"""Error of a camera pose at the branch above which it is corrected, with a warning [m]."""
 LASTING_SIGMA_M = 2e-4
 """How far a tube of the skeleton's radii stands beside the branch [m]: a share of a point's error
 that is alike in all frames of one bend. A tracker's covariance, right frame by frame, lacks it."""

@@ -7,7 +7,7 @@ from limber.geometry.cloud.camera import Camera, project
 
 
 def render_depth(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Draw triangles into a depth image without noise; pixels that see nothing are 0.
+    """Render triangles into a depth image without noise; empty pixels are 0.
 
     Args:
         camera: Intrinsics and pose.

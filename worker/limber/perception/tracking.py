@@ -26,7 +26,7 @@ SEEN_SHARE = 0.01
 PIECES = 80
 """Pieces of the curve whose points' errors are taken to be independent of the next one's."""
 MODEL_SIGMA_M = 5e-5
-"""How well a tube of the skeleton's radii stands for the branch [m]; added to the covariance."""
+"""Error of a tube of the skeleton's radii as a model of the branch [m]; added to the covariance."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class CurveTracker:
               anchor: Anchor | None = None) -> TrackedFrame:
         """Fit the curve to a cloud, starting from the frame ``before`` (None: rest).
 
-        A cloud of under 10 points leaves the curve where it was, nothing visible.
+        With fewer than 10 points the curve stays where it was, with nothing visible.
         """
         curve = before or self.rest.start()
         cloud = self.thinned(cloud)
@@ -110,7 +110,7 @@ class CurveTracker:
         return TrackedFrame(curve.at(self.arcs), covariance, support >= 5, share, curve)
 
     def thinned(self, cloud: SeenCloud) -> SeenCloud:
-        """Return a random choice of a cloud's points, where it has more than needed."""
+        """Return a random selection of a cloud's points if it has more than needed."""
         count = len(cloud.points)
         if count <= self._point_limit:
             return cloud

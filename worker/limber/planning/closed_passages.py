@@ -1,9 +1,10 @@
-"""A proof that no path exists, put to the full model.
+"""Check of a proof that no path exists on the full model.
 
-The proof is of the field with its error counted, and that error was measured at other places. So
-before it is passed on, the branch is solved where cells close the way: at those that are least over
-a limit, along the border of what the start reaches. Where the full model keeps the limits there, or
-is farther from the field than its error, the proof does not hold, and what was found is learnt.
+The proof is about the field including its error, and that error was measured at other positions. So
+before the proof is passed on, the branch is solved where cells block the path: at those least over
+a limit, along the border of the region reached from the start. If the full model keeps the limits
+there, or differs from the field by more than its error, the proof does not hold, and the states
+found become samples.
 """
 
 from dataclasses import dataclass, replace
@@ -28,13 +29,13 @@ _LEARNT_APART = 0.5 * _APART
 
 @dataclass(frozen=True)
 class WallCheck:
-    """What the full model says where a way is closed.
+    """Full-model result where a path is blocked.
 
     Attributes:
         solved: How many states have a solution.
-        bears_out: Whether these states bear the proof out; also where no limit closes the way, but
-            the border of the sampled region does.
-        learnt: The states of a proof that they do not bear out, as samples.
+        bears_out: Whether these states confirm the proof; also true if no limit blocks the path,
+            but the border of the sampled region does.
+        learnt: The states as samples, if they do not confirm the proof.
     """
 
     solved: int
@@ -44,10 +45,10 @@ class WallCheck:
 
 def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: NoWayError, *,
                  workers: int | None = None, progress: Progress = SILENT) -> WallCheck:
-    """Solve the branch where ``none`` says that the way is closed.
+    """Solve the branch where ``none`` states that the path is blocked.
 
     A pose without a solution is closed as well: the branch cannot be there. Without any solution
-    nothing is borne out.
+    nothing is confirmed.
     """
     places = _chosen(none.wall)
     if not len(places):
@@ -68,8 +69,9 @@ def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, no
 
 
 def _chosen(wall: np.ndarray) -> np.ndarray:
-    """Return places [k, 3] of a wall [n, 3], the first of it first, each apart from the others;
-    half of them those that come first, half those far from all before."""
+    """Return places [k, 3] of a wall [n, 3], its first one first, each apart from the others; half
+    of them the earliest ones, half those far from all before.
+    """
     chosen: list[np.ndarray] = []
     for place in wall:
         if len(chosen) == _STATES // 2:
@@ -101,7 +103,7 @@ def _contradicts(field: EnergyField, limits: Limits, samples: GraspSamples) -> n
 
 
 def confirmed(none: NoWayError, check: WallCheck) -> NoWayError:
-    """Return the error, saying that the full model bears it out."""
+    """Return the error, stating that the full model confirms it."""
     if not check.solved:
         return none
     return NoWayError(none.seen, f"{none.why} {check.solved} states of the full model, where the "
@@ -109,8 +111,9 @@ def confirmed(none: NoWayError, check: WallCheck) -> NoWayError:
 
 
 def not_confirmed(limits: Limits, easiest: EasiestWay | None) -> NoWayError:
-    """Return the error of a proof that the full model does not bear out; ``easiest`` is the way
-    that goes least over the limits."""
+    """Return the error of a proof that the full model does not confirm; ``easiest`` is the path
+    that exceeds the limits least.
+    """
     least = "" if easiest is None or easiest.worst <= 1.0 else (
         f" By the field the easiest way takes {100.0 * easiest.worst:.0f} % of a limit, within its "
         "error.")

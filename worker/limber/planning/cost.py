@@ -1,13 +1,13 @@
 """The cost of a path, and the comparison of two paths.
 
-The paper's edge cost (its eq. 5) adds deformation and distance. Summing the energy over waypoints,
-as a literal reading has it, depends on their spacing and lets a planner win by long edges; so
+The paper's edge cost (its eq. 5) adds deformation and distance. Taken literally, summing the energy
+over waypoints depends on their spacing and lets a planner win by long edges; so
 
     J = a_def * integral E ds / (E0 L0) + a_dis * integral ds / L0
 
-with ``E0`` the peak energy and ``L0`` the length of the straight line: dimensionless, additive,
-the same however an edge is divided. Limits on energy and force are part of validity, not of cost:
-a branch breaks by the peak, not by the integral.
+with ``E0`` the peak energy and ``L0`` the length of the straight line. It is dimensionless,
+additive, and independent of how an edge is divided. Limits on energy and force are part of
+validity, not of cost: a branch breaks by the peak, not by the integral.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from limber.core.numerics.compiled import compiled
 from limber.planning.field.energy_field import EnergyField, allowed_at, energy_at
 
 STEP = 0.005
-"""Longest distance between points where an edge is evaluated [m]; also the paper-like spacing."""
+"""Longest distance between evaluation points of an edge [m]; also the paper-like spacing."""
 
 
 class EdgeWeights(NamedTuple):
@@ -33,8 +33,9 @@ class EdgeWeights(NamedTuple):
 
 @dataclass(frozen=True)
 class CostWeights:
-    """The weights ``a_def`` and ``a_dis``, both without unit, and the scales ``E0`` [J], ``L0``
-    [m]. The baseline RRT* is ``a_def = 0``, ``a_dis = 1``."""
+    """The dimensionless weights ``a_def`` and ``a_dis``, and the scales ``E0`` [J], ``L0`` [m]. The
+    baseline RRT* is ``a_def = 0``, ``a_dis = 1``.
+    """
 
     deformation: float
     distance: float
@@ -113,7 +114,7 @@ def resample(path: np.ndarray, spacing: float) -> np.ndarray:
 def edge_cost(start, stop, field, weights):
     """Return the cost of the straight edge; infinite if any of it is not allowed.
 
-    Midpoint rule at ``weights.step`` or finer; ``stop`` is checked, ``start`` taken as checked.
+    Midpoint rule at ``weights.step`` or finer; ``stop`` is checked, ``start`` is assumed checked.
     """
     length = np.sqrt(np.sum((stop - start) ** 2))
     pieces = max(int(np.ceil(length / weights.step)), 1)

@@ -1,7 +1,7 @@
 """The shortest and the gentlest path on the energy field, then both on the full model.
 
-The field serves to search. Every energy, force and strain that is reported comes from the finite
-elements along the found paths; how far the field was off is reported beside them.
+The field is used for the search only. All reported energies, forces and strains are computed by
+finite elements along the paths found; the error of the field is reported beside them.
 """
 
 from collections.abc import Mapping
@@ -48,10 +48,10 @@ class PlannedMotion:
     Attributes:
         summary: The stage's result.
         baseline, plan: The shortest path (RRT*), and the gentle one.
-        field: With what was learnt from plans that were refused.
-        trees: What the planners with a tree searched, by their name.
+        field: Field including the states learnt from refused plans.
+        trees: Search trees of the planners that grow one, by their name.
         pace: How fast the motion may be.
-        to_go: What a path from anywhere costs at least; None where no bound was asked for.
+        to_go: Lower bound on the cost of a path from any position; None if no bound was requested.
     """
 
     summary: dict[str, Any]
@@ -69,25 +69,26 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
                 workers: int | None = None, progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
-    ``limits`` are the settings' where not given; those of a robot's cell come in this way, and
-    what its camera sees or its second arm reaches as ``cell``. With ``doubt`` the limits are kept
-    with the settings' confidence: planned is with tighter ones.
+    ``limits`` are the settings' if not given; they carry the limits of a robot's cell, and ``cell``
+    what its camera sees or its second arm reaches. With ``doubt``, the limits are kept with the
+    settings' confidence: the plan uses tighter ones.
 
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
-    on: the states found there join the field's samples and it is planned anew, at most
-    ``settings.replans`` times. So is one along which the field is too far off to have been the
-    gentlest; the last of those is passed on with a warning. Where no path keeps the limits on the
-    field, and its error leaves that in doubt, the states along the way that comes nearest join the
-    samples likewise (:mod:`limber.planning.undecided_passages`). And so is a motion that breaks a
-    limit by the branch's inertia, however slow it was tried.
+    on: the states found there join the field's samples and the plan is repeated, at most
+    ``settings.replans`` times. The same holds for a plan along which the field's error is too large
+    for it to be the gentlest; the last of those is passed on with a warning. If no path keeps the
+    limits on the field, and its error leaves that undecided, the states along the path that comes
+    nearest join the samples likewise (:mod:`limber.planning.undecided_passages`). The same holds
+    for a motion that breaks a limit by the branch's inertia at any pace tried.
 
     Cancelled (or by Ctrl-C) while the bound closes, it takes the best path so far, which is checked
-    as any other; ``stopped`` in the summary says so.
+    as any other; ``stopped`` in the summary records this.
 
     Raises:
         Cancelled: before there was a path, or the best so far breaks a limit.
         InputError: the start is not allowed, or two goals are given.
-        NoPathError: no path, or none that keeps the limits on the full model; says why and where.
+        NoPathError: there is no path, or none that keeps the limits on the full model; states why
+        and where.
         ConvergenceError: the branch cannot be solved along the shortest path.
     """
     own = Limits.of(settings)
@@ -110,13 +111,13 @@ class _Rounds:
     """Rounds of planning on the field, checking on the full model, and learning from it.
 
     Attributes:
-        limits, goal: As asked for.
-        field: With what was learnt so far.
-        aim, planned_limits: What is planned with: the goal and the limits as far tighter as what
-            was planned before fell short of them.
+        limits, goal: As requested.
+        field: Field including the states learnt so far.
+        aim, planned_limits: Goal and limits for planning, tightened by the amounts that earlier
+            plans missed them by.
         pair: The last paths on the field; ``plan`` and ``baseline`` on the full model.
-        risks, moving: Of the plans that came so far: their risks, and the last in time.
-        told: A row for each round.
+        risks, moving: Of the plans so far: their risks, and the last one's motion in time.
+        told: One row per round.
     """
 
     grasp_model: GraspModel
@@ -140,7 +141,7 @@ class _Rounds:
     told: list[dict[str, Any]] = fresh(default_factory=list)
 
     def plan_once(self, ahead: Progress, is_last: bool) -> bool:
-        """Plan and check; return whether the plan may be passed on. Else something was learnt."""
+        """Plan and check; return whether the plan may be passed on. If not, samples were added."""
         began, before = perf_counter(), self.pair
         pair = self._planned(ahead, is_last)
         if pair is None:
@@ -170,10 +171,10 @@ class _Rounds:
         return False
 
     def _planned(self, ahead: Progress, is_last: bool) -> PathPair | None:
-        """Return paths on the field; None where poses were added instead.
+        """Return paths on the field; None if poses were added instead.
 
         Raises:
-            NoWayError: none was found, or none exists and the full model bears it out.
+            NoWayError: none was found, or none exists and the full model confirms it.
         """
         try:
             return plan_within(self.field, self.start, self.aim, self.settings,
@@ -193,10 +194,10 @@ class _Rounds:
             return None
 
     def _closed(self, none: NoWayError, is_last: bool, ahead: Progress) -> None:
-        """Pass on that there is no way, or learn what speaks against it.
+        """Pass on that there is no path, or learn evidence against it.
 
         Raises:
-            NoWayError: nothing does, or there is no round left.
+            NoWayError: no evidence against it was found, or no round is left.
         """
         if none.is_proven:
             ahead(0.0, "checking on the full model where the way is closed")
@@ -218,7 +219,7 @@ class _Rounds:
     def _solved(self, before: PathPair | None, pair: PathPair, ahead: Progress) -> ResolvedPath:
         """Return the plan on the full model, and keep the baseline there."""
         ahead(0.3, "both paths on the full model")
-        # The shortest path rarely changes with what was learnt: it is solved once.
+        # The shortest path rarely changes with new samples: it is solved once.
         same = before is not None and np.array_equal(before.baseline.points, pair.baseline.points)
         paths = [pair.plan.points] + [pair.baseline.points] * (not same)
         # A refined path has points closer together, so that its chords follow the shell.
@@ -229,8 +230,9 @@ class _Rounds:
         return plan
 
     def _broken(self, plan: ResolvedPath, is_near: bool, ahead: Progress) -> list[str]:
-        """Return what a plan breaks, standing still, with other moduli, or in motion; the next is
-        planned with limits that are so much tighter."""
+        """Return the limits that a plan breaks, at standstill, with other moduli, or in motion; the
+        next one is planned with limits tightened accordingly.
+        """
         broken = broken_on_full_model(plan, self.limits, self.goal, self.grasp_model.mesh.nodes)
         if plan.is_whole:
             self.aim = self.aim.drawn_in(plan.solved)
@@ -252,7 +254,7 @@ class _Rounds:
         return broken
 
     def _unfit_end(self, plan: ResolvedPath) -> list[str]:
-        """Return why the plan's end does not do, where it does not: the next ends elsewhere."""
+        """Return why the plan's end is not valid, if so: the next one ends elsewhere."""
         try:
             self.goal.require_end(self.grasp_model, plan.solved)
         except NoPathError as error:
@@ -264,7 +266,7 @@ class _Rounds:
             {name: _RESERVE * share for name, share in excess.items() if share > 1.0})
 
     def found(self) -> PlannedMotion:
-        """Return the last plan with all that is said of it, and warn of what is in doubt."""
+        """Return the last plan with all its results, and warn of what is uncertain."""
         pair, plan = present(self.pair, "paths on the field"), present(self.plan, "plan")
         baseline = present(self.baseline, "shortest path").require()
         self.goal.require_end(self.grasp_model, plan.solved)
@@ -293,7 +295,7 @@ class _Rounds:
 
 def _knowing(field: EnergyField, grasp_model: GraspModel, limits: Limits, workers: int | None,
              progress: Progress) -> EnergyField:
-    """Return the field that knows what the constraints are on.
+    """Return the field with the constraints' quantities as loads.
 
     Raises:
         NoPathError: one is broken where the branch hangs.

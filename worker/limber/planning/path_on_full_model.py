@@ -24,15 +24,15 @@ class SolvedPoses:
     Attributes:
         poses: Positions [m] and natural rotations [rad], shape [n, 6].
         energies: Potential of strain and weight above the hanging state [J], shape [n].
-        forces, torques: Of the gripper on the branch [N, Nm], shape [n, 3].
+        forces, torques: Force and torque of the gripper on the branch [N, Nm], shape [n, 3].
         strains: Largest principal Green-Lagrange strain anywhere in the branch, shape [n].
-        strain_places: Where, in the rest shape [m], shape [n, 3].
+        strain_places: Position of that strain in the rest shape [m], shape [n, 3].
         stresses: Largest principal Cauchy stress by magnitude [Pa], shape [n].
         min_det_f: Least determinant of the deformation gradient, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].
         targets: Positions of the named targets [m], shape [n, targets, 3].
-        axial_forces: Part of the forces along the branch, outward [N], shape [n].
-        displacements: Of all nodes [m], shape [n, node_count, 3].
+        axial_forces: Component of the forces along the branch, outward [N], shape [n].
+        displacements: Displacements of all nodes [m], shape [n, node_count, 3].
     """
 
     poses: np.ndarray
@@ -50,7 +50,7 @@ class SolvedPoses:
 
     @classmethod
     def of(cls, grasp_model: GraspModel, results: list[StaticResult]) -> "SolvedPoses":
-        """Return what solutions say."""
+        """Return the states of solutions."""
         moved = [result.displacement for result in results]
         strains, places, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
         return cls(
@@ -75,7 +75,7 @@ class SolvedPoses:
 
     @property
     def loads(self) -> dict[str, np.ndarray]:
-        """Loads by their names but closeness to obstacles, shape [n] each."""
+        """Loads by their names except closeness to obstacles, shape [n] each."""
         return dict(zip(LOADS[:-1], (self.strains, self.stresses, self.axial_forces,
                                 np.linalg.norm(self.torques, axis=1)), strict=True))
 
@@ -84,7 +84,7 @@ class SolvedPoses:
         return SolvedPoses(**{name: values[index] for name, values in vars(self).items()})
 
     def joined(self, other: "SolvedPoses") -> "SolvedPoses":
-        """Return these states and those of ``other`` behind them."""
+        """Return these states followed by those of ``other``."""
         return SolvedPoses(**{name: np.concatenate([values, getattr(other, name)])
                               for name, values in vars(self).items()})
 
@@ -95,10 +95,10 @@ class ResolvedPath:
 
     Attributes:
         solved: The states along it.
-        approach: Those on the way from rest, the hanging state first, to before the path.
+        approach: States on the path from rest, the hanging state first, up to the path's start.
         unsolved: Positions on approach and path without an acceptable solution [m], shape [k, 3].
-        reasons: Why, k of them.
-        is_whole: Whether the end was reached; over a tenth unsolved ends the way early.
+        reasons: Reason for each of the k.
+        is_whole: Whether the end was reached; the path ends early if over a tenth is unsolved.
     """
 
     solved: SolvedPoses
@@ -127,7 +127,8 @@ class ResolvedPath:
         """Return this.
 
         Raises:
-            ConvergenceError: over a tenth of the poses has no acceptable solution, or the last.
+            ConvergenceError: over a tenth of the poses, or the last one, has no acceptable
+            solution.
         """
         if self.is_whole:
             return self
@@ -141,7 +142,7 @@ class ResolvedPath:
 
 def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray,
                  progress: Progress = SILENT) -> ResolvedPath:
-    """Solve the branch along ``path`` [n, 3], coming from rest by ``approach`` [k, 3]."""
+    """Solve the branch along ``path`` [n, 3], coming from rest along ``approach`` [k, 3]."""
     before, unsolved, reasons = [grasp_model.rest], [], []
     good, last, state = [], None, grasp_model.rest.displacement
     ahead = resample(approach, _APPROACH_STEP)[1:-1]
@@ -168,6 +169,6 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
 def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,
                          workers: int | None = None, progress: Progress = SILENT,
                          ) -> list[ResolvedPath]:
-    """Solve several paths with the same approach, each in a process where cores allow."""
+    """Solve several paths with the same approach, each in its own process if cores allow."""
     return run_tasks(resolve_path, [(grasp_model, path, approach) for path in paths],
                      workers=workers, progress=progress, message="both paths on the full model")

@@ -1,4 +1,4 @@
-"""One planning problem: where from, where to, what a metre costs and what is not allowed."""
+"""One planning problem: start, goal, cost per metre and limits."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,25 +16,25 @@ _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity
 
 
 UNPROVEN = "but it is not proven that none exists"
-"""Of what is said without a path: more samples may show one. Across processes the words tell."""
+"""Part of messages without a path: more samples may show one. Checked across processes."""
 
 
 class NoWayError(NoPathError):
     """No path from the start to the goal keeps the limits on the field: proven, or none found.
 
-    ``wall`` are grasp positions where the way is closed by limits, those first that are least over
-    them [m], shape [k, 3].
+    ``wall`` are grasp positions where limits block the path, those least over them first [m], shape
+    [k, 3].
     """
 
     wall: np.ndarray = np.empty((0, 3))
 
     @property
     def is_proven(self) -> bool:
-        """Whether the field, its error counted, leaves no way."""
+        """Whether the field, including its error, allows no path."""
         return UNPROVEN not in self.seen
 
     def behind(self, wall: np.ndarray) -> "NoWayError":
-        """Return the error with the places where the way is closed."""
+        """Return the error with the positions where the path is blocked."""
         self.wall = wall
         return self
 
@@ -43,14 +43,14 @@ class NoWayError(NoPathError):
 class GentleProblem:
     """Any path from ``start`` [3] into ``goal`` within ``limits`` (see ``EnergyField.limited``).
 
-    ``weights`` are the cost of an edge. ``field_error`` [J] is subtracted from the energy where a
-    lower bound is asked for, so that it holds for every branch whose energy lies that near. No path
-    may be longer than ``longest`` [m]; bounds do without that limit, and hold with it as well.
+    ``weights`` are the cost of an edge. For a lower bound, ``field_error`` [J] is subtracted from
+    the energy, so that the bound holds for every branch whose energy is within it. No path may be
+    longer than ``longest`` [m]; bounds ignore that limit, and also hold with it.
 
-    ``beyond`` are limits that the field exceeds only where the branch exceeds those that were
-    asked for (:meth:`~limber.planning.constraints.limits.Limits.beyond`). Bounds and proofs count
-    on them alone; without them no limit proves anything. They allow for the field's largest error
-    anywhere; ``errors``, by limit, say how much smaller it is at a place.
+    ``beyond`` are limits that the field exceeds only where the branch exceeds the requested ones
+    (:meth:`~limber.planning.constraints.limits.Limits.beyond`). Bounds and proofs use them alone;
+    without them no limit proves anything. They allow for the field's largest error anywhere;
+    ``errors``, by limit, give how much smaller it is at a position.
     """
 
     energy_field: EnergyField
@@ -72,7 +72,7 @@ class GentleProblem:
 
     @property
     def sure_limits(self) -> FieldArrays:
-        """The limits ``beyond`` which a pose surely is not allowed; infinite where unknown."""
+        """The limits ``beyond`` which a pose is surely not allowed; infinite if unknown."""
         if self.beyond is not None:
             return self.beyond
         return self.limits._replace(max_energy=np.inf, max_force=np.inf,
@@ -82,7 +82,7 @@ class GentleProblem:
         """Return the cost of a polyline [n, 3]; infinite if it breaks a limit, is too long or
         misses the goal.
 
-        Finer than the planners' edges: what is reported must not owe to their quadrature.
+        Finer than the planners' edges: reported values must not depend on their quadrature.
         """
         from limber.planning.cost import path_cost
 
@@ -103,7 +103,7 @@ class GentleProblem:
 
 
 def least_over(problem: GentleProblem, points: np.ndarray) -> np.ndarray:
-    """Return ``points`` [n, 3] in the order of how far they are over a limit, the least first."""
+    """Return ``points`` [n, 3] in ascending order of their excess over a limit."""
     worst = np.zeros(len(points))
     for one in limited(problem.energy_field, problem.sure_limits):
         worst = np.maximum(worst, one.size(points) / one.limit)
@@ -117,7 +117,7 @@ def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:
 
 
 def no_way(problem: GentleProblem, proof: str) -> NoWayError:
-    """Return the error for a goal to which no path exists, with the ``proof``."""
+    """Return the error for a goal that no path reaches, with the ``proof``."""
     counted = _in_words(problem, problem.sure_limits)
     if counted:
         proof += (" The proof includes the largest cross-validation error of the energy field: no "
@@ -130,7 +130,7 @@ def no_way(problem: GentleProblem, proof: str) -> NoWayError:
 
 
 def not_found(problem: GentleProblem, why: str) -> NoWayError:
-    """Return the error for a path that was not found, with ``why`` that proves nothing."""
+    """Return the error for a path that was not found, with ``why``, which proves nothing."""
     return NoWayError(
         f"No path to the goal with{problem.limits_in_words() or ' known poses'} was found, "
         f"{UNPROVEN}.", why,

@@ -1,4 +1,4 @@
-"""Where a path starts: at rest, at a given place, or at one that is drawn."""
+"""The start of a path: at rest, at a given position, or drawn."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from limber.planning.settings import PlanSettings
 
 
 def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarray:
-    """Return the start that is asked for [m], shape [3].
+    """Return the requested start [m], shape [3].
 
     Raises:
-        InputError: two are. NoPathError: none could be drawn.
+        InputError: two are requested. NoPathError: none could be drawn.
     """
     if settings.start is not None and settings.start_seed is not None:
         raise InputError("Both --start and --start-seed are given.",
@@ -29,9 +29,9 @@ def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarr
 def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: int) -> np.ndarray:
     """Return a random deformed configuration far from rest and from the goal, shape [3].
 
-    The paper's trials start from "randomized initial configurations"; it does not say how they
-    were drawn. Here: uniform over the allowed region, at least half the largest deflection away
-    from rest, and outside the goal by as much.
+    The paper's trials start from "randomized initial configurations", without stating how they were
+    drawn. Here: uniform over the allowed region, at least half the largest deflection away from
+    rest, and as far outside the goal.
 
     Raises:
         NoPathError: no such configuration was found.
@@ -50,7 +50,7 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
 
 
 def check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> None:
-    """Raise InputError where the start [3] is not allowed; says why."""
+    """Raise InputError if the start [3] is not allowed, with the reason."""
     if allowed_points(start[None], limits)[0]:
         return
     place = ", ".join(f"{value:.3f}" for value in start)

@@ -1,21 +1,21 @@
 """The file ``plans/NAME.json``: the motion of gripper and branch, pose by pose.
 
-Format 2. Beside the summary (goal, scores of both paths, seeds) it has three ways, ``baseline`` and
-``plan`` between start and goal, and ``motion``: the whole of what a gripper does, from the hanging
-branch to the start (``approach``), along the plan (``path``) and back by the way it came
-(``return``). Each way is a table of columns of one length:
+Format 2. Beside the summary (goal, scores of both paths, seeds) it has three paths: ``baseline``
+and ``plan`` between start and goal, and ``motion``, the whole motion of a gripper, from the hanging
+branch to the start (``approach``), along the plan (``path``) and back along the same path
+(``return``). Each is a table of columns of equal length:
 
 ``times_s``, ``poses`` [m, rad] [n][6], ``energies_j``, ``forces_n`` and ``torques_nm`` [n][3] (of
 the gripper on the branch, the torque about the pose's position), ``axial_forces_n`` (along the
 branch, outward), ``strains`` and ``stresses_pa`` (largest in the branch), ``tips_m`` [n][3],
-``targets_m`` {name: [n][3]}, ``field_energies_j`` (what the field had promised), ``joints_rad``
-[n][6] where a robot is given; ``motion`` also ``phases``.
+``targets_m`` {name: [n][3]}, ``field_energies_j`` (predicted by the field), ``joints_rad`` [n][6]
+if a robot is given; ``motion`` also ``phases``.
 
-``timing`` has the limits of speed and acceleration that the times keep; a motion stands still at
-rest, at the path's end, and at rest again. ``in_motion``, where limits were asked for, says that
-they hold at this pace with the branch's inertia, and the peaks moving and standing still.
-``limits`` has for each limit asked for its value, the peak of the motion standing still at each
-pose and the margin. ``robot`` is null for plans that were not made in a robot's cell.
+``timing`` has the limits of speed and acceleration that the times keep; a motion is at standstill
+at rest, at the path's end, and at rest again. ``in_motion``, if limits were requested, states that
+they hold at this pace with the branch's inertia, and the peaks in motion and at standstill.
+``limits`` has for each requested limit its value, the peak of the motion at standstill at each
+pose, and the margin. ``robot`` is null for plans that were not made in a robot's cell.
 
 Format 1 had no version, no motion, and the sizes of forces alone. It is read as well.
 """
@@ -45,21 +45,21 @@ _COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "t
 
 @dataclass(frozen=True)
 class Way:
-    """States along a path; None where a file does not contain them.
+    """States along a path; None if a file does not contain them.
 
     Attributes:
         poses: [m, rad], shape [n, 6].
         energies: Potential of strain and weight above the hanging state [J], shape [n].
-        force_sizes: Of the gripper's force [N], shape [n].
-        strains: Largest in the branch, shape [n].
-        forces, torques: Of the gripper on the branch [N, Nm], shape [n, 3].
+        force_sizes: Magnitude of the gripper's force [N], shape [n].
+        strains: Largest strain in the branch, shape [n].
+        forces, torques: Force and torque of the gripper on the branch [N, Nm], shape [n, 3].
         times: [s], ascending, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].
         targets: Positions [m], shape [n, 3] each, by name.
-        field_energies: What the energy field had promised [J], shape [n].
-        joints: Of the robot [rad], shape [n, joints].
-        stresses: Largest in the branch [Pa], shape [n].
-        axial_forces: Part of the force along the branch, outward [N], shape [n].
+        field_energies: Energies predicted by the field [J], shape [n].
+        joints: Joint angles of the robot [rad], shape [n, joints].
+        stresses: Largest stress in the branch [Pa], shape [n].
+        axial_forces: Component of the force along the branch, outward [N], shape [n].
         phases: ``approach``, ``path`` or ``return``, n of them.
     """
 
@@ -84,7 +84,7 @@ class _Told(BaseModel):
 
 
 class PathScores(_Told):
-    """What is said of one of the two paths, on the full model."""
+    """Summary of one of the two paths, on the full model."""
 
     length_m: float | None = None
     energy_integral_jm: float | None = None
@@ -94,7 +94,7 @@ class PathScores(_Told):
 
 
 class PlanGoal(_Told):
-    """What is to reach which ball."""
+    """The goal: its kind, and a ball in it."""
 
     kind: str = "grasp"
     position_m: tuple[float, float, float] | None = None
@@ -102,7 +102,7 @@ class PlanGoal(_Told):
 
 
 class PlanBranchBound(_Told):
-    """The same on the full model."""
+    """The bound for the full model."""
 
     field_error_j: float | None = None
     gap_percent: float | None = None
@@ -134,7 +134,7 @@ class PlanTrade(_Told):
 
 
 class PlanDetour(_Told):
-    """How energy and length of the gentlest paths are traded."""
+    """The trade-off between energy and length of the gentlest paths."""
 
     shortest_m: float
     longest_m: float
@@ -149,14 +149,14 @@ class PlanInMotion(_Told):
 
 
 class PlanStep(_Told):
-    """A moment of a planner."""
+    """One entry of a planner's history."""
 
     iteration: int
     cost: float | None
 
 
 class PlanSummary(_Told):
-    """Of a plan's file, what others read beside its columns."""
+    """The parts of a plan's file that others read beside its columns."""
 
     goal: PlanGoal = PlanGoal()
     planner: str | None = None
@@ -179,10 +179,10 @@ class PlanFile:
     """A plan as read.
 
     Attributes:
-        version: Of the file's format.
-        summary: All of the file that is no column.
+        version: Version of the file's format.
+        summary: All of the file except the columns.
         baseline, plan: Between start and goal.
-        motion: The whole of it, None in format 1.
+        motion: The whole motion, None in format 1.
     """
 
     version: int
@@ -195,10 +195,10 @@ class PlanFile:
 def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
            pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
            field_energies: np.ndarray | None = None, phases: tuple[str, ...] | None = None) -> Way:
-    """Return the way of solved poses, as fast as ``pace`` allows, standing still at ``stops``.
+    """Return the path of solved poses, as fast as ``pace`` allows, at standstill at ``stops``.
 
     Args:
-        targets: Names, in the order of the solution's.
+        targets: Names, in the order of the solution's targets.
     """
     return Way(
         poses=solved.poses, energies=solved.energies, force_sizes=solved.force_sizes,
@@ -211,9 +211,9 @@ def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
 
 def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
                  pace: Pace = DEFAULT_PACE) -> Way:
-    """Return approach from rest, path, and the way back, which is the same in reverse.
+    """Return approach from rest, path, and the return path, which is the same reversed.
 
-    Equilibria have no memory: on the way back the branch takes the states that it came by.
+    Equilibria have no memory: on the return path the branch takes the same states.
     """
     ahead, on_path = path.ahead, len(path.solved.poses)
     back = np.arange(len(ahead.poses) - 1)[::-1]
@@ -224,7 +224,7 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
 
 
 def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]:
-    """Return value, peak along the motion and margin of each limit that was asked for."""
+    """Return value, peak along the motion and margin of each requested limit."""
     peaks = {"energy": motion.energies, "force": motion.force_sizes, "strain": motion.strains,
              "stress": motion.stresses, "axial_force": motion.axial_forces,
              "torque": np.linalg.norm(motion.torques, axis=1)}
@@ -242,7 +242,7 @@ def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,
     """Return the content of a file of format 2.
 
     Args:
-        summary: With an entry for ``baseline`` and for ``plan``.
+        summary: Summary with an entry for ``baseline`` and for ``plan``.
     """
     content = {
         "format_version": FORMAT, **summary, "targets": sorted(plan.targets),
@@ -258,7 +258,7 @@ def read_plan(path: Path) -> PlanFile:
     """Read a plan of format 1 or 2.
 
     Raises:
-        InputError: it is no plan, damaged, or of a newer program.
+        InputError: it is not a plan, is damaged, or is from a newer program.
     """
     try:
         content = read_json(path, "a plan")
@@ -279,10 +279,10 @@ def read_plan(path: Path) -> PlanFile:
 
 
 def read_plan_summary(path: Path) -> dict[str, Any]:
-    """Return what a plan's file says beside its columns, whatever of it there is.
+    """Return the entries of a plan's file beside its columns, as far as present.
 
     Raises:
-        InputError: it is no plan, or damaged.
+        InputError: it is not a plan, or is damaged.
     """
     content = read_json(path, "a plan")
     checked_as(path, PlanSummary, content, "a plan", strict=True)

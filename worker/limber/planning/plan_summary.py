@@ -25,7 +25,7 @@ _LONGER = 1.05  # a smoothed gentle path may be a little shorter than an unsmoot
 def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
                baseline: ResolvedPath, plan: ResolvedPath, settings: PlanSettings,
                ) -> dict[str, Any]:
-    """Return what a plan's file says beside its columns, as far as it is known without rounds."""
+    """Return the entries of a plan's file beside its columns that are known without rounds."""
     before, after = baseline.measures, plan.measures
     return {
         "goal": goal.describe() | {"chosen": not asked_kinds(settings)},
@@ -56,13 +56,13 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
 
 def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMeasures,
                    ) -> dict[str, Any]:
-    """Return what the bound says of every branch whose energy is nowhere farther below the field's
-    than 95 % of the samples were, each left out in turn, and how far above that the plan is.
+    """Return the bound for every branch whose energy is nowhere farther below the field's than 95 %
+    of the samples were, each left out in turn, and the plan's gap to that bound.
 
-    With c = w E + l and E less an error e, but not below 0, c is nowhere less than l / (l + w e) of
-    what it was, and so is the bound; an integral of energy over at most a length is less by at most
-    e times that. Of a goal for a target it says nothing: where the target is the field does not
-    know well enough.
+    With c = w E + l and E reduced by an error e, but not below 0, c is nowhere less than l / (l + w
+    e) times its former value, and so is the bound. An integral of energy over at most a length is
+    reduced by at most e times that length. For a goal of a target no bound is given: the field does
+    not know the target's position well enough.
     """
     weights, detour = pair.cost.weights, pair.detour
     cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
@@ -81,7 +81,7 @@ def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMe
 
 
 def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:
-    """Return the peak strain, and how far the field was from the full model along the path."""
+    """Return the peak strain, and the field's error against the full model along the path."""
     solved = path.solved
     off = field.energy(solved.poses[:, :3]) - np.maximum(solved.energies, 0.0)
     return {"peak_strain": float(solved.strains.max()),

@@ -1,8 +1,8 @@
-"""What a plan's search leaves beside it: ``plans/NAME-trees.csv`` and ``plans/NAME-bound.npz``.
+"""Search results saved beside a plan: ``plans/NAME-trees.csv`` and ``plans/NAME-bound.npz``.
 
-The trees: a row a node with its planner, its position, and the row of that tree that it hangs on
-(-1: none). The bound: what a path from anywhere costs at least, on the first grid of the
-certificate, which covers the whole sampled region.
+The trees: one row per node with its planner, its position, and the row of its parent (-1: none).
+The bound: least cost of a path from any position, on the first grid of the certificate, which
+covers the whole sampled region.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class CostToGo:
 
     Attributes:
         origin: Corner of the first cell [m], shape [3].
-        axes: Of the grid, unit, as rows, shape [3, 3].
+        axes: Axes of the grid, unit, as rows, shape [3, 3].
         spacing: Edge of a cell [m].
         costs: NaN where no path leads, shape [nx, ny, nz].
     """
@@ -36,8 +36,8 @@ class CostToGo:
     def at(self, points: np.ndarray) -> np.ndarray:
         """Return it at ``points`` [n, 3] between the centres, for pictures.
 
-        A region may be thinner than a cell: where a cell is not known the nearest one that is
-        stands for it. NaN outside the grid.
+        A region may be thinner than a cell: an unknown cell takes the value of the nearest known
+        one. NaN outside the grid.
         """
         from scipy.ndimage import distance_transform_edt, map_coordinates
 
@@ -54,10 +54,10 @@ class CostToGo:
 
     @classmethod
     def read(cls, path: Path) -> "CostToGo":
-        """Read what :meth:`write` wrote.
+        """Read a file that :meth:`write` wrote.
 
         Raises:
-            InputError: it is damaged.
+            InputError: the file is damaged.
         """
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, {"origin_m": (3,), "axes": (3, 3), "spacing_m": (),

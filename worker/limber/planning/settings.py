@@ -1,4 +1,4 @@
-"""Settings of the energy field and of paths; they load nothing heavy."""
+"""Settings of the energy field and of paths; they import nothing heavy."""
 
 from typing import ClassVar, Literal
 
@@ -8,7 +8,7 @@ from limber.core.settings import Groups, Settings
 
 
 class EnergySettings(Settings):
-    """How the energy field is sampled."""
+    """Sampling of the energy field."""
 
     groups: ClassVar[Groups] = {
         "samples": ("samples", "field_error", "deflection", "seed"),
@@ -34,7 +34,7 @@ class EnergySettings(Settings):
 
 
 class PlanSettings(Settings):
-    """From where to where, what counts and what is not allowed."""
+    """Start, goal, cost and limits of a plan."""
 
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "second_arm",

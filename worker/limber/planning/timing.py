@@ -1,9 +1,9 @@
-"""When a gripper passes the poses of a path, under limits of speed and acceleration.
+"""Times at which a gripper passes the poses of a path, under limits of speed and acceleration.
 
-Along a polyline of given corners the fastest motion from rest to rest: the squared speed may grow
-and fall by ``2 a ds`` along the way (a pass forward and one backward), and at a corner of curvature
-``k`` it is at most ``a / k``. Both parts of the acceleration, along and across, get their share, so
-that the whole is never over the limit.
+The fastest motion from rest to rest along a polyline of given corners: the squared speed may grow
+and fall by ``2 a ds`` along the path (one pass forward and one backward), and at a corner of
+curvature ``k`` it is at most ``a / k``. Both components of the acceleration, along and across, get
+a fraction of the limit, so that the total never exceeds it.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Pace:
     acceleration: float = 0.1
 
     def slower(self, times: float) -> "Pace":
-        """Return the pace of a motion that takes so many times as long."""
+        """Return the pace of a motion that takes this many times as long."""
         return Pace(self.speed / times, self.acceleration / times**2)
 
 
@@ -35,12 +35,12 @@ DEFAULT_PACE = Pace()
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """How far along its way a motion is when; the acceleration is constant between its knots.
+    """Distance of a motion along its path over time, with constant acceleration between knots.
 
     Attributes:
-        along: Distance along the way at the knots [m], from 0, ascending, shape [k].
-        times: When they are passed [s], from 0, shape [k].
-        speeds: How fast [m/s], shape [k].
+        along: Distance along the path at the knots [m], from 0, ascending, shape [k].
+        times: Times at the knots [s], from 0, shape [k].
+        speeds: Speeds there [m/s], shape [k].
     """
 
     along: np.ndarray
@@ -54,12 +54,12 @@ class TimeLaw:
 
     @property
     def accelerations(self) -> np.ndarray:
-        """Along the way, between the knots [m/s^2], shape [k - 1]."""
+        """Acceleration along the path, between the knots [m/s^2], shape [k - 1]."""
         durations = np.diff(self.times)
         return np.diff(self.speeds) / np.maximum(durations, 1e-12) * (durations > 0.0)
 
     def at(self, instants: np.ndarray) -> np.ndarray:
-        """Return the distance along the way at ``instants`` [s] [m]; the last one afterwards."""
+        """Return the distance along the path at ``instants`` [s] [m]; the last one afterwards."""
         instants = np.clip(instants, 0.0, self.duration)
         piece = np.clip(np.searchsorted(self.times, instants, side="right") - 1, 0,
                         len(self.times) - 2)
@@ -71,7 +71,7 @@ class TimeLaw:
 def time_law(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> TimeLaw:
     """Return the fastest motion along ``positions`` [n, 3], two or more.
 
-    It stands still at both ends and at the points ``stops``.
+    It is at standstill at both ends and at the points ``stops``.
     """
     edges = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     slowest = _at_corners(positions, edges, pace)
@@ -94,7 +94,7 @@ def time_law(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> 
 
 
 def times_along(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> np.ndarray:
-    """Return when ``positions`` [n, 3] are passed [s], from 0, shape [n]; see :func:`time_law`."""
+    """Return the times [s], from 0, at ``positions`` [n, 3], shape [n]; see :func:`time_law`."""
     if len(positions) < 2:
         return np.zeros(len(positions))
     return time_law(positions, pace, stops).times[::_PIECES]
@@ -108,7 +108,7 @@ def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
     shortest turns between rotations.
 
     Args:
-        law: Of these poses' positions and stops.
+        law: Time law of these poses' positions and stops.
     """
     from scipy.interpolate import Akima1DInterpolator
 

@@ -44,12 +44,12 @@ _ANY = 1e6  # gap: any path will do
 class PathPair:
     """RRT* (length alone) and the gentle plan between the same start and goal region.
 
-    ``approach`` [k, 3] leads gently from the rest pose to the start: a branch that is pushed
-    there straight may buckle on the way and be another branch when it arrives. ``certificate``
-    says how close the plan is to the best possible path on the field; ``compared`` has the
-    polylines [n, 3] of all paths that were found, by name. ``margins`` is by how much the limits
-    were tighter than asked; ``detour`` what a limit on the length did. ``trees`` is what the
-    planners that grow one found, by the planner's name.
+    ``approach`` [k, 3] is a gentle path from the rest pose to the start: a branch that is pushed
+    there straight may buckle on the path and arrive in another state. ``certificate`` gives the
+    plan's gap to the best possible path on the field; ``compared`` has the polylines [n, 3] of all
+    found paths, by name. ``margins`` is by how much the limits were tighter than requested;
+    ``detour`` the effect of a limit on the length. ``trees`` has the results of the planners that
+    grow a tree, by the planner's name.
     """
 
     baseline: FoundPath
@@ -64,26 +64,26 @@ class PathPair:
 
     @property
     def stays(self) -> bool:
-        """Whether the start lies in the goal, so that the paths have no length."""
+        """Whether the start is in the goal, so that the paths have no length."""
         return self.plan.engine == NOTHING_ASKED
 
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
                 limits: Limits, *, asked: Limits | None = None, before: PathPair | None = None,
                 progress: Progress = SILENT) -> PathPair:
-    """Plan both paths within ``limits``, tighter by what the field may be wrong by where it can be.
+    """Plan both paths within ``limits``, tightened by the field's possible error where feasible.
 
-    ``asked`` are the limits before they were tightened for what the field does not know, ``limits``
-    where not given: that no path exists is said of those. ``before`` is what was found until the
-    field learnt: its trees are not grown again where their paths still hold.
+    ``asked`` are the limits before they were tightened for the field's error, ``limits`` if not
+    given: a proof that no path exists refers to those. ``before`` has the results before the field
+    learnt: its trees are not grown again if their paths still hold.
 
-    Where no path keeps the margins, one that keeps the limits on the field alone is planned; where
-    none does either, and that proves nothing, one that may keep them on the branch
+    If no path keeps the margins, one that keeps the limits on the field alone is planned. If none
+    does either, and that proves nothing, one is planned that may keep them on the branch
     (:meth:`~.limits.Limits.beyond`). The full model decides whether it holds.
 
     Raises:
         InputError: the start is not allowed.
-        NoPathError: the goal cannot be reached; says why, and whether that is proven.
+        NoPathError: the goal cannot be reached; states why, and whether that is proven.
     """
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
@@ -91,7 +91,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
-    # A start near its limit leaves room for a part of the margins only.
+    # A start near its limit leaves room for only a part of the margins.
     shares = [share for share in _SHARES if any(margins.values())
               and allowed_points(start[None], limits.within(field, share))[0]]
     if shares:
@@ -116,8 +116,9 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
 
 def _check_any_way(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
                    asked: Limits) -> None:
-    """Raise NoWayError where cells prove at once that no path keeps the limits: before any search
-    for one."""
+    """Raise NoWayError if cells prove at once that no path keeps the limits, before any search for
+    one.
+    """
     if not limits.asked():
         return
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
@@ -137,10 +138,10 @@ def _check_any_way(field: EnergyField, start: np.ndarray, goal: Goal, limits: Li
 def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goal,
               settings: PlanSettings, limits: Limits, surely: FieldArrays,
               **options: Any) -> PathPair:
-    """Return what is planned with as much more than the limits as the field may be wrong by.
+    """Return the plan with limits relaxed by the field's possible error.
 
     Raises:
-        NoWayError: ``none``, where it is proven, the field is not wrong, or that is of no use.
+        NoWayError: ``none``, if it is proven, the field has no error, or relaxing does not help.
     """
     doubts = limits.doubts(field)
     if UNPROVEN not in none.seen or not any(doubts.values()):
@@ -168,12 +169,12 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
               before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits, and bound the cost of any path from below.
 
-    ``limits`` are those of the settings where not given; ``beyond`` and ``errors`` what the bound
-    counts on (:class:`~.path_problem.GentleProblem`).
+    ``limits`` are those of the settings if not given; ``beyond`` and ``errors`` are used by the
+    bound (:class:`~.path_problem.GentleProblem`).
 
     Raises:
         InputError: the start is not allowed.
-        NoPathError: the goal cannot be reached; says why, and whether that is proven.
+        NoPathError: the goal cannot be reached; states why, and whether that is proven.
     """
     limits = limits or Limits.of(settings).on(field)
     check_start(field, start, limits)
@@ -184,7 +185,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         goals = with_near_side(goal_points(goal, field, limits, seed=settings.seed), start, goal,
                                field, limits)
     except GoalOverLimitsError as error:
-        # Drawn poses miss a narrow valley: cells find a way into it, or prove that there is none.
+        # Drawn poses miss a narrow valley: cells find a path into it, or prove that there is none.
         goals, nobody = np.empty((0, 3)), error
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
     weighed = CostWeights.between(field, start, goal.centre(field),
@@ -217,7 +218,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
 
 def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPath],
             settings: PlanSettings) -> tuple[FoundPath, Certificate]:
-    """Return the plan of the planner that is asked for, and how close to the best it is.
+    """Return the plan of the requested planner, and its gap to the best.
 
     Raises:
         NoPathError: that planner found none.
@@ -238,7 +239,7 @@ def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPa
 
 def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
              limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
-    """Return what is planned where the start lies in the goal: both paths stay there."""
+    """Return the plan if the start is in the goal: both paths stay there."""
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
@@ -250,7 +251,7 @@ def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSe
 
 def _gentle(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
             progress: Progress) -> tuple[GentlePath, DetourPath | None]:
-    """Return the gentlest path, and what a limit on its length did."""
+    """Return the gentlest path, and the effect of a limit on its length."""
     if settings.max_detour is None:
         return plan_gentle(problem, known, progress=progress), None
     detour = _detour(problem, known, settings, progress)
@@ -279,7 +280,7 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSetti
 def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
            weighed: CostWeights, before: dict[str, FoundPath], progress: Progress,
            ) -> dict[str, FoundPath]:
-    """Return what RRT* and D-RRT* find, or had found before: either, both or nothing."""
+    """Return the results of RRT* and D-RRT*, new or from before: either, both or none."""
     engine = chosen_engine(settings.engine)
     search = Search(iterations=settings.iterations, seed=settings.seed)
     shortest = replace(weighed, deformation=0.0, distance=1.0)
@@ -295,20 +296,20 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
         try:
             found[name] = plan_path(asked, search, engine=engine, progress=part)
         except NoPathError as error:
-            # No verdict: the eikonal planner finds the path, or proves that there is none.
+            # Not conclusive: the eikonal planner finds the path, or proves that there is none.
             progress.warn(f"{name}: {error}")
     return found
 
 
 def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
-    """Return the path made as short as it can be, where RRT* found none."""
+    """Return the path shortened as far as possible, if RRT* found none."""
     weights = problem.weights._replace(energy=0.0)
     points, cost = refine(path, replace(problem, weights=weights))
     return FoundPath(points, cost, cost, engine="refined")
 
 
 def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
-    """Return a gentle way [k, 3] from rest to the start, within the same limits.
+    """Return a gentle path [k, 3] from rest to the start, within the same limits.
 
     Raises:
         NoPathError: there is none.
@@ -330,6 +331,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
                 goals=start[None]), Search(iterations=1500, seed=settings.seed)).points
             points, _ = refine(rough, way)
         except NoPathError:
-            # A tree that misses a narrow way is no verdict: the grid finds it, or says why not.
+            # A tree that misses a narrow passage is not conclusive: the grid finds it, or states
+            # why not.
             points = plan_gentle(way, enough=_ANY).points
     return np.concatenate([points, start[None]])

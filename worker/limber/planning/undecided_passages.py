@@ -20,8 +20,9 @@ from limber.planning.planners.easiest import easiest_way
 
 @dataclass(frozen=True)
 class Passages:
-    """The easiest way to the goal on the full model: what was ``learnt`` there, and in words
-    ``told`` what it takes."""
+    """The easiest path to the goal on the full model: the states ``learnt`` there, and in words
+    ``told`` what it takes.
+    """
 
     learnt: GraspSamples
     told: str
@@ -29,8 +30,9 @@ class Passages:
 
 def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarray, goal: Goal,
                    limits: Limits, progress: Progress = SILENT) -> Passages | None:
-    """Solve the branch along the way that goes least over the limits; None where the field's error
-    does not leave in doubt that it goes over them, or nothing new is to be learnt there."""
+    """Solve the branch along the path that exceeds the limits least; None if the field's error
+    leaves no doubt that it exceeds them, or nothing new can be learnt there.
+    """
     way = easiest_way(field, limits.on(field), start, goal)
     asked, margins = limits.asked(), limits.margins(field)
     reserve = max((margins[name] / limit for name, limit in asked.items()), default=0.0)

@@ -1,6 +1,6 @@
 """Recordings of pulls: format, tables, import, alignment, registration, checks.
 
-How a recording is described, in SI units:
+Description of a recording, in SI units:
 
 >>> from limber.recordings import GraspEntry, PullEntry
 >>> entry = PullEntry(grasp=GraspEntry(point_m=(0.0, 0.0, 0.5), radius_m=0.01))

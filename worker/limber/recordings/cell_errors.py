@@ -1,7 +1,7 @@
 """Calibration errors of a cell: standard deviations of errors constant over a recording.
 
-Noise averages out over frames; an error of a millimetre in the gripper's frame does not. A
-fit takes these errors as unknowns, with the deviations given here as their prior.
+Noise averages out over frames; an error of a millimetre in the gripper's frame does not. A fit
+treats these errors as unknowns, with the deviations given here as their prior.
 """
 
 from typing import TYPE_CHECKING
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 class CalibrationEntry(BaseModel):
     """Standard deviations, under ``[calibration]`` of ``pull.toml``; 0: known exactly.
 
-    The defaults are those of a cell set up with care and not measured since: a hand-eye
-    calibration good to a millimetre and a degree, a force sensor within 2 % whose zero drifts by
-    a newton (makers' sheets allow more; see the note on field errors), a camera good to a
+    The defaults are those of a carefully set up cell without later measurement: a hand-eye
+    calibration accurate to a millimetre and a degree, a force sensor within 2 % whose zero drifts
+    by a newton (makers' sheets allow more; see the note on field errors), a camera accurate to a
     millimetre.
     """
 
@@ -59,13 +59,14 @@ EXACT = CalibrationEntry(
     pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
     force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=0.0,
     clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0, repeat_sigma=0.0)
-"""Of a simulated cell without errors."""
+"""Calibration of a simulated cell without errors."""
 WITHOUT_GRIPPER = CalibrationEntry(
     pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
     force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=1e-3,
     clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0)
-"""Of a stated load and of markers that were laid onto the branch at rest: what is left is how far
-that laying turned them."""
+"""Calibration for a stated load and markers registered to the branch at rest. The remaining error
+is the rotation of that registration.
+"""
 
 
 def calibration_of(entry: "PullEntry") -> CalibrationEntry:

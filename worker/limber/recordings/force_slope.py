@@ -1,4 +1,4 @@
-"""Force against displacement, as a load cell on an actuator gives it: how stiff, with interval."""
+"""Force against displacement, from a load cell on an actuator: stiffness with interval."""
 
 import re
 from dataclasses import dataclass
@@ -20,11 +20,12 @@ from limber.recordings.tables import (
 from limber.recordings.time_series import saturated
 
 NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
-"""Force over the unloaded reading that counts as contact [N]; a drop of twice as much is a slip."""
+"""Force above the unloaded reading that counts as contact [N]; a drop of twice as much is a slip.
+"""
 OBSTACLE = 2.0
-"""A slope that grows so many times at a bend is that of something else behind the branch."""
+"""Growth factor of the slope at a bend above which there is an obstacle behind the branch."""
 STIFFENING = 0.3
-"""A slope that changes by more along the push is told."""
+"""Change of the slope along the push above which it is reported."""
 
 WHY_NO_MODULUS = (
     "A force slope is the stiffness of the whole structure below the contact: proportional to "
@@ -40,14 +41,14 @@ class ForceSlope:
 
     Attributes:
         slope: [N/m] over the loaded part of the outward path.
-        interval: Its 95 % interval [N/m]; wide enough for residuals that follow each other.
-        contact: Displacement at which force sets in [m], on the actuator's scale.
+        interval: Its 95 % interval [N/m]; wide enough for correlated residuals.
+        contact: Displacement at first contact [m], on the actuator's scale.
         contact_seen: Whether the recording starts before contact.
         baseline: Reading without load [N].
         sample_count: Samples in the loaded part.
         stiffening: Slope of the second half of the loaded part over that of the first, minus 1.
-        slips: Displacements at which the force drops at once [m].
-        slope_before_slip: [N/m] up to the first slip, or None where it does not slip.
+        slips: Displacements at which the force drops suddenly [m].
+        slope_before_slip: [N/m] up to the first slip, or None if there is no slip.
         return_slope: [N/m] of the return path, or None if there is none.
         energy_lost: Fraction of the work of the outward path that is not returned, or None.
         warnings: Problems found in the file.
@@ -72,15 +73,15 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
     """Read displacement [m] and force [N] in the file's order; units are those of the header.
 
     Columns are found by name: ``Load Cell Reading (gf)`` or ``force [N]``, ``Displacement (mm)``,
-    with any separator and preamble. Rows that are not complete are dropped with a warning.
+    with any separator and preamble. Incomplete rows are dropped with a warning.
 
     Args:
         path: The file.
-        unit: Of the displacement, instead of the header's.
-        force_unit: Of the force, instead of the header's.
+        unit: Unit of the displacement, instead of the header's.
+        force_unit: Unit of the force, instead of the header's.
 
     Raises:
-        InputError: a column or its unit is missing, or under 5 rows are left.
+        InputError: a column or its unit is missing, or fewer than 5 rows remain.
     """
     table = read_table(path)
     force_at, force_scale = _column(table, r"force|load", FORCE_NAMES_N, force_unit)
@@ -102,16 +103,16 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
     """Fit contact and slope of the outward path, and the slope of the return path if there is one.
 
     Contact is the bend of a constant followed by a line. The slope is that of a straight line
-    through what lies over contact and the sensor's noise; its standard error allows for residuals
-    that are not independent, as a curved response or a slip leaves them.
+    through the readings above contact and above the sensor's noise. Its standard error allows for
+    correlated residuals, which a curved response or a slip causes.
 
     Args:
         displacement: [m], shape [n], in the order of time.
         force: [N], shape [n].
-        warnings: What is known to be wrong already; handed on.
+        warnings: Known faults; passed on.
 
     Raises:
-        InputError: the force never rises out of the noise.
+        InputError: the force never exceeds the noise.
     """
     messages = list(warnings)
     moved, force = _in_range(np.asarray(displacement, float), np.asarray(force, float), messages)
@@ -184,14 +185,15 @@ def _column(table: Table, name: str, units: dict[str, float], given: str | None,
 
 def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
               ) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out readings at the sensor's limit and single ones far off."""
+    """Leave out readings at the sensor's limit and single outliers."""
     limited = saturated(force[:, None])
     if limited.any() and limited.sum() < 0.8 * len(force):
         messages.append(f"{int(limited.sum())} readings at {np.abs(force[limited]).max():.3g} N "
                         "are identical: the load cell is saturated there. They were discarded, at "
                         f"{_shown_places(moved[limited])}.")
         moved, force = moved[~limited], force[~limited]
-    # One sample far from both neighbours, on the same side; a slip stays where it falls to.
+    # One sample far from both neighbours, on the same side. After a slip readings stay at the new
+    # level.
     before, after = force[1:-1] - force[:-2], force[1:-1] - force[2:]
     jump = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     usual = np.median(np.abs(np.diff(force))) if len(force) > 1 else 0.0
@@ -213,7 +215,7 @@ def _shown_places(moved: np.ndarray) -> str:
 
 def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
               ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn signs so that the actuator advances and the body pushes back."""
+    """Set signs so that the actuator advances and the body pushes back."""
     far = int(np.argmax(np.abs(moved - moved[0])))
     if moved[far] < moved[0]:
         messages.append("The displacement decreases as the actuator advances. Its sign was "
@@ -221,7 +223,7 @@ def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
         moved = -moved
     far = int(np.argmax(moved))
     change = force[:far + 1] - force[0]
-    # Work of the reading over its first one: negative where the sensor counts pressure negative.
+    # Work of the reading relative to its first: negative if the sensor counts pressure negative.
     work = float(np.sum((change[1:] + change[:-1]) / 2 * np.diff(moved[:far + 1])))
     if work < 0 and change.min() < -NOISE_FLOOR_N and -change.min() > 3 * change.max():
         messages.append("The reading falls as the actuator advances. The work done shows that it "
@@ -231,9 +233,9 @@ def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
 
 
 def _ways(moved: np.ndarray) -> tuple[slice, slice]:
-    """The way out, up to the farthest sample, and the way back."""
+    """The outward path, up to the farthest sample, and the return path."""
     far = int(np.argmax(moved))
-    # A hold at the end is no way back.
+    # A hold at the end is no return path.
     returns = moved[far] - moved[-1] > 0.05 * np.ptp(moved) and len(moved) - far > 5
     return slice(0, far + 1 if returns else len(moved)), slice(
         far if returns else len(moved), len(moved))
@@ -253,7 +255,7 @@ def _stiffening(x: np.ndarray, y: np.ndarray) -> float | None:
 
 
 def _slips(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Indices before which the force drops by more than sensor noise can make it."""
+    """Indices before which the force drops by more than sensor noise can explain."""
     step = np.diff(y)
     usual = 1.4826 * np.median(np.abs(step - np.median(step)))
     return np.flatnonzero(step < -max(2 * NOISE_FLOOR_N, 6 * usual)) if len(x) > 4 else (
@@ -262,7 +264,7 @@ def _slips(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _return(moved: np.ndarray, force: np.ndarray, moved_out: np.ndarray, force_out: np.ndarray,
             contact: float, baseline: float) -> tuple[float | None, float | None]:
-    """Slope [N/m] of the way back, and the share of the work that was lost."""
+    """Slope [N/m] of the return path, and the fraction of the work that was lost."""
     loaded = (moved > contact) & (force > baseline + NOISE_FLOOR_N)
     if loaded.sum() < 4:
         return None, None
@@ -291,10 +293,10 @@ def _contact(moved: np.ndarray, force: np.ndarray) -> tuple[float, float]:
 
 
 def _first_contact(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """Displacement and reading at the first contact, and where a later one begins (or the end).
+    """Displacement and reading at the first contact, and the start of a later one (or the end).
 
-    The bend that fits best may be that of an obstacle behind the branch: then the force has risen
-    before it already.
+    The best-fitting bend may be that of an obstacle behind the branch; the force has then risen
+    before it.
     """
     contact, baseline = _contact(x, y)
     end = float(x[-1])
@@ -316,9 +318,9 @@ def _first_contact(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and its standard error: Newey and West's, or that of a first-order autoregression.
+    """Slope and its standard error: Newey-West's, or that of a first-order autoregression.
 
-    The larger counts: the former is too small for few samples, the latter for long waves.
+    The larger is used: the former is too small for few samples, the latter for long waves.
     """
     features = np.column_stack([np.ones(len(x)), x - x.mean()])
     inverse = np.linalg.inv(features.T @ features)
@@ -334,7 +336,7 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     robust = (inverse @ meat @ inverse)[1, 1] * len(x) / freedom
     square = float(residual @ residual)
     follow = float(residual[1:] @ residual[:-1]) / square if square > 0 else 0.0
-    # Estimated from residuals, the correlation comes out too small by about this.
+    # Residuals underestimate the correlation by about this.
     follow = np.clip(follow + (1 + 4 * follow) / len(x), 0.0, 0.95)
     plain = inverse[1, 1] * square / freedom * (1 + follow) / (1 - follow)
     return float(solved[1]), float(np.sqrt(max(robust, plain)))

@@ -1,7 +1,7 @@
-"""A steady load, such as a hung weight: where the branch comes to rest under it.
+"""A steady load, such as a hung weight: the branch's rest position under it.
 
-No robot is needed. Marker tracks show the branch without the load, then swinging, then at rest;
-the rest is found, and becomes a pull of a few frames that a force drives.
+No robot is needed. Marker tracks show the branch without the load, then swinging, then at rest. The
+rest position is detected and becomes a pull of a few frames, driven by a force.
 """
 
 from dataclasses import dataclass
@@ -12,36 +12,40 @@ from limber.core.errors import InputError
 from limber.recordings.recording import Observations
 
 FRAMES = 4
-"""Frames that the settled part is averaged into."""
+"""Number of frames into which the settled part is averaged."""
 STILL_SHARE = 0.005
-"""Settled means: within this share of the whole displacement of where it ends: chosen."""
+"""Fraction of the whole displacement within which the end counts as settled. Chosen, not measured.
+"""
 HIDDEN_SHARE = 0.1
-"""Where the noise is above so much of the displacement, start and end of the motion are sought in
-the mean of all markers: chosen."""
+"""Ratio of noise to displacement above which start and end of the motion are found from the mean of
+all markers. Chosen, not measured.
+"""
 SURE = 4.0
-"""Deviations by which a mean must differ to have moved."""
+"""Standard deviations by which a mean must differ to count as motion."""
 STRAY = 5.5
-"""Deviations per axis that no marker of a still recording strays by: in 1 of 1,000 recordings of
-1,000 places."""
+"""Standard deviations per axis that no marker of a still recording exceeds, except in 1 of 1,000
+recordings with 1,000 positions.
+"""
 MEAN_WIDTH = 5
 """Frames of the running mean."""
 REGISTRATION_SHARE = 0.25
-"""A marker whose place on the body is off by 1 mm is off by so much of that when it moves: the
-displacement changes along a bent body by about its slope."""
+"""Displacement error of a marker, as a fraction of its position error on the body: the displacement
+of a bent body changes along it by about its slope.
+"""
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Before the load and after the swinging.
+    """Positions before the load and after the swinging.
 
     Attributes:
         rest: Markers without the load [m], shape [m, 3].
         times: Middle of each block of the settled part [s], shape [f].
         positions: Mean of each block [m], shape [f, m, 3]; NaN where a marker was not seen.
-        noise: Of one reading, standard deviation per axis [m].
+        noise: Standard deviation of one reading per axis [m].
         moved: Displacement of the marker that moved most [m].
-        duration: Of the settled part [s].
-        warnings: What the user should know.
+        duration: Duration of the settled part [s].
+        warnings: Warnings for the user.
     """
 
     rest: np.ndarray
@@ -53,10 +57,10 @@ class Settled:
     warnings: tuple[str, ...] = ()
 
     def sigma(self, registration: float) -> float:
-        """Standard deviation [m] to state for each frame: what all share does not average out.
+        """Standard deviation [m] for each frame, since common errors do not average out.
 
         Args:
-            registration: RMS distance of the markers at rest from where they should be [m].
+            registration: RMS distance of the markers at rest from their nominal positions [m].
         """
         shared = REGISTRATION_SHARE * registration
         alone = self.noise * np.sqrt(2 / max(len(self.times), 1))
@@ -66,11 +70,11 @@ class Settled:
 def settled(seen: Observations, name: str) -> Settled:
     """Find the unloaded start and the settled end of a recording.
 
-    The end is the longest last part in which no marker's running mean leaves a band of 1 % of the
-    whole displacement. A slow creep inside the band is reported.
+    The end is the longest final part in which every marker's running mean stays in a band of 1 % of
+    the whole displacement. A slow creep inside the band is reported.
 
     Raises:
-        InputError: nothing moved, or the recording ends while it still swings.
+        InputError: nothing moved, or the branch still swings at the end of the recording.
     """
     times, positions = seen.times, seen.positions
     whole = seen.visible.mean(axis=0) > 0.5
@@ -119,7 +123,7 @@ def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]
     """Return the markers in the branch's shape at rest [m], shape [m, 3], and their noise [m].
 
     Args:
-        start: "held": at rest before it is let go; "loaded": at rest when the swing is over.
+        start: "held": at rest before it is released; "loaded": at rest when the swing is over.
 
     Raises:
         InputError: no marker stays in view, or a loaded one still swings at the end.
@@ -142,7 +146,8 @@ def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]
 
 
 def _noise(positions: np.ndarray) -> float:
-    """Of one coordinate, from second differences: a smooth motion has hardly any."""
+    """Noise of one coordinate from second differences, which are close to zero for a smooth motion.
+    """
     second = np.diff(positions, n=2, axis=0)
     second = second[np.isfinite(second)]
     if not len(second):
@@ -151,7 +156,7 @@ def _noise(positions: np.ndarray) -> float:
 
 
 def _still_frames(positions: np.ndarray, end: np.ndarray, noise: float) -> int:
-    """Return how many first frames there are before anything moves; at least one."""
+    """Return the number of initial frames before anything moves; at least one."""
     away = np.linalg.norm(positions - positions[0], axis=2)
     band = 6 * noise + 5e-5
     still = np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=1) < band
@@ -160,8 +165,8 @@ def _still_frames(positions: np.ndarray, end: np.ndarray, noise: float) -> int:
         return count
     for _ in range(3):
         course, deviation = _course(positions, _mean(positions[:count]), end, noise)
-        # Half of the way is passed where the frames before it are below one half, those after it
-        # above, as nearly as can be.
+        # The motion is half complete at the frame that best separates values below one half from
+        # those above.
         half = max(int(np.argmin(np.cumsum(course - 0.5))) + 1, 1)
         width = max(5, half // 4)
         moving = _smoothed(course, width) > SURE * deviation / np.sqrt(width) + 0.02
@@ -172,7 +177,7 @@ def _still_frames(positions: np.ndarray, end: np.ndarray, noise: float) -> int:
 
 def _settled_frame(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noise: float,
                    last: int) -> int:
-    """Return the first frame of those that stay at the end, in the mean of all markers.
+    """Return the first frame of the settled end, in the mean of all markers.
 
     The end is the mean of the ``last`` frames.
     """
@@ -185,7 +190,7 @@ def _settled_frame(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noi
 
 def _course(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noise: float,
             ) -> tuple[np.ndarray, float]:
-    """Return how far all markers are from rest, 0, to end, 1, shape [t], and its deviation."""
+    """Return the progress of all markers from rest, 0, to end, 1, shape [t], and its deviation."""
     way = end - rest
     whole = np.isfinite(way).all(axis=1)
     length = float(np.linalg.norm(way[whole])) or noise

@@ -1,4 +1,4 @@
-"""Folders of images or clouds into a pull: PLY files, RGB-D frames in the layout of TUM."""
+"""Import of image or cloud folders into a pull: PLY files, RGB-D frames in the TUM layout."""
 
 import shutil
 from pathlib import Path
@@ -19,15 +19,16 @@ from limber.geometry.io.clouds import read_points, unit_of
 
 TUM_DEPTH_SCALE = 5000.0
 CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
-"""A camera that moves or turns more than that during a pull is not the fixed one expected."""
+"""Largest motion or rotation of a camera during a pull at which it still counts as fixed."""
 
 
 def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses [n, 6] and wrenches about them [n, 6] in the frame that ``frame_pose`` is in.
+    """Return poses [n, 6] and wrenches about them [n, 6] in the parent frame of ``frame_pose``.
 
     Args:
-        frame_pose: Of the frame that they are given in [m] and rotation vector [rad], shape [6].
+        frame_pose: Pose of the frame in which they are given: [m] and rotation vector [rad], shape
+        [6].
     """
     known = np.isfinite(poses[:, 3:]).all(axis=1)
     turned = np.full((len(poses), 3), np.nan)
@@ -39,13 +40,13 @@ def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.nd
 
 def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
                 ) -> list[str]:
-    """Bring PLY files into ``clouds/``, in metres and named by their time stamps.
+    """Import PLY files into ``clouds/``, in metres and named by their time stamps.
 
     Returns:
         Warnings.
 
     Raises:
-        InputError: fewer than two files, or names without times and no rate.
+        InputError: there are fewer than two files, or names without times and no rate.
     """
     files = sorted(source.glob("*.ply"))
     if len(files) < 2:
@@ -86,7 +87,7 @@ def write_frame(path: Path, points: np.ndarray) -> None:
 
 def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
               ) -> list[str]:
-    """Bring an RGB-D folder into ``depth/``, ``mask/`` and ``camera.toml``.
+    """Import an RGB-D folder into ``depth/``, ``mask/`` and ``camera.toml``.
 
     ``depth.txt``, ``rgb.txt``, ``mask.txt`` and ``groundtruth.txt`` are read as in TUM's data
     (``timestamp file``, ``timestamp tx ty tz qx qy qz qw``); without the lists, file names are
@@ -97,7 +98,7 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
         Warnings.
 
     Raises:
-        InputError: no frames, no intrinsics, or a camera that moves.
+        InputError: there are no frames, no intrinsics, or the camera moves.
     """
     present, warnings = _depth_images(source, settings)
     camera = _camera(source, present[0][1])
@@ -121,7 +122,7 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
 
 
 def _depth_images(source: Path, settings: Any) -> tuple[list[tuple[float, Path]], list[str]]:
-    """Time stamps [s] and files of the depth images that are there, and warnings."""
+    """Time stamps [s] and files of the existing depth images, and warnings."""
     listed = _listed(source, "depth", settings)
     if len(listed) < 2:
         raise InputError(f"{source} has {len(listed)} depth images.",
@@ -169,10 +170,10 @@ def _listed(source: Path, what: str, settings: Any) -> list[tuple[float, Path]]:
 
 
 def _inside(source: Path, name: str) -> Path:
-    """The file that a list names, which lies in the recording's folder.
+    """The file named by a list, which must be in the recording's folder.
 
     Raises:
-        InputError: it lies elsewhere.
+        InputError: it is elsewhere.
     """
     try:
         return inside(source, name)
@@ -232,7 +233,7 @@ def _open3d_camera(path: Path) -> Camera:
 
 
 def _placed(camera: Camera, source: Path, start: float, end: float) -> tuple[Camera, list[str]]:
-    """The camera at its pose of ``groundtruth.txt``, which must not change much."""
+    """The camera at its pose in ``groundtruth.txt``, which must be nearly constant."""
     path = source / "groundtruth.txt"
     listed = tum_list(path)
     if not listed:

@@ -1,4 +1,4 @@
-"""Which pixels show the branch: from a file, from depth alone, or from a YOLO model of the user's.
+"""Pixels that show the branch: from a file, from depth alone, or from the user's YOLO model.
 """
 
 from pathlib import Path
@@ -20,19 +20,19 @@ def read_mask(path: Path) -> np.ndarray:
 def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
                      background: np.ndarray | None = None, difference: float = 0.02,
                      smallest_share: float = 0.05) -> np.ndarray:
-    """Find the branch without a model: what stands out of the background, in large pieces.
+    """Find the branch without a model: large foreground pieces.
 
     Args:
         depth: [m], shape [height, width]; 0 or NaN: no reading.
-        near: Nothing nearer [m].
-        far: Nothing farther [m].
+        near: Smallest depth [m].
+        far: Largest depth [m].
         background: Depth without the branch [m]; pixels nearer by ``difference`` are foreground.
         difference: [m].
-        smallest_share: Pieces smaller than this fraction of the largest are discarded as
-            flying pixels. Other large pieces stay, since a hand or a leaf may cut a branch in two.
+        smallest_share: Pieces smaller than this fraction of the largest are discarded as flying
+            pixels. Other large pieces are kept, since a hand or a leaf may split a branch in two.
 
     Returns:
-        True on the branch, shape [height, width]; all False where nothing is in range.
+        True on the branch, shape [height, width]; all False if nothing is in range.
     """
     valid = np.isfinite(depth) & (depth > near) & (depth < far)
     if background is not None:
@@ -52,8 +52,8 @@ def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
 class YoloSegmenter:
     """A YOLO segmentation model from a weights file on this computer, through ``ultralytics``.
 
-    With ``prompt`` the model must be an open-vocabulary one (YOLO-World, YOLOE); the paper asked
-    its YOLO for "potted plant". Without, ``class_name`` picks one of the model's own classes.
+    With ``prompt`` the model must be an open-vocabulary one (YOLO-World, YOLOE); the paper's prompt
+    was "potted plant". Otherwise ``class_name`` selects one of the model's own classes.
     """
 
     def __init__(self, weights: Path, *, prompt: str | None = None, class_name: str | None = None,

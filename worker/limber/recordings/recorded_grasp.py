@@ -1,4 +1,4 @@
-"""The recorded grasp on whatever mesh simulates it."""
+"""The recorded grasp on any mesh that simulates it."""
 
 import numpy as np
 
@@ -8,17 +8,17 @@ from limber.mechanics.grasp import Grasp
 from limber.recordings.recording import GraspEntry
 
 LEAST_NODES = 6
-"""A patch of fewer is widened."""
+"""Fewest nodes of a patch; a smaller one is widened."""
 
 
 def grasp_on(mesh: TetMesh, entry: GraspEntry) -> Grasp:
     """Return the recorded grasp as a patch of a mesh.
 
-    Its centre is the recorded point. A patch of under 6 nodes is widened; how long a piece a
-    clamping gripper holds stays what was recorded.
+    Its centre is the recorded point. A patch of under 6 nodes is widened; the recorded length held
+    by a clamping gripper is kept.
 
     Raises:
-        InputError: the point is not on the branch, or in its fixed base.
+        InputError: the point is not on the branch, or is in its fixed base.
     """
     point = np.array(entry.point_m)
     distance = np.sort(np.linalg.norm(mesh.nodes - point, axis=1))

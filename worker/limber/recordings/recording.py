@@ -1,8 +1,8 @@
-"""A pull: what the gripper did to the branch, and what was seen of it; its folder ``pulls/NAME``.
+"""A pull: the gripper's action on the branch, and the observations; its folder ``pulls/NAME``.
 
-``pull.toml`` says how to read the rest; ``robot.csv`` has the gripper's pose in the branch's
-frame and the wrench that the gripper exerts on the branch; ``markers.csv`` has observed points.
-Depth frames and clouds enter as files, and become points in :mod:`limber.perception`.
+``pull.toml`` describes how to read the rest; ``robot.csv`` has the gripper's pose in the branch's
+frame and the wrench of the gripper on the branch; ``markers.csv`` has observed points. Depth frames
+and clouds are files, and become points in :mod:`limber.perception`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,7 @@ Vector = tuple[float, float, float]
 
 
 class GraspEntry(BaseModel):
-    """Where and how the gripper holds the branch at rest."""
+    """Grasp of the branch at rest: position and type."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -39,7 +39,7 @@ class GraspEntry(BaseModel):
 
 
 class SensorEntry(BaseModel):
-    """What is known of the sensors' noise and range."""
+    """Noise and range of the sensors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -51,7 +51,7 @@ class SensorEntry(BaseModel):
 
 
 class SwingEntry(BaseModel):
-    """How a branch that swings was let go; its load is the force in ``robot.csv``."""
+    """Release of a swinging branch; its load is the force in ``robot.csv``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -127,8 +127,8 @@ class Pull:
         poses: Poses of the grasp [m, rad], shape [n, 6].
         wrenches: Force [N] and torque [N m] of the gripper on the branch, shape [n, 6]; NaN
             where not measured.
-        observations: Observed points, or None where they have yet to be found in images.
-        warnings: What was wrong in the files.
+        observations: Observed points, or None if they have yet to be found in images.
+        warnings: Faults of the files.
     """
 
     name: str
@@ -140,7 +140,7 @@ class Pull:
     warnings: tuple[str, ...] = field(default=())
 
     def warned(self, *messages: str) -> "Pull":
-        """Return the pull with more warnings."""
+        """Return the pull with additional warnings."""
         return replace(self, warnings=self.warnings + messages)
 
 
@@ -148,7 +148,7 @@ def read_pull(folder: str | Path) -> Pull:
     """Read the folder of a pull.
 
     Raises:
-        InputError: a file is missing, a column is, or something in them makes no sense.
+        InputError: a file or a column is missing, or a value makes no sense.
     """
     folder = Path(folder)
     entry = read_entry(folder / "pull.toml")
@@ -173,14 +173,14 @@ def read_pull(folder: str | Path) -> Pull:
 
 
 def no_pose(path: Path) -> InputError:
-    """Return the refusal of a table in which no row has a complete pose of the gripper."""
+    """Return the error for a table in which no row has a complete pose of the gripper."""
     return InputError(f"{path} has no row with a complete pose of the gripper.",
                       "In each row one of x, y, z, rx, ry, rz is missing or no number.",
                       "Export the recording again, with the gripper's position and rotation.")
 
 
 def write_pull(folder: str | Path, pull: Pull) -> None:
-    """Write ``pull.toml``, ``robot.csv`` and, where there are observations, ``markers.csv``."""
+    """Write ``pull.toml``, ``robot.csv`` and, if there are observations, ``markers.csv``."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_entry(folder / "pull.toml", pull.entry)
@@ -198,7 +198,8 @@ def read_entry(path: Path) -> PullEntry:
     """Read ``pull.toml``.
 
     Raises:
-        InputError: missing, not TOML, or an entry that makes no sense (named).
+        InputError: it is missing, not TOML, or an entry makes no sense; the message names the
+        entry.
     """
     content = read_toml(path, "the description of a pull (`limber import-pull` makes one)")
     return _checked(content, str(path))

@@ -12,9 +12,9 @@ from limber.core.numerics.rigid import rigid_fit
 from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split_title
 
 POOR_FIT_M = 5e-3
-"""A rigid fit that leaves more than this at a marker is reported."""
+"""Residual of a rigid fit at a marker above which it is reported."""
 COLLINEAR = 0.03
-"""Extent across a line, over that along it, from which markers span a triangle."""
+"""Ratio of extents across and along a line from which markers span a triangle."""
 _MOST_FOR_PERMUTATION = 7
 
 
@@ -27,7 +27,7 @@ class Registration:
         shift: [m], shape [3].
         used: Indices of the recording's markers that have a nominal position, shape [m].
         residual: Distance of each from it at rest [m], shape [m].
-        warnings: What the user should know.
+        warnings: Warnings for the user.
     """
 
     rotation: np.ndarray
@@ -38,12 +38,12 @@ class Registration:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals over the degrees of freedom left [m]."""
+        """Root mean square of the residuals over the remaining degrees of freedom [m]."""
         freedom = max(3 * len(self.used) - 6, 1)
         return float(np.sqrt(np.sum(self.residual**2) / freedom))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Take points [m], shape [..., 3], to the branch's frame."""
+        """Transform points [m], shape [..., 3], to the branch's frame."""
         return points @ self.rotation.T + self.shift
 
 
@@ -51,7 +51,7 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
     """Read ``label,x_m,y_m,z_m`` (or another unit of length): labels, positions [m], [m, 3].
 
     Raises:
-        InputError: the file cannot be read as that.
+        InputError: the file cannot be read in this format.
     """
     path = Path(path)
     lines = [line for line in read_text(path, "a table of the markers' nominal positions")
@@ -79,19 +79,20 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
              nominal: np.ndarray, name: str) -> Registration:
     """Fit markers at rest rigidly to their nominal positions.
 
-    Markers are paired by name; if no name matches and both have the same number, by order,
-    or by the order that fits best. An outlier is excluded from the fit if three others agree.
+    Markers are paired by name. If no name matches and both have the same number, they are paired by
+    order, or by the order that fits best. An outlier is excluded from the fit if three others
+    agree.
 
     Args:
         points: At rest in the capture frame [m], shape [n, 3].
-        labels: Of the recording's markers.
+        labels: Labels of the recording's markers.
         nominal_labels: Names in the table of nominal positions.
         nominal: Nominal positions [m], shape [k, 3].
-        name: Of the pull, for messages.
+        name: Name of the pull, for messages.
 
     Raises:
-        InputError: fewer than three markers in common, one with a nominal position is missing,
-            or they lie on a line, are mirrored, or are mistaken for each other.
+        InputError: fewer than three markers are shared, one with a nominal position is missing, or
+            they are on a line, mirrored, or mistaken for each other.
     """
     pairs = [(k, j) for k, label in enumerate(labels) for j, known in enumerate(nominal_labels)
              if same_label(label, known) and np.isfinite(points[k]).all()]
@@ -123,10 +124,11 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
 
 def _unpaired(labels: list[str], nominal_labels: list[str], pairs: list[tuple[int, int]],
               name: str) -> list[str]:
-    """Say which markers have no nominal place.
+    """State which markers have no nominal position.
 
     Raises:
-        InputError: one that has a place is not in the recording, or not in view at its start.
+        InputError: a marker with a nominal position is not in the recording, or not visible at its
+        start.
     """
     missing = [label for j, label in enumerate(nominal_labels) if j not in {j for _, j in pairs}]
     if missing:
@@ -142,7 +144,7 @@ def _unpaired(labels: list[str], nominal_labels: list[str], pairs: list[tuple[in
 
 
 def _require_body(target: np.ndarray, name: str) -> None:
-    """Raises InputError where markers lie on a line: a turn about it would not show."""
+    """Raises InputError if markers are on a line: a rotation about it would be undetermined."""
     extent = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)
     if extent[1] < max(COLLINEAR * extent[0], 1e-4):
         raise InputError(f"{name}: the markers' nominal positions lie on a line.",
@@ -152,7 +154,7 @@ def _require_body(target: np.ndarray, name: str) -> None:
 
 def _require_same_body(points: np.ndarray, target: np.ndarray, labels: list[str],
                        name: str) -> None:
-    """Raises InputError where markers fit once they are mirrored, or two of them exchanged."""
+    """Raises InputError if markers fit once they are mirrored, or two of them are exchanged."""
     rms = float(np.sqrt(np.mean(_residuals(points, target)**2)))
     if rms <= POOR_FIT_M:
         return
@@ -181,7 +183,7 @@ def _residuals(points: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _consistent(points: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Whether each marker agrees with the others; one that spoils the fit threefold does not."""
+    """Whether each marker agrees with the others; one that triples the residual does not."""
     keep = np.ones(len(points), bool)
     while keep.sum() > 4:
         rms = np.sqrt(np.mean(_residuals(points[keep], target[keep])**2))

@@ -1,4 +1,4 @@
-"""Tables of robots: the gripper's pose and wrench, whatever the columns are called."""
+"""Robot tables: the gripper's pose and wrench, whatever the names of the columns."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,21 +35,21 @@ _QUATERNION = {f"q{a}": f"orientation{a}" for a in "xyzw"}
 _IN_TOPICS = {**{f"{a}_m": f"position{a}" for a in "xyz"},
               **{f"f{a}_n": f"force{a}" for a in "xyz"},
               **{f"t{a}_nm": f"torque{a}" for a in "xyz"}}
-"""How the names of ROS messages end, whatever topic stands before them."""
+"""Last parts of the names in ROS messages, whatever topic precedes them."""
 _UNITS = {"m": (LENGTH_UNITS_M, "m"), "rad": (ANGLE_UNITS_RAD, "rad"),
           "n": (FORCE_NAMES_N, "N"), "nm": (TORQUE_UNITS_NM, "Nm")}
 
 
 def robot_stream(path: str | Path, force_unit: str | None = None,
                  rate_hz: float | None = None) -> Stream:
-    """Read a robot's table: columns x_m .. rz_rad, fx_n .. tz_nm as far as they are there.
+    """Read a robot's table: those of the columns x_m .. rz_rad, fx_n .. tz_nm that are present.
 
-    Known are our own names, those of UR's RTDE (``actual_TCP_pose_0``, ...), and short ones with
-    a unit; a rotation may be a quaternion qx, qy, qz, qw.
+    Known names are our own, those of UR's RTDE (``actual_TCP_pose_0``, ...), and short ones with a
+    unit; a rotation may be a quaternion qx, qy, qz, qw.
 
     Args:
         path: The file.
-        force_unit: Of the forces (torques: times metres); None takes the titles' own.
+        force_unit: Unit of the forces (torques: times metres); None uses the titles' own.
         rate_hz: Samples per second, if there is no time column.
 
     Raises:
@@ -82,11 +82,11 @@ def is_robot_table(titles: list[Title]) -> bool:
 
 
 def _known(titles: list[Title]) -> list[Title]:
-    """Titles of ROS topics and of TUM's trajectories by our names."""
+    """Titles of ROS topics and of TUM's trajectories, renamed to our names."""
     plain = [title.plain for title in titles]
     if {"tx", "ty", "tz", "qx", "qy", "qz", "qw"} <= set(plain) and not (
             set(_ALIASES["x_m"]) & set(plain)):
-        # TUM's translation; with no quaternion it is a torque.
+        # TUM's translation; without a quaternion it is a torque.
         places = {f"t{a}": f"p{a}" for a in "xyz"}
         return [Title(places.get(title.plain, title.name), title.unit) for title in titles]
     renamed = list(titles)
@@ -117,7 +117,7 @@ def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: St
     at = {title.plain: k for k, title in enumerate(titles)}
     if all(name in at for name in ("qx", "qy", "qz", "qw")):
         quaternion = stream.values[:, [at["qx"], at["qy"], at["qz"], at["qw"]]]
-        # One of length 0 is no turn.
+        # A quaternion of length 0 is no rotation.
         length = np.linalg.norm(quaternion, axis=1)
         known = np.isfinite(length) & (length > 1e-6)
         turns = np.full((len(stream), 3), np.nan)

@@ -1,6 +1,6 @@
-"""What a force sensor and a marker system do wrong, found before a fit believes it.
+"""Detection of faults of force sensors and marker systems, before a fit uses their data.
 
-Each check returns the pull with the trouble removed and a sentence about it in ``warnings``.
+Each check returns the pull with the fault removed and a sentence about it in ``warnings``.
 """
 
 from dataclasses import replace
@@ -15,14 +15,14 @@ from limber.recordings.time_series import gaps, saturated, spikes
 
 _FARTHEST, _MOST_TURN, _MOST_FORCE = 1e4, 1e3, 1e6  # m of the branch, rad, N or N m
 PLAUSIBLE_YOUNG_PA = (2e4, 4e10)
-"""From soft silicone to the stiffest dry wood: outside, the force is taken to be mis-scaled."""
+"""From soft silicone to the stiffest dry wood; outside, the force's scale is wrong."""
 
 
 def clean(pull: Pull) -> Pull:
     """Apply every check that needs no model.
 
     Raises:
-        InputError: a position, force or torque is beyond anything that can be recorded.
+        InputError: a position, force or torque is beyond any plausible value.
     """
     _require_possible(pull)
     pull = _without_bad_readings(pull)
@@ -58,9 +58,9 @@ def _require_possible(pull: Pull) -> None:
 
 
 def work_done(pull: Pull) -> np.ndarray:
-    """Return the work [J] that the gripper has done on the branch since the start, shape [n].
+    """Return the cumulative work [J] of the gripper on the branch, shape [n].
 
-    Samples without a wrench count as those before them.
+    Samples without a wrench are given the previous one.
     """
     wrench = pull.wrenches.copy()
     for column in range(6):
@@ -68,15 +68,15 @@ def work_done(pull: Pull) -> np.ndarray:
         wrench[:, column] = np.interp(pull.times, pull.times[measured], wrench[measured, column]
                                       ) if measured.any() else 0.0
     mean = (wrench[1:] + wrench[:-1]) / 2
-    # Rotation vectors add up only for small steps; between two samples they are small.
+    # Rotation vectors add up only for small steps; those between two samples are small.
     return np.r_[0.0, np.cumsum(np.sum(mean * np.diff(pull.poses, axis=0), axis=1))]
 
 
 def force_unit_suspicion(young_pa: float) -> str | None:
-    """Return the likely unit of the force if the modulus that it implies is implausible.
+    """Return the likely unit of the force if the implied modulus is implausible.
 
     Args:
-        young_pa: Young's modulus [Pa] that the measured work implies, forces taken as newtons.
+        young_pa: Young's modulus [Pa] implied by the measured work, with forces in newtons.
     """
     low, high = PLAUSIBLE_YOUNG_PA
     if low <= young_pa <= high:
@@ -90,11 +90,11 @@ def force_unit_suspicion(young_pa: float) -> str | None:
 
 
 def unswapped(observations: Observations) -> tuple[Observations, list[int]]:
-    """Give markers that exchanged names their own name back.
+    """Restore the names of markers that exchanged them.
 
-    Each frame is compared with what constant velocity predicts from the two before; another
-    assignment is taken where it halves the distance or better. Returns the corrected
-    observations and the frames at which names changed.
+    Each frame is compared with a constant-velocity prediction from the two before. Another
+    assignment is used if it at least halves the distance. Returns the corrected observations and
+    the frames at which names changed.
     """
     positions = observations.positions.copy()
     swaps: list[int] = []
@@ -162,7 +162,7 @@ def _tared(pull: Pull) -> Pull:
     travel += pull.entry.grasp.radius_m * np.linalg.norm(
         pull.poses[:, 3:] - pull.poses[0, 3:], axis=1)
     if pull.entry.gravity_m_s2 is not None or travel.max() <= 0:
-        # The hand carries weight at rest, or never moves: nothing says what zero force is.
+        # The hand carries weight at rest, or never moves: the zero of the force is undetermined.
         return pull
     at_rest = np.cumprod(travel <= 0.01 * travel.max()).astype(bool)
     quiet = pull.wrenches[at_rest]
@@ -174,7 +174,7 @@ def _tared(pull: Pull) -> Pull:
     sigma = pull.entry.sensor.force_sigma_n
     peak = np.nanmax(np.linalg.norm(pull.wrenches[:, :3], axis=1))
     bias = np.linalg.norm(offset[:3])
-    # Five standard deviations of the mean, and more than a few percent of what is measured.
+    # Five standard deviations of the mean, and more than a few percent of the measured value.
     if bias <= 5 * sigma / np.sqrt(len(quiet)) or bias <= 0.03 * peak:
         return pull
     return replace(pull, wrenches=pull.wrenches - offset).warned(

@@ -1,4 +1,4 @@
-"""Settings of an import; they load nothing heavy."""
+"""Settings of an import; this module imports no heavy package."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -9,7 +9,7 @@ from limber.recordings.importing.recording_formats import kind_names
 
 
 class ImportSettings(Settings):
-    """How to read a recording."""
+    """Settings for reading a recording."""
 
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "coordinates",

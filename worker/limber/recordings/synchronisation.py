@@ -1,7 +1,7 @@
-"""The robot's and the observer's streams on one clock: frames that an estimator compares.
+"""The streams of robot and observer on one clock: frames that an estimator compares.
 
-The observer's time stamps lead: each of them is a frame, at which the gripper's pose is
-interpolated and its wrench averaged over the time between two frames.
+The observer's time stamps define the frames. At each the gripper's pose is interpolated, and its
+wrench is averaged over the time between two frames.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from limber.recordings.time_series import gaps, inside_gap
 
 @dataclass(frozen=True)
 class Frames:
-    """What was done and seen at the same instants.
+    """Actions and observations at the same instants.
 
     Attributes:
         times: [s] on the robot's clock, shape [f].
@@ -26,7 +26,7 @@ class Frames:
         wrench_counts: Readings averaged in each wrench, shape [f].
         positions: Observed points [m], shape [f, m, 3]; NaN where not seen.
         covariance: [m^2], shape [f, m, 3, 3].
-        warnings: What could not be used.
+        warnings: Data that could not be used.
     """
 
     times: np.ndarray
@@ -47,7 +47,7 @@ class Frames:
 
 
 def frames_of(pull: Pull) -> Frames:
-    """Bring a pull's streams together at the observer's time stamps.
+    """Synchronise a pull's streams at the observer's time stamps.
 
     Raises:
         InputError: the clocks do not overlap, or there is nothing to compare.
@@ -82,10 +82,10 @@ def frames_of(pull: Pull) -> Frames:
 def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
     """Find the offset [s] to add to the observations' stamps, and its standard deviation.
 
-    The observed motion is, without inertia, a smooth function of the gripper's pose: the offset
-    wanted is the one under which a quadratic function of the pose explains the observed points
-    best. A pull at constant speed, started and ended out of view, says nothing about it: the
-    standard deviation then is infinite.
+    Without inertia the observed motion is a smooth function of the gripper's pose. The offset
+    returned is the one for which a quadratic function of the pose best fits the observed points.
+    A pull at constant speed, started and ended out of view, does not determine it: the standard
+    deviation is then infinite.
     """
     seen = pull.observations
     if seen is None or len(seen.times) < 12:
@@ -142,7 +142,8 @@ def _mean_wrenches(pull: Pull, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarr
     for row, moment in enumerate(wanted):
         near = np.flatnonzero(np.abs(times - moment) <= half)
         if half > 2 * step and len(near) > 2:
-            # A mean over a window about the instant is unbiased for what varies linearly in it.
+            # A mean over a window about the instant is unbiased for values that vary linearly in
+            # it.
             slope = np.polynomial.polynomial.polyfit(times[near] - moment, values[near], 1)
             wrenches[row], counts[row] = slope[0], len(near)
         elif np.abs(times - moment).min() <= step:

@@ -1,8 +1,8 @@
-"""Tables of other programs: where header, columns, units and time are, whatever they are called.
+"""Tables of other programs: header, columns, units and time, whatever their names.
 
-A recorder's own CSV has what :mod:`limber.recordings.time_series` reads. Others separate by
-semicolons or tabs, write a preamble above the header, put units in brackets, call time "Time
-Stamp" and count it in milliseconds; here they become streams in SI units, at the door.
+A recorder's own CSV has the format of :mod:`limber.recordings.time_series`. Others separate by
+semicolons or tabs, write a preamble above the header, put units in brackets, call time "Time Stamp"
+and count it in milliseconds. Here they are converted to streams in SI units on input.
 """
 
 import re
@@ -39,7 +39,7 @@ LENGTH_UNITS_M = {spelt: UNIT_METRES[unit] for spelt, unit in LENGTHS.items()}
 FORCE_NAMES_N = FORCE_UNITS_N | {
     "newton": 1.0, "newtons": 1.0, "lb": FORCE_UNITS_N["lbf"], "kg": FORCE_UNITS_N["kgf"],
     **dict.fromkeys(("g", "gram", "grams"), FORCE_UNITS_N["gf"])}
-"""Also what titles call them."""
+"""Force units in newtons, including their names in titles."""
 ANGLE_UNITS_RAD = {"rad": 1.0, "deg": np.pi / 180}
 TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
 
@@ -54,13 +54,14 @@ class Table:
 
     Attributes:
         path: The file.
-        titles: Of the columns, as written (a row of units below them is joined in brackets).
+        titles: Titles of the columns, as written (a row of units below them is appended in
+        brackets).
         values: Shape [n, columns]; NaN in cells without a number. Dates and times of day are
             seconds.
-        warnings: What was wrong.
+        warnings: Faults that were found.
         clocks: Columns that were dates or times of day.
         rate_hz: Frames per second, if the file states it.
-        unit: Of lengths whose titles have none, if the file states it.
+        unit: Unit of lengths without one in their titles, if the file states it.
     """
 
     path: Path
@@ -114,7 +115,7 @@ def read_table(path: str | Path) -> Table:
 
 
 def _without_words(table: Table, words: list[int]) -> Table:
-    """The table without its columns of words."""
+    """The table without its text columns."""
     if not words:
         return table
     kept = [k for k in range(len(table.titles)) if k not in words]
@@ -125,7 +126,7 @@ def _without_words(table: Table, words: list[int]) -> Table:
 
 
 def split_title(title: str) -> Title:
-    """Take the unit off a column's name: :func:`limber.core.files.column_titles.split_title`."""
+    """Split the unit from a column's name: :func:`limber.core.files.column_titles.split_title`."""
     return Title(*column_titles.split_title(title, _UNITS))
 
 
@@ -133,7 +134,7 @@ def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -
     """Return the factor to SI of a column.
 
     Raises:
-        InputError: it names a unit that is none of ``units``.
+        InputError: its unit is none of ``units``.
     """
     unit = title.unit or default
     known = dict(units)
@@ -156,7 +157,8 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
     """Return the table with its time stamps [s] in order; other columns keep their titles.
 
     Raises:
-        InputError: no column of times (and no ``rate_hz``), or too few or too disordered rows.
+        InputError: there is no column of times (and no ``rate_hz``), or the rows are too few or too
+        disordered.
     """
     titles = [split_title(title) for title in table.titles]
     at = time_column(table)
@@ -190,7 +192,7 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
 
 def _stamps(table: Table, titles: list[Title], at: int,
             ) -> tuple[np.ndarray, list[str], tuple[int, ...]]:
-    """Times [s] of a column of stamps, what was assumed of them, and which columns they are."""
+    """Times [s] of a column of stamps, the assumptions made, and the columns used."""
     title, values = titles[at], table.values[:, at]
     other = next((k for k in table.clocks if k != at and is_time(titles[k].name)), None)
     if at in table.clocks and other is not None:
@@ -218,7 +220,7 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
 
     Args:
         path: The file.
-        unit: Of the positions; None takes the titles' own, metres where they have none.
+        unit: Unit of the positions; None uses the titles' own, or metres if they have none.
         rate_hz: Frames per second, if there is no time column.
 
     Returns:
@@ -246,7 +248,7 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     warnings = list(stream.warnings)
     if ignored:
         warnings.append(f"{Path(path).name}: columns not used: {', '.join(ignored)}.")
-    # In C order: sums over what chosen columns give would differ in their last digits.
+    # In C order: otherwise sums over selected columns would differ in their last digits.
     values = np.ascontiguousarray(stream.values[:, used]) * scales
     positions = values.reshape(len(stream), -1, 3)
     return marker_tracks(stream.times, positions, warnings), list(whole)
@@ -265,13 +267,13 @@ def _places(titles: Sequence[str]) -> dict[str, dict[str, int]]:
 
 def marker_tracks(times: np.ndarray, positions: np.ndarray, warnings: Sequence[str] = (),
                   ) -> Stream:
-    """Return tracks of markers as a stream: ``m0_x_m``, ``m0_y_m``, ``m0_z_m``, ``m1_x_m``, ...
+    """Return marker tracks as a stream: ``m0_x_m``, ``m0_y_m``, ``m0_z_m``, ``m1_x_m``, ...
 
     Args:
         times: [s], shape [n].
-        positions: [m], shape [n, m, 3]. Motion capture writes (0, 0, 0) for a marker that it does
-            not see, or NaN.
-        warnings: What was wrong with the file.
+        positions: [m], shape [n, m, 3]. Motion capture writes (0, 0, 0) or NaN for an invisible
+            marker.
+        warnings: Faults of the file.
     """
     seen = positions.copy(order="K")
     seen[np.all(positions == 0.0, axis=2)] = np.nan
@@ -280,7 +282,7 @@ def marker_tracks(times: np.ndarray, positions: np.ndarray, warnings: Sequence[s
 
 
 def same_label(one: str, other: str) -> bool:
-    """Whether two names mean one marker: ``Tip - 1`` and ``tip1``."""
+    """Whether two names denote the same marker: ``Tip - 1`` and ``tip1``."""
     return _bare(one) == _bare(other)
 
 
@@ -291,7 +293,7 @@ def _bare(label: str) -> str:
 
 def _titles(above: list[list[str]], comments: list[str], width: int, separator: str | None,
             ) -> list[str] | None:
-    """The lowest line above the numbers with as many names; a line of units below it joins in."""
+    """The lowest title line with as many names; units in the next line are appended."""
     fitting = [row for row in above if len(row) == width and _is_named(row)]
     if not fitting:
         fitting = [row for comment in comments

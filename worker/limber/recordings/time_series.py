@@ -1,6 +1,6 @@
-"""Time-stamped tables of a recording, read from CSV and cleaned of what sensors do wrong.
+"""Time-stamped tables of a recording, read from CSV and cleaned of sensor faults.
 
-Nothing is repaired in silence: each repair leaves a sentence in ``warnings``.
+No repair is silent: each adds a sentence to ``warnings``.
 """
 
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from limber.core.errors import InputError
 from limber.core.files.reading import read_text
 
 MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal variable over its median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation of a normal variable."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Stream:
 
     Attributes:
         times: Increasing time stamps [s], shape [n].
-        values: One row a sample, shape [n, columns]; NaN where nothing was measured.
+        values: One row per sample, shape [n, columns]; NaN if not measured.
         columns: Names of the columns of ``values``.
-        warnings: What was wrong with the file and what was done about it.
+        warnings: Faults of the file and their repairs.
     """
 
     times: np.ndarray
@@ -45,13 +45,12 @@ class _Rows:
 def read_stream(path: str | Path) -> Stream:
     """Read a CSV file with a header and a column of time stamps [s].
 
-    An unfinished last line is dropped, rows are brought into the order of time, of rows with the
-    same stamp the first is kept; each with a warning. Empty fields and ``nan`` mean "not
-    measured".
+    An unfinished last line is dropped, rows are sorted by time, and of rows with the same stamp the
+    first is kept; each with a warning. Empty fields and ``nan`` mean "not measured".
 
     Raises:
-        InputError: no such file, no time column, fewer than two rows, a field that is not a
-            number, or a tenth or more of the rows out of order (then the clock is not a clock).
+        InputError: there is no such file, no time column, fewer than two rows, a field that is not
+            a number, or a tenth or more of the rows are out of order (the clock is then unusable).
     """
     path = Path(path)
     rows = _read_rows(path)
@@ -80,14 +79,14 @@ def write_stream(path: str | Path, stream: Stream) -> None:
 
 
 def gaps(times: np.ndarray, factor: float = 5.0) -> np.ndarray:
-    """Return the intervals (start, end) [s] over ``factor`` median steps long, shape [g, 2]."""
+    """Return the intervals (start, end) [s] longer than ``factor`` median steps, shape [g, 2]."""
     steps = np.diff(times)
     wide = steps > factor * np.median(steps)
     return np.column_stack([times[:-1][wide], times[1:][wide]])
 
 
 def inside_gap(times: np.ndarray, intervals: np.ndarray) -> np.ndarray:
-    """Whether each time lies strictly within one of the intervals, shape [n] of bool."""
+    """Whether each time is strictly within one of the intervals, shape [n] of bool."""
     inside = np.zeros(len(times), bool)
     for start, end in intervals:
         inside |= (times > start) & (times < end)
@@ -97,9 +96,9 @@ def inside_gap(times: np.ndarray, intervals: np.ndarray) -> np.ndarray:
 def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> np.ndarray:
     """Find readings far from their neighbours, shape [n] of bool.
 
-    Each window's middle is compared with a robust line through the window (Theil and Sen), so
-    that a fast pull is not taken for a spike and up to three readings in a row are found. A spike
-    lies more than ``threshold`` robust standard deviations off.
+    Each window's middle is compared with a robust line through the window (Theil and Sen). A fast
+    pull is then not taken for a spike, and up to three consecutive spikes are found. A spike
+    differs by more than ``threshold`` robust standard deviations.
     """
     width = 2 * half_window + 1
     if len(values) < width:
@@ -113,12 +112,13 @@ def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> 
                       / (place[second] - place[first]), axis=2)
     expected = np.median(windows - slope[..., None] * place, axis=2)
     residual = np.abs(values - expected)
-    # One scale for all axes: the noise of a sensor is alike in them, and an axis that hardly
-    # moves has none to show.
+    # One scale for all axes: a sensor's noise is similar in all of them, and an axis that hardly
+    # moves does not show it.
     typical = MAD_TO_SIGMA * np.median(residual[np.any(residual > 0, axis=1)]
                                        if np.any(residual) else residual)
     far = residual > threshold * typical + 1e-3 * np.abs(values).max()
-    # A spike bends the line of its neighbours, which then look off as well, by less.
+    # A spike distorts the line of its neighbours, whose deviations then look large too, but
+    # smaller.
     around = np.pad(residual, ((half_window, half_window), (0, 0)))
     largest = np.lib.stride_tricks.sliding_window_view(around, width, axis=0).max(axis=2)
     return np.any(far & (residual > 0.5 * largest), axis=1)
@@ -176,7 +176,7 @@ def _read_rows(path: Path) -> _Rows:
 
 def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str],
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Sort rows by time and drop those without a stamp or with one that was there before.
+    """Sort rows by time and drop those without a stamp or with a duplicate one.
 
     Each repair adds a sentence to ``warnings``.
 

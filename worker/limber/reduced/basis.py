@@ -22,18 +22,20 @@ from limber.reduced.training import Snapshots
 # Shares and steps weigh what a basis is made of against each other: chosen, not measured one by
 # one; the errors that come out are (scripts/bench mechanics, rows of the reduced model).
 TANGENT_SHARE = 0.25
-"""Weight of tangents beside states; they stand for the change by the steps below."""
+"""Weight of tangents relative to states; a tangent represents the change by the steps below."""
 SWING_SHARE = 0.1
 """Weight of swung states beside those at rest: they are for motion, which is less exact."""
 SWING_STRAIN_SHARE = 0.05
 """The same among the strain fields."""
 MOVE_STEP = 0.05
-"""Step of a tangent to the position, as part of the extent."""
+"""Step of a tangent in position, as a fraction of the extent."""
 TURN_STEP = 0.15
 """Step of a tangent to the rotation [rad]."""
 VIBRATION_STEP = 0.03
-"""Amplitude of a vibration among the strain fields, as part of the extent: large, since free ends
-have next to no strain in the states, and would flutter if their own strains were left out."""
+"""Amplitude of a vibration among the strain fields, as a fraction of the extent. It is large
+because free ends have hardly any strain in the states and would flutter without strain fields of
+their own.
+"""
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class Basis:
         columns: Lifts, then modes, shape [size, node_count, 3].
         lift_count: Number of lifts.
         states: Coordinates of the training states, shape [s, size].
-        captured: Part of the snapshots' H1 energy that the basis holds.
+        captured: Fraction of the snapshots' H1 energy that the basis contains.
         reach: Largest size of each coordinate in training, swung states included, shape [size].
     """
 
@@ -114,7 +116,7 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
             the states for the other columns: they are many, and statics does without them.
 
     Raises:
-        InputError: fewer columns than lifts and vibrations take, or snapshots that hold nothing.
+        InputError: fewer columns than lifts and vibrations need, or empty snapshots.
     """
     coordinates = GraspCoordinates(grasp)
     count = coordinates.count
@@ -191,7 +193,7 @@ def elastic_lifts(model: BranchModel, coordinates: GraspCoordinates) -> np.ndarr
 
 
 def tangent_steps(model: BranchModel, snapshots: Snapshots) -> np.ndarray:
-    """Return the steps that the pose tangents stand for [m and rad], shape [3 or 6]."""
+    """Return the steps that the pose tangents represent [m and rad], shape [3 or 6]."""
     count = snapshots.pose_tangents.shape[1]
     return np.array(3 * [MOVE_STEP * model.extent] + (count - 3) * [TURN_STEP])
 

@@ -51,7 +51,7 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                      settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
     """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`.
 
-    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is wanted, which doubles its size.
+    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is needed, which doubles its size.
     """
     control_young = np.asarray(control_young, float)
     if not settings.vibration_count:
@@ -74,8 +74,8 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
 def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
     """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
 
-    Control points are the mesh's; where the field is not what they can give (or there are none)
-    it becomes one region with its own pattern, and only its level can change.
+    Control points are the mesh's. If they cannot represent the field (or there are none), it
+    becomes one region with its own pattern, and only its level can change.
     """
     from limber.mechanics.materials.young_field import young_weights
 

@@ -1,9 +1,8 @@
 """A cache of trained reduced models.
 
-A model takes minutes to learn and depends on nothing but the branch, its material and weight, the
-patch that is held and what it was asked to learn: a digest of these names its file. One file holds
-the model and the full solutions it was made of, so that no reader sees two that do not belong
-together. ::
+Training takes minutes and depends only on the branch, its material and weight, the held patch and
+the training settings: a digest of these is the file's name. One file contains the model and the
+full solutions it was made from, so that a reader never sees two that do not belong together. ::
 
     learnt = learnt_model(model, grasp, weights, control_young, settings,
                           cache=ReducedCache(default_folder()))
@@ -36,10 +35,10 @@ from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Snapshots, TrainingSettings
 
 LIMIT_BYTES = 2 << 30
-"""How much all models of a folder may take: a dozen of a branch of some thousand tetrahedra."""
+"""Largest size of all models of a folder: a dozen for a branch of some thousand tetrahedra."""
 SHARED = ReducedSettings(size=80, vibration_count=1, field_count=130, training=TrainingSettings(
     grasp_count=160, young_spread=1.0))
-"""What is learnt of a branch whose moduli are known, where nobody asks otherwise."""
+"""Default training of a branch whose moduli are known."""
 SNAPSHOT_PREFIX = "snapshot_"
 _LEFT_OVER_SECONDS = 24 * 3600.0
 _WAIT_SECONDS = 0.5
@@ -135,7 +134,7 @@ class ReducedCache:
     def learning(self, key: str) -> Iterator[None]:
         """Hold the lock of a model's training, so that no other process trains it meanwhile.
 
-        Where no lock can be made, each process trains its own.
+        If no lock can be made, each process trains its own.
 
         Raises:
             Timeout: another process holds it.

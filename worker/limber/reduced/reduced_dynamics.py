@@ -18,8 +18,9 @@ from limber.reduced.state import ReducedState
 _NEAR = 1e-5
 """Next gain of energy over the energy from which Newton is taken to close in; chosen."""
 _JUMP = 2e-3
-"""Grasp's motion off its old velocity, as part of the extent, that a first step foresees: chosen,
-not measured."""
+"""Deviation of the grasp from its old velocity, as a fraction of the extent, that a first step
+allows for. Chosen, not measured.
+"""
 _LIVE_HALVINGS = 3
 """Halvings of a step that fails, at most: 8 steps of about a millisecond fit into one of 60 Hz."""
 _NEWMARK = NewmarkSettings()
@@ -39,7 +40,7 @@ class ReducedStepper:
     """Steps the reduced model through time, driven at the grasp.
 
     Args:
-        model: With the Young's modulus wanted.
+        model: With the requested Young's modulus.
         state: Where to start; a static state starts at rest.
         nodal_forces: Dead loads [N] besides gravity, shape [node_count, 3].
     """
@@ -59,7 +60,7 @@ class ReducedStepper:
 
     @property
     def strain_energy(self) -> float:
-        """Of the strain since the model's mesh [J]."""
+        """Energy of the strain relative to the model's mesh [J]."""
         return self.model.strain_energy(self.state.coordinates)
 
     @property
@@ -76,8 +77,8 @@ class ReducedStepper:
     def move(self, pose: np.ndarray, step: float) -> bool:
         """Step to a pose [m, rad] that is reached in ``step`` [s]; return whether it converged.
 
-        The grasp's velocity is that of the straight way there, its acceleration 0: poses that
-        come live, with noise, must not shake the branch by their second difference.
+        The grasp's velocity is that of the straight line to the pose, its acceleration 0: live
+        poses have noise, and their second difference must not shake the branch.
         """
         return self._move(check_pose(pose), step, _LIVE_HALVINGS)
 
@@ -88,7 +89,8 @@ class ReducedStepper:
         if self.step(held, velocity, np.zeros(count), step, foresee=True):
             self.pose = pose
             return True
-        # A branch pressed on its axis buckles within the step: inertia tells shorter ones where.
+        # A branch compressed along its axis buckles within the step; in shorter steps inertia
+        # decides where to.
         return halvings > 0 and self.pose is not None and all(
             self._move(goal, step / 2, halvings - 1)
             for goal in (pose_between(self.pose, pose, 0.5), pose))

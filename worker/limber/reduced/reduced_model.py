@@ -7,7 +7,7 @@ polynomial (limber.reduced.strain_polynomial). ::
     state = reduced.with_young(young).solve_static(pose)
     state.strain_energy, state.reaction_force, reduced.displacement(state)
 
-How far to trust it: :mod:`limber.reduced.refresh`.
+For its error see :mod:`limber.reduced.refresh`.
 """
 
 import copy
@@ -29,10 +29,11 @@ from limber.reduced.training_poses import TrainingPoses
 _STATIC = ReducedStaticSettings()
 _NO_INCREMENT = np.empty(0)
 _LOST = 0.25
-"""Part of the potential's change in a step that its work may leave open before the step is taken
-for a jump: as for the full model (limber.mechanics.statics.path)."""
+"""Fraction of the potential's change in a step beyond its work above which the step counts as a
+jump, as for the full model (limber.mechanics.statics.path).
+"""
 _LEADING = 20
-"""Modes that tell whether a state is like those of the training: chosen, not measured."""
+"""Modes that decide whether a state is like those of the training. Chosen, not measured."""
 
 
 @dataclass
@@ -70,7 +71,7 @@ class ReducedModel:
         young_spread: Factor in Young's modulus within which the training sampled.
         extent: Diagonal of the branch's bounding box [m].
         error: Held-out errors measured when it was built (limber.reduced.refresh).
-        poisson: Poisson's ratio, where it is another than the training's.
+        poisson: Poisson's ratio, if it differs from the training's.
         strain_fields: What strain is made of, shape [tet_count, q, 6, m]; None where it was not
             kept, and :meth:`strains` is not to be had.
     """
@@ -179,7 +180,7 @@ class ReducedModel:
     def strains(self, q: np.ndarray) -> np.ndarray:
         """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12).
 
-        As the model assumes it: a tenth as far off the full model's as that of the displacement.
+        As the model assumes it; its error is a tenth of that of the displacement's strain.
         """
         self.strain_energy(q)
         shares = np.linalg.solve(self.root.T, self._work.strain).astype(np.float32)
@@ -204,9 +205,9 @@ class ReducedModel:
                      ) -> ReducedState:
         """Return the equilibrium at a pose [m, rad]; look at ``converged`` and ``trusted``.
 
-        Starts from ``start`` or from the nearest training state. A state that fails, is not
-        stable or lies outside the training is sought again from others, on longer ways; the one
-        of the lowest energy counts.
+        Starts from ``start`` or from the nearest training state. If the state fails, is unstable or
+        outside the training, the search is repeated from other states on longer paths; the state of
+        the lowest energy counts.
         """
         began = time.perf_counter()
         pose = check_pose(pose)
@@ -230,8 +231,8 @@ class ReducedModel:
                  settings: ReducedStaticSettings = _STATIC) -> ReducedState:
         """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size].
 
-        Unlike :meth:`solve_static` it looks for no other, and goes in steps so short that none
-        jumps to another; where one would, the state is not converged.
+        Unlike :meth:`solve_static` it searches for no other state, and its steps are so short that
+        none jumps; if one would, the state is not converged.
         """
         began, pose = time.perf_counter(), check_pose(pose)
         at_pose = np.concatenate([self.grasp.centre + start[:self.basis.lift_count], pose[3:]])
@@ -241,8 +242,9 @@ class ReducedModel:
 
     def pulled(self, start: np.ndarray, force: np.ndarray,
                settings: ReducedStaticSettings = _STATIC) -> ReducedState | None:
-        """Return the equilibrium under a force [3] on a pinned grasp, from coordinates ``start``
-        [size], held there; None where the way ends before, as at a snap."""
+        """Return the equilibrium under a force [3] on a pinned grasp, from the coordinates
+        ``start`` [size]; None if the path ends before, as at a snap.
+        """
         count = self.basis.lift_count
         begin = (self.energy_force(start)[1] - self.load)[:count]
         q, reached, step = start, 0.0, 1.0
@@ -312,8 +314,9 @@ class ReducedModel:
     def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
                 settings: ReducedStaticSettings, most: int, *, steadily: bool = False,
                 ) -> "_Found":
-        """Newton to the pose in ``most`` iterations; halves the way where that fails, ``steadily``
-        also where the branch may have jumped."""
+        """Newton to the pose in ``most`` iterations; if that fails, the step is halved, with
+        ``steadily`` also if the branch may have jumped.
+        """
         iterations, reached, step = 0, 0.0, 1.0
         while True:
             part = min(1.0, reached + step)
@@ -335,8 +338,9 @@ class ReducedModel:
                 return replace(found, converged=False, iterations=iterations)
 
     def _came_from(self, q: np.ndarray, found: "_Found") -> bool:
-        """Whether an equilibrium follows on the one at ``q``: every tangent on the way to it was
-        positive definite, or the potential changed by as much as the gripper worked."""
+        """Whether an equilibrium continues the one at ``q``: every tangent along the path was
+        positive definite, or the potential changed by the work of the gripper.
+        """
         if found.steady:
             return True
         count, energies, forces = self.basis.lift_count, [], []
@@ -412,7 +416,7 @@ class _Found:
 def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:
     """Solve with the lower triangle; raise the diagonal until it is positive definite.
 
-    Returns the solution (NaN where there is none) and whether nothing had to be raised.
+    Returns the solution (NaN if there is none) and whether the diagonal stayed as it was.
     """
     from scipy.linalg.lapack import dposv
 

@@ -1,9 +1,8 @@
 """The error of a reduced model against the full one, and its refresh where that is too large.
 
-A few Newton corrections of the full model at a reduced state tell the error, for the price of as
-many factorisations. A :class:`RefreshingModel` makes it where asked, answers with the
-full solution where the reduced one is not good enough, and learns from it: the new full solutions
-enter the basis.
+A few Newton corrections of the full model at a reduced state give its error at the cost of as many
+factorisations. A :class:`RefreshingModel` does this on request, answers with the full solution if
+the reduced one is not good enough, and adds the new full solutions to the basis.
 """
 
 from dataclasses import dataclass, replace
@@ -24,14 +23,15 @@ from limber.reduced.state import ReducedSettings, ReducedState
 from limber.reduced.training import Snapshots, Trainer
 
 _CORRECTIONS = 4
-"""Newton steps of the full model that a reduced state is compared after. Of 90 grasps after E
-changed by up to 3, 11 of them more than 0.5 % of the length or 1 % of the energy off: 1, 2, 3, 4
-steps flag 74, 43, 4, 0 of those that are good, and 11, 9, 10, 11 of those that are not."""
+"""Newton steps of the full model after which a reduced state is compared. Of 90 grasps after E
+changed by up to 3, of which 11 had errors above 0.5 % of the length or 1 % of the energy: 1, 2, 3,
+4 steps flag 74, 43, 4, 0 of the good ones, and 11, 9, 10, 11 of the bad ones.
+"""
 _POSITION, _ENERGY = 0.0045, 0.009
-"""Errors, of the extent and of the energy, beyond which a state is doubted: a tenth below those
-that no state may have unsaid (0.5 %, 1 %). What is measured falls a little short of what is there:
-of 300 grasps 3 were off by 0.50 to 0.52 % and said to be less, and none of 245 good ones was
-doubted.
+"""Errors, relative to the extent and the energy, above which a state is flagged: a tenth below the
+largest unflagged errors allowed (0.5 %, 1 %), since the measured error is slightly too small. Of
+300 grasps, 3 had errors of 0.50 to 0.52 % that were measured as less, and none of 245 good ones was
+flagged.
 """
 
 
@@ -90,10 +90,11 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
 
 def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance: float = _POSITION,
             energy_tolerance: float = _ENERGY) -> ReducedState:
-    """Return a state with the doubt that its measured error leaves: none where it is small.
+    """Return a state with the doubt that follows from its measured error; none if it is small.
 
-    What the reduced model itself can say (how far from its training a state is) tells little: most
-    bad states lie within, at moduli that the basis knows, where a free end points a little astray.
+    The reduced model's own indicator (the distance of a state from its training) shows little: most
+    bad states are within the training, at moduli that the basis covers, with a free end slightly
+    misaligned.
     """
     if not state.converged:
         uncertainty = "no stable equilibrium was found"
@@ -164,7 +165,7 @@ class Answer:
         displacement: [m], shape [node_count, 3].
         strain_energy: [J].
         reaction_force: Of the gripper on the branch [N], shape [3].
-        estimate: The error of the reduced state, where it was checked.
+        estimate: The error of the reduced state, if it was checked.
     """
 
     source: str
@@ -182,8 +183,8 @@ class RefreshingModel:
         model, grasp, weights, control_young, settings: As for ``build_reduced``.
         position_tolerance: Largest error of a node relative to the extent that is accepted.
         energy_tolerance: Largest relative error of the energy.
-        refresh_every: New full solutions after which the basis is made anew.
-        reduced, snapshots: A model that is there already, with what it was made of.
+        refresh_every: New full solutions after which the basis is made again.
+        reduced, snapshots: An existing model with the solutions it was made from.
     """
 
     def __init__(self, model: BranchModel, grasp: Grasp, weights: np.ndarray,

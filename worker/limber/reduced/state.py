@@ -32,8 +32,8 @@ class ReducedStaticSettings:
 
     Attributes:
         tolerance: Energy that a Newton step would still gain, relative to the strain energy.
-        max_iterations: Newton iterations a step.
-        max_halvings: How often the way to the pose is halved before another start is tried.
+        max_iterations: Most Newton iterations per step.
+        max_halvings: Most halvings of the path to the pose before another start is tried.
         start_count: How many starts are tried, the given state included.
         novelty_limit: Largest coordinate relative to the training's beyond which the state is
             taken for false and sought again from other starts.
@@ -55,12 +55,12 @@ class ReducedState:
 
     Attributes:
         converged: Whether it is a stable equilibrium of the reduced model.
-        trusted: Whether it also lies within what the basis was made from; see ``doubt``.
+        trusted: Whether it is also within the training of the basis; see ``doubt``.
         doubt: Why it is not trusted, empty if it is.
         coordinates: q, shape [size].
         pose: [m, rad], shape [6].
         young: At the control points [Pa], shape [K].
-        strain_energy: Of the strain since the model's mesh [J].
+        strain_energy: Energy of the strain relative to the model's mesh [J].
         energy: Potential of strain and weight, as in StaticResult [J].
         reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], shape [3]; torque
             about the pose's position.

@@ -176,7 +176,7 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
                     control_young: np.ndarray, snapshots: Snapshots | None,
                     field_count: int | None, *, keeps_fields: bool = False,
                     ) -> tuple[StrainPolynomial, np.ndarray | None]:
-    """Return the strain polynomial of a basis, and the fields if they are wanted.
+    """Return the strain polynomial of a basis, and the fields on request.
 
     Args:
         weights: From control points to tetrahedra, shape [tet_count, K].
@@ -350,7 +350,7 @@ def _all_fields(points: _Points, basis: Basis) -> np.ndarray:
         terms = _terms(points, basis, chunk)
         flat = terms.reshape(-1, terms.shape[2])
         gram = gram + points.stress(terms, chunk).reshape(flat.shape).T @ flat
-    # Terms of very different size: scaled first, so that none drowns in another's round-off.
+    # Terms of very different size are scaled first, so that none is lost in another's round-off.
     scale = 1 / np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
     return scale[:, None] * _leading(gram * scale * scale[:, None], None)
 

@@ -19,13 +19,16 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 
 _YOUNG_SCALE = 0.1
-"""Metres per factor e in Young's modulus, as part of the extent; chosen, not measured."""
+"""Distance per factor e in Young's modulus, as a fraction of the extent. Chosen, not measured."""
 _TIP_TURNS = 1.3
-"""How much a cantilever's end turns per turn of its chord: between 1 (stiff) and 1.5 (small)."""
+"""Rotation of a cantilever's end per rotation of its chord: between 1 (stiff) and 1.5 (small
+deflection).
+"""
 
 _SWING = 0.14
-"""How far the lowest vibration swings a state out, as part of the extent; higher ones less: about
-what brisk motion does. Chosen, not measured."""
+"""Amplitude of the lowest vibration added to a state, as a fraction of the extent; higher ones are
+smaller. About that of brisk motion. Chosen, not measured.
+"""
 _SWING_COUNT = 3
 """States swung out from one: chosen, not measured."""
 
@@ -40,8 +43,8 @@ class TrainingSettings:
         turn: Largest rotation of a clamped grasp away from the natural one [rad].
         young_spread: Young's modulus at each control point is sampled between 1/spread and
             spread times its value for every second grasp; 1: it is known and stays.
-        vibration_every: At every so many states the lowest vibrations are added, and states
-            swung out along them, which motion in time needs; 0: none.
+        vibration_every: Number of states after which the lowest vibrations, and states displaced
+            along them, are added, as motion in time needs; 0: none.
         vibration_count: How many of them.
         seed: Of the sampling.
     """
@@ -83,7 +86,7 @@ class Snapshots:
         swings: States with free ends swung out far along vibrations, held at rest there by the
             loads that bend them so [m], shape [w, node_count, 3].
         swing_states: The states they belong to, shape [w].
-        failed: Number of wanted grasps that found no equilibrium.
+        failed: Number of requested grasps without an equilibrium.
     """
 
     poses: np.ndarray
@@ -184,7 +187,7 @@ def pose_distance(model: BranchModel, poses: np.ndarray, young: np.ndarray, pose
 
 
 class Trainer:
-    """Solves the full model at wanted grasps, each from the nearest state that it has.
+    """Solves the full model at requested grasps, each from the nearest known state.
 
     Args:
         model: The branch; its Young's modulus is replaced by ``weights @ control_young``.
@@ -217,7 +220,7 @@ class Trainer:
     def take(self, poses: np.ndarray, young: np.ndarray, known: Snapshots | None = None, *,
              vibration_every: int = 0, vibration_count: int = 0,
              progress: Progress = SILENT) -> Snapshots:
-        """Solve all wanted grasps, nearest first, and differentiate each.
+        """Solve all requested grasps, nearest first, and differentiate each.
 
         Args:
             poses: [m, rad], shape [s, 6]. young: At the control points [Pa], shape [s, K].

@@ -1,4 +1,4 @@
-"""What was found, in sentences that report, scene and terminal share."""
+"""Findings as sentences that report, scene and terminal share."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,16 +15,17 @@ ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is 
            "the real branch.")
 ASSUMED_PULL = "from a simulated pull with an assumed modulus"
 _MOST_NAMED = 6
-"""Control points whose moduli stand one by one in a sentence."""
+"""Most control points whose moduli are listed one by one in a sentence."""
 SAME = 0.05
-"""Percent of energy and length by which two paths that count as one differ at most."""
+"""Largest difference of energy and length [%] at which two paths count as one."""
 PATH_NAMES = {"baseline": "shortest", "plan": "gentle"}
-"""Of the two paths of a plan, in text, tables and figures."""
+"""Names of the two paths of a plan in text, tables and figures."""
 
 
 def simulated_pull(branch: Branch) -> dict[str, Any] | None:
-    """Return the result of a branch's first simulated pull, ``young_assumed`` where the branch
-    was not generated and nothing is known of its modulus; None where all pulls were measured."""
+    """Return the result of a branch's first simulated pull; None if all pulls were measured.
+    ``young_assumed`` is set if the branch was not generated and its modulus is unknown.
+    """
     stages = branch.manifest.stages
     found = [stages[key].result for key in (f"pull:{name}" for name in branch.names("pulls"))
              if key in stages and stages[key].result.get("young_true_pa") is not None]
@@ -32,7 +33,7 @@ def simulated_pull(branch: Branch) -> dict[str, Any] | None:
 
 
 def modulus_origin(branch: Branch) -> str:
-    """Return where the mesh's modulus is from: one that was assumed looks the same in colours."""
+    """Return the source of the mesh's modulus: in colours an assumed one looks like an estimate."""
     made = branch.manifest.files.get("mesh.vtu")
     if made is None or made.stage in ("reconstruct", "mesh"):
         return "assumed"
@@ -45,7 +46,7 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
 
     Args:
         estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa], with None where open.
-        assumed: What is to be known of them before they are read; empty for a real pull.
+        assumed: What the reader must know first; empty for a real pull.
     """
     intervals = estimate.get("young_interval_pa") or [None] * len(estimate["young_pa"])
     told = [_with_interval(young, interval) for young, interval in zip(
@@ -61,7 +62,7 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
 
 
 def path_sentence(plan: Mapping[str, Any]) -> str:
-    """Return length, energy and force of the gentle path, and what it saves.
+    """Return length, energy and force of the gentle path, and its savings.
 
     Args:
         plan: Summary of a plan.
@@ -83,7 +84,7 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
 
 
 def certificate_sentence(plan: Mapping[str, Any]) -> str:
-    """Return how far a plan's cost is at most above the least possible, as far as it is proven."""
+    """Return how far a plan's cost can be above the optimum, as far as proven."""
     certificate = plan.get("certificate") or {}
     gaps = [(certificate.get("gap_percent"), "on the energy field"),
             ((certificate.get("full_model") or {}).get("gap_percent"), "on the full model")]
@@ -94,14 +95,14 @@ def certificate_sentence(plan: Mapping[str, Any]) -> str:
 
 
 def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:
-    """Return what is beyond an arm or the wood along a plan's paths, by measure.
+    """Return the limits of arm or wood that a plan's paths exceed, by measure.
 
     Args:
-        plan: Summary of a plan; ``robot`` names the arm it is for, ``strength`` has the strain at
-            which half of such branches break, and its source.
+        plan: Summary of a plan; ``robot`` names its arm, ``strength`` has the strain at which half
+            of such branches break, and its source.
 
     Returns:
-        Sentences by ``peak_force_n`` and ``peak_strain``; nothing where all is within reach.
+        Sentences by ``peak_force_n`` and ``peak_strain``; empty if no limit is exceeded.
     """
     found = {}
     for key, over in (("peak_force_n", _over_arm), ("peak_strain", _over_wood)):
@@ -116,18 +117,19 @@ def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:
 
 
 def beyond_sentence(plan: Mapping[str, Any]) -> str:
-    """Return what along a plan's paths is beyond an arm or the wood; empty where nothing is."""
+    """Return sentences on the limits of arm or wood that a plan's paths exceed; empty if none."""
     labels = {"peak_force_n": "Peak force", "peak_strain": "Largest strain"}
     return " ".join(f"{labels[key]}, {words}." for key, words in remarks_on(plan).items())
 
 
 def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
-    """Say which arm cannot carry a path's force: the plan's, or the strongest known that cannot."""
+    """State which arm cannot apply a path's force: the plan's, or the strongest known that cannot.
+    """
     force, model = float(plan[path]["peak_force_n"]), (plan.get("robot") or {}).get("model")
     try:
         arms = [arm_named(model)] if model else list(ARMS.values())
     except InputError:
-        # The arm's file, or the package that has the arm, is on another computer.
+        # The arm's file, or the package that provides the arm, is on another computer.
         return ""
     weak = [arm for arm in arms if force > arm.payload * STANDARD_GRAVITY]
     if not weak:
@@ -153,7 +155,7 @@ def _with_interval(young: float, interval: Sequence[float | None] | None) -> str
 
 
 def _mpa(value: float) -> str:
-    """Three digits [MPa], never with an exponent."""
+    """Three digits [MPa], without an exponent."""
     return f"{float(f'{value / 1e6:.3g}'):,.10g}"
 
 

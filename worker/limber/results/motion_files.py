@@ -28,8 +28,8 @@ def write_pc2(path: Path, positions: np.ndarray, start: float = 0.0, rate: float
 
     Args:
         positions: Vertices [m], shape [frames, n, 3].
-        start: First frame's number.
-        rate: Frames a sample.
+        start: Number of the first frame.
+        rate: Frames per sample.
     """
     positions = np.asarray(positions, np.float32)
     shaped = positions.ndim == 3 and positions.shape[2] == 3 and len(positions) > 0
@@ -46,7 +46,7 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
     """Return positions [frames, n, 3], start and rate of a PC2 file.
 
     Raises:
-        InputError: it is not one, or it is cut short.
+        InputError: it is no PC2 file, or it is truncated.
     """
     data = Path(path).read_bytes()
     whole = len(data) >= _PC2_HEADER.size
@@ -65,7 +65,7 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
 
 
 class FramesFile(FileContent):
-    """Content of ``frames/NAME.json`` as far as it is read: lists with a number a frame."""
+    """Content of ``frames/NAME.json`` that is read: lists with one number per frame."""
 
     frame_count: int | None = Field(None, ge=1)
     rate: float = Field(24.0, gt=0, le=1e6)
@@ -94,18 +94,18 @@ def read_frames_file(path: Path) -> FramesFile:
     """Read the description of a motion's frames.
 
     Raises:
-        InputError: it cannot be read, or its lists do not fit each other.
+        InputError: it cannot be read, or its lists differ in length.
     """
     return read_json_as(path, FramesFile, "a description of a motion's frames")
 
 
 def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np.ndarray]:
-    """Return what a surface can be coloured by in each frame, for ``frames/NAME.npz``.
+    """Return the values for colouring a surface in each frame, for ``frames/NAME.npz``.
 
-    Averages by volume of the tetrahedra about a vertex; for det F the least of them.
+    Volume-weighted averages over the tetrahedra at a vertex; for det F their minimum.
 
     Args:
-        states: One a frame, from :func:`limber.mechanics.strain.strain_state`.
+        states: One per frame, from :func:`limber.mechanics.strain.strain_state`.
 
     Returns:
         ``strain_energy_density_j_m3``, ``principal_strain`` (the largest),
@@ -124,7 +124,7 @@ def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np
 
 
 def node_average(mesh: TetMesh) -> sp.csr_matrix:
-    """Return the matrix that averages values of tetrahedra at each node by volume, [n, tets]."""
+    """Return the matrix that averages tetrahedron values at each node by volume, [n, tets]."""
     count, width = mesh.tets.shape
     volume = np.repeat(np.abs(mesh.volumes), width)
     matrix = sp.csr_matrix((volume, (mesh.tets.ravel(), np.repeat(np.arange(count), width))),
@@ -141,14 +141,14 @@ def _least_at_nodes(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
 
 def write_pvd_series(folder: Path, name: str, model: BranchModel, times: np.ndarray,
                      displacement: np.ndarray) -> list[Path]:
-    """Write ``name.pvd`` and one VTU a frame, with strain, stress and energy density.
+    """Write ``name.pvd`` and one VTU per frame, with strain, stress and energy density.
 
     Args:
         folder: Where to write; it must exist.
         displacement: [m], shape [frames, node_count, 3].
 
     Returns:
-        The files written, the PVD last; ParaView opens that one.
+        The files written, the PVD last; open that one in ParaView.
     """
     folder, paths = Path(folder), []
     for number, moved in enumerate(displacement):

@@ -1,12 +1,12 @@
-"""What an arm and its controller must be, for the rest of Limber.
+"""Interface of an arm and its controller to the rest of Limber.
 
-Cell, motion, guard, virtual controller, planning and scenes know a robot through these alone. An
-arm that meets :class:`Arm` is planned with and checked once it has a name
-(:func:`limber.robot.known_arms.register_arm`); it is moved where a driver of its controller is
-there too (:class:`ArmControl`, :func:`limber.robot.driver.controls.register_control`).
+Cell, motion, guard, virtual controller, planning and scenes use a robot only through these. An arm
+that meets :class:`Arm` can be planned with and checked once it has a name
+(:func:`limber.robot.known_arms.register_arm`). It can be moved if a driver of its controller exists
+too (:class:`ArmControl`, :func:`limber.robot.driver.controls.register_control`).
 
-Frames are those of the controller: its base frame and the flange. Joints turn; angles are in
-radians. ``n`` is the number of joints.
+Frames are those of the controller: its base frame and the flange. Joints are revolute; angles are
+in radians. ``n`` is the number of joints.
 """
 
 import socket
@@ -19,11 +19,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Rods:
-    """The moving links of an arm in some poses, as rods with round ends, in its base's frame.
+    """The moving links of an arm in some poses, as capsules, in its base's frame.
 
     Attributes:
-        names: Of the links, one a rod.
-        starts, ends: Of the rods' axes [m], shape [poses, rods, 3].
+        names: Names of the links, one per rod.
+        starts, ends: End points of the rods' axes [m], shape [poses, rods, 3].
         radii: [m], shape [rods].
     """
 
@@ -37,22 +37,21 @@ class Arm(Protocol):
     """The description of an arm: kinematics, limits, shape. It never changes.
 
     Attributes:
-        name: What a cell file calls it (``robot.model``).
-        controller: Kind of its controller, by which its driver is found.
+        name: Its name in a cell file (``robot.model``).
+        controller: Kind of its controller, which determines its driver.
         rate: Steps a second of the controller [Hz].
         measures_force: Whether the controller itself measures the force at the flange well enough
             for the guard.
         payload: Greatest mass at the flange [kg].
-        joint_names: One a joint, for a person.
-        ros_joints: What the names have in them under which ROS sends the joints.
-        joint_limits: Least and greatest angles [rad], infinite where a joint turns without end,
-            shape [n, 2].
+        joint_names: One name per joint, for a person.
+        ros_joints: Parts of the names under which ROS sends the joints.
+        joint_limits: Least and greatest angles [rad], infinite for an endless joint, shape [n, 2].
         joint_speed: Greatest speeds [rad/s], shape [n].
         home: Angles far from every singularity and limit [rad], shape [n].
-        shoulder: Middle of what the arm reaches, base frame [m], shape [3].
+        shoulder: Centre of the arm's reach, base frame [m], shape [3].
         reach: Greatest distance of the wrist from there [m].
-        link_radius: Of the links where they are drawn [m].
-        singularity_names: Of the columns of :meth:`singularity_distance`.
+        link_radius: Radius of the links in drawings [m].
+        singularity_names: Names of the columns of :meth:`singularity_distance`.
     """
 
     @property
@@ -94,8 +93,9 @@ class Arm(Protocol):
         ...
 
     def jacobian(self, joints: np.ndarray) -> np.ndarray:
-        """Return the flange's velocity [m/s] over its angular velocity [rad/s], base frame, a unit
-        joint speed a column, shape [..., 6, n], at joint angles [..., n]."""
+        """Return the flange's velocity [m/s] over its angular velocity [rad/s], base frame, one
+        column per unit joint speed, shape [..., 6, n], at joint angles [..., n].
+        """
         ...
 
     def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
@@ -103,16 +103,16 @@ class Arm(Protocol):
 
         Args:
             frames: Frames of the flange, shape [..., 4, 4].
-            near: Angles [..., n] near which the answer is wanted. The one nearest to them is among
-                those returned; others may be omitted.
+            near: Angles [..., n] near the requested solution. The nearest solution is among those
+                returned; others may be omitted.
 
         Returns:
-            One configuration a row, shape [..., k, n] with any k; rows that do not exist are NaN.
+            One configuration per row, shape [..., k, n] with any k; rows that do not exist are NaN.
         """
         ...
 
     def configurations(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return the ways of going through ``frames``: in each the arm keeps its configuration.
+        """Return the joint paths through ``frames``: in each the arm keeps its configuration.
 
         Args:
             frames: Frames of the flange, in order and close together, shape [poses, 4, 4].
@@ -125,12 +125,13 @@ class Arm(Protocol):
         ...
 
     def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
-        """Return how far joint angles [..., n] are from each kind of singularity, shape [..., s]:
-        0 in it, at most about 1."""
+        """Return the distance of joint angles [..., n] from each kind of singularity, shape [...,
+        s]: 0 in it, at most about 1.
+        """
         ...
 
     def rods(self, joints: np.ndarray) -> Rods:
-        """Return the moving links at joint angles [poses, n], for what stands in the way."""
+        """Return the moving links at joint angles [poses, n], for collision checks."""
         ...
 
 
@@ -140,18 +141,19 @@ class Sample:
 
     Attributes:
         clock: The controller's time [s].
-        arrived: When it came, on this computer's monotonic clock [s].
+        arrived: Time of arrival, on this computer's monotonic clock [s].
         joints, joint_speeds: [rad], [rad/s], shape [n].
-        pose, speed: Of the tool's centre in the base's frame [m, rad], [m/s, rad/s], shape [6].
-        wrench: Of the surroundings on the tool as the controller reports it: the base's axes,
-            about the tool's centre [N, N m], shape [6].
+        pose, speed: Pose and speed of the tool's centre in the base's frame [m, rad], [m/s, rad/s],
+        shape [6].
+        wrench: Wrench of the surroundings on the tool as the controller reports it: the base's
+            axes, about the tool's centre [N, N m], shape [6].
         robot_mode, safety_mode, runtime_state: The controller's numbers (7, 1 and 2 are well).
         slider: Speed slider, 0 to 1.
-        tool: Tool that is set in the controller, the flange's frame [m, rad], shape [6]; None where
-            its version does not tell it.
-        payload: Mass that is set there [kg], and ``payload_centre`` its centre in the flange's
+        tool: Tool that is set in the controller, the flange's frame [m, rad], shape [6]; None if
+            its version does not report it.
+        payload: Mass set in the controller [kg], and ``payload_centre`` its centre in the flange's
             frame [m], shape [3]; None likewise.
-        outputs: Digital outputs, one a bit; None where it has none.
+        outputs: Digital outputs, one per bit; None if it has none.
     """
 
     clock: float
@@ -174,14 +176,14 @@ class Sample:
 class ArmControl(Protocol):
     """An open controller, as the loop of :mod:`limber.robot.driver.control_loop` moves its arm.
 
-    Whoever opens one has seen that it is the cell's and may be moved. Forces, tare and every limit
-    are the loop's own: a control only reads and sends.
+    The opening function has checked that it is the cell's controller and may be moved. Forces, tare
+    and every limit belong to the loop: a control only reads and sends.
 
     Attributes:
         rate: Samples a second [Hz].
-        lookahead: By how much the arm is behind its target [s].
-        silence: After so long without a word the controller stops by itself [s].
-        facts: What it is and where the arm stands, as plain data, for the parent.
+        lookahead: Delay of the arm behind its target [s].
+        silence: Time without a message after which the controller stops automatically [s].
+        facts: Description of the controller and the arm's state, as plain data, for the parent.
     """
 
     rate: float
@@ -190,8 +192,8 @@ class ArmControl(Protocol):
     facts: dict[str, Any]
 
     def read(self, timeout: float, beside: Sequence[socket.socket] = ()) -> list[Sample]:
-        """Return the next samples, waiting at most ``timeout`` [s] for the first, or until
-        something comes ``beside``.
+        """Return the next samples, waiting at most ``timeout`` [s] for the first, or until data
+        arrives ``beside``.
 
         Raises:
             ConnectionError: the connection to the robot was lost.
@@ -199,37 +201,38 @@ class ArmControl(Protocol):
         ...
 
     def skip(self) -> None:
-        """Drop the samples that have come so far."""
+        """Drop the samples that have arrived so far."""
         ...
 
     def connect(self) -> None:
-        """Connect what moves the arm, set its tool and payload, and :meth:`watch`.
+        """Connect to move the arm, set its tool and payload, and call :meth:`watch`.
 
-        Nothing else writes to a controller that only was opened.
+        Nothing is written to an opened controller before this.
 
         Raises:
-            WorkError: it does not take its settings.
+            WorkError: it rejects its settings.
         """
         ...
 
     def watch(self) -> None:
-        """Let the controller stop by itself after :attr:`silence`."""
+        """Let the controller stop automatically after :attr:`silence`."""
         ...
 
     def program_runs(self) -> bool:
-        """Whether the controller takes targets now."""
+        """Whether the controller accepts targets now."""
         ...
 
     def start_program(self) -> bool:
-        """Let it take targets; returns whether that was begun, and does not wait for it."""
+        """Let it accept targets; returns whether that was begun, and does not wait for it."""
         ...
 
     def servo(self, pose: np.ndarray) -> bool:
-        """Send the next target of the tool's centre [m, rad], shape [6]; whether it was taken."""
+        """Send the next target of the tool's centre [m, rad], shape [6]; whether it was accepted.
+        """
         ...
 
     def servo_joints(self, joints: np.ndarray) -> bool:
-        """Send the next joint angles [rad], shape [n]; whether they were taken."""
+        """Send the next joint angles [rad], shape [n]; whether they were accepted."""
         ...
 
     def end_motion(self) -> bool:
@@ -237,15 +240,15 @@ class ArmControl(Protocol):
         ...
 
     def stop_at_once(self) -> None:
-        """Stop the arm on a second way, which does not depend on the first.
+        """Stop the arm on a second channel, which does not depend on the first.
 
         Raises:
-            OSError: it is broken.
+            OSError: the connection is broken.
         """
         ...
 
     def keep_alive(self) -> bool:
-        """Say that this process lives, where nothing is sent; whether it was heard."""
+        """Signal that this process is alive if nothing else is sent; returns whether it arrived."""
         ...
 
     def grip(self, close: bool) -> None:
@@ -257,9 +260,9 @@ class ArmControl(Protocol):
         ...
 
     def put_back(self) -> str | None:
-        """Set what was set before :meth:`connect`; returns in words what could not be."""
+        """Restore the settings from before :meth:`connect`; returns in words what failed."""
         ...
 
     def close(self) -> None:
-        """Let go of the robot."""
+        """Release the robot."""
         ...

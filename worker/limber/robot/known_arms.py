@@ -12,10 +12,10 @@ _ARMS: dict[str, Arm] = dict(ARMS)
 
 
 def register_arm(arm: Arm) -> None:
-    """Let cell files name ``arm``.
+    """Make ``arm`` available to cell files.
 
-    Limber works in several processes. A package that has an arm names its module as an entry point
-    of the group ``limber.arms``; the module registers the arm, and its driver, when it is imported.
+    Limber works in several processes. A package with an arm names its module as an entry point of
+    the group ``limber.arms``. The module registers the arm, and its driver, when it is imported.
 
     Raises:
         InputError: another arm has that name.

@@ -1,4 +1,4 @@
-"""What a robot and its sensor show before anything moves: it is read, and nothing is written."""
+"""State of a robot and its sensor before a motion: it is only read, nothing is written."""
 
 import select
 import time
@@ -25,13 +25,14 @@ _STILL = 1e-6  # N: a living sensor's noise never repeats so
 
 @dataclass(frozen=True)
 class Observed:
-    """A robot that stands.
+    """A robot at rest.
 
     Attributes:
-        facts: What the controller is, as :class:`.ArmControl` tells it.
+        facts: Description of the controller, as in :class:`.ArmControl`.
         samples: In order.
-        readings: Of the force sensor with each, flange axes, not tared [N, N m], shape [n, 6].
-        differences: In what the controller differs from the cell.
+        readings: Reading of the force sensor with each, flange axes, not tared [N, N m], shape [n,
+        6].
+        differences: Differences between the controller and the cell.
     """
 
     facts: dict[str, Any]
@@ -45,10 +46,10 @@ class Observed:
         return plays(self.samples[-1])
 
     def nominal_off(self, cell: Cell) -> float | None:
-        """Return by how much the controller's pose differs from the arm's nominal measures [m].
+        """Return the deviation of the controller's pose from the arm's nominal dimensions [m].
 
-        Most of it is the arm's own calibration, which the controller knows. None where the tool
-        that its pose is of is not known.
+        Most of it is the arm's own calibration, which the controller knows. None if the tool of its
+        pose is not known.
         """
         sample = self.samples[-1]
         if sample.tool is None and any(each.what == "tool centre point"
@@ -59,7 +60,7 @@ class Observed:
         return float(np.linalg.norm(nominal[:3, 3] - sample.pose[:3]))
 
     def implausible(self, cell: Cell) -> list[str]:
-        """Return what is wrong with the sensor's readings while the arm stands, in words."""
+        """Return implausible properties of the sensor's readings at rest, in words."""
         if len(self.readings) < _FEWEST:
             return []
         if not np.isfinite(self.readings).all():
@@ -94,7 +95,7 @@ def observe(cell: Cell, seconds: float) -> Observed:
         sensor = open_sensor(cell)
         try:
             control.skip()
-            # The first reading of a sensor with a connection of its own is on its way.
+            # The first reading of a sensor with its own connection has not arrived yet.
             select.select(sensor.connections, [], [], _FIRST_READING_SECONDS)
             samples, readings = _read(control, sensor, seconds)
         finally:
@@ -108,7 +109,7 @@ def observe(cell: Cell, seconds: float) -> Observed:
 
 
 def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
-    """Show what differs from the cell before anything is written or moves.
+    """Report differences from the cell before anything is written or moves.
 
     Raises:
         LimberError: as :func:`observe`. SafetyStop: a program runs, or the sensor is implausible.

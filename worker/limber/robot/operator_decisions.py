@@ -1,4 +1,4 @@
-"""What the person beside the robot decides: that it moves, what follows a stop, a hand gripper."""
+"""Decisions of the person beside the robot: to start, after a stop, to use a hand gripper."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _CONNECTED_SECONDS = 5.0
 
 
 def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Progress) -> None:
-    """Let the robot move only when somebody has typed ``name``; asked for at a terminal.
+    """Let the robot move only after a person has typed ``name``; asked for at a terminal.
 
-    What its controller has set otherwise than the cell states is shown before that.
+    Settings of the controller that differ from the cell are shown before that.
 
     Raises:
-        InputError: nothing was typed, or something else.
+        InputError: nothing was typed, or another text.
         LimberError: the robot does not answer, or cannot be moved now.
     """
     asks = typed is None and sys.stdin.isatty()
@@ -46,13 +46,13 @@ def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Pro
 
 def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: Progress,
                       ) -> dict[str, Any]:
-    """After a stop the arm holds, unless ``choice`` or the person at the terminal says retreat.
+    """After a stop the arm holds, unless ``choice`` or the person at the terminal is retreat.
 
-    Where a retreat does not bring the force below the soft limit, the gripper opens.
+    If a retreat does not bring the force below the soft limit, the gripper opens.
 
     Returns:
-        ``choice``; ``retreated``, whether the arm went back; ``gripper_opened``; ``force_n``, what
-        is left on the branch (None: not known); and ``outcome``, all of it in words.
+        ``choice``; ``retreated``, whether the arm retreated; ``gripper_opened``; ``force_n``, the
+        remaining force on the branch (None: not known); and ``outcome``, all of it in words.
     """
     if choice == "ask" and sys.stdin.isatty():
         typed = input("The robot has stopped. Type retreat to return along the same path; "
@@ -67,7 +67,7 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
         if found["retreated"] or not link.has_ended:
             return told | found
     try:
-        # The driver of the link is gone. What it followed and its tare are on disk.
+        # The link's driver has ended. Its path and its tare are on disk.
         with RobotLink(cell) as other:
             other.wait_for_samples(_CONNECTED_SECONDS)
             return told | _gone_back(cell, other, progress)
@@ -79,7 +79,7 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
 
 
 def _gone_back(cell: Cell, link: RobotLink, progress: Progress) -> dict[str, Any]:
-    """Go back; where that leaves a force over the soft limit, open the gripper."""
+    """Retreat; if a force above the soft limit remains, open the gripper."""
     event = _retreated(link)
     force = _force_left(link)
     told = {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
@@ -93,7 +93,7 @@ def _gone_back(cell: Cell, link: RobotLink, progress: Progress) -> dict[str, Any
 
 
 def _opened_without_driver(cell: Cell) -> tuple[bool, str]:
-    """Open the gripper by its output alone; returns whether that was done, and what was done."""
+    """Open the gripper by its output alone; returns whether it opened, and a description."""
     if cell.tool.gripper != "digital_output":
         return False, f"Free the branch by hand (tool.gripper is {cell.tool.gripper})"
     try:
@@ -105,7 +105,7 @@ def _opened_without_driver(cell: Cell) -> tuple[bool, str]:
 
 
 def _retreated(link: RobotLink) -> dict[str, Any]:
-    """Return the event that ended a retreat; a refusal is one that stopped it at once."""
+    """Return the event that ended a retreat; a refusal counts as an immediate stop."""
     try:
         return link.retreat()
     except LimberError as error:
@@ -117,7 +117,7 @@ def _retreated(link: RobotLink) -> dict[str, Any]:
 
 
 def _opened(cell: Cell, link: RobotLink, progress: Progress) -> tuple[bool, str]:
-    """Open the gripper; returns whether that was done, and what was done."""
+    """Open the gripper; returns whether it opened, and a description."""
     if cell.tool.gripper == "none" or (cell.tool.gripper == "by_hand" and not sys.stdin.isatty()):
         return False, (f"Limber does not open this gripper (tool.gripper is {cell.tool.gripper}): "
                        "free the branch by hand")
@@ -130,11 +130,11 @@ def _opened(cell: Cell, link: RobotLink, progress: Progress) -> tuple[bool, str]
 
 
 def _force_left(link: RobotLink) -> float | None:
-    """The smoothed force on the branch now [N], or None where the driver does not tell it."""
+    """The smoothed force on the branch now [N], or None if the driver does not report it."""
     try:
         force = float(np.linalg.norm(link.wait_for_samples(_FORCE_SECONDS)[_FORCE]))
     except LimberError:
-        # The driver is gone: what is told says so.
+        # The driver has ended: its report states so.
         return None
     return force if np.isfinite(force) else None
 
@@ -145,7 +145,7 @@ def _left(force: float | None) -> str:
 
 
 def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> None:
-    """Close or open the gripper; one without a wire by the person at the terminal."""
+    """Close or open the gripper; without a wire, the person at the terminal does it."""
     if cell.tool.gripper == "digital_output":
         link.gripper(close)
         time.sleep(cell.tool.grip_seconds)

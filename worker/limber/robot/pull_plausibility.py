@@ -1,8 +1,8 @@
-"""Whether a force sensor can be right, by the first millimetres of a pull and by its end.
+"""Plausibility of a force sensor, by the first millimetres of a pull and by its end.
 
-What a branch's stiffness is worth is what a pull measures. Its direction is known before: a force
-that is predicted along one direction does not come along another, nor with the other sign. Where
-the moduli are known already its size is predicted as well.
+A pull measures the stiffness of a branch. The direction of the force is known before: a force
+predicted along one direction does not appear along another, nor with the opposite sign. If the
+moduli are known already, its magnitude is predicted as well.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from limber.robot.cell.cell import Cell
 
 LOOKED_M = 0.01
-"""Travel after which a wrong sensor has been noticed."""
+"""Travel by which a wrong sensor has been detected."""
 
 _NOISES = 4.0  # times a smoothed force's noise: less is no statement
 _MOSTLY = 0.5  # cosine of the angle to the predicted force
@@ -29,8 +29,9 @@ class PredictedPull:
 
     Attributes:
         ways: Travel of the gripper [m], ascending from 0, shape [n].
-        forces: Of the gripper on the branch [N], branch frame, shape [n, 3].
-        factor: By which a force may be larger or smaller, if the moduli are known; else None.
+        forces: Forces of the gripper on the branch [N], branch frame, shape [n, 3].
+        factor: Factor by which a force may be larger or smaller, if the moduli are known; else
+        None.
     """
 
     ways: np.ndarray
@@ -43,11 +44,11 @@ class PredictedPull:
 
 
 class PullPlausibility:
-    """Looks at the samples of a pull as they come.
+    """Checks the samples of a pull as they arrive.
 
     Args:
-        cell: What it states of the sensor's noise and drift.
-        predicted: What is to be felt.
+        cell: States the sensor's noise and drift.
+        predicted: Expected forces.
 
     Attributes:
         reason: Why the sensor cannot be right, once that is certain.
@@ -78,8 +79,9 @@ class PullPlausibility:
         return self.reason
 
     def left_at_end(self, samples: np.ndarray) -> str | None:
-        """Return in words what force is left where the gripper is back at its start, if that is
-        more than noise, drift and the branch leave; ``samples`` [n, 37] are the last ones."""
+        """Return in words a force that remains with the gripper back at its start and is not
+        explained by noise, drift and the branch; ``samples`` [n, 37] are the last ones.
+        """
         left = float(np.linalg.norm(samples[:, _COLUMNS].mean(axis=0)))
         drift = self._drift * (float(samples[-1, 0]) - self._began)
         allowed = self._noise + drift + _BACK_SHARE * self._peak
@@ -90,7 +92,7 @@ class PullPlausibility:
                 "drifted, or the branch slipped in the gripper")
 
     def _agree(self, doubt: str) -> None:
-        """Take a doubt for certain where it is repeated."""
+        """Take a suspected error as certain when it is repeated."""
         kind = doubt.split(":", maxsplit=1)[0]
         self._told = (kind, self._told[1] + 1 if doubt and kind == self._told[0] else 1)
         if doubt and self._told[1] >= _AGREE:

@@ -1,4 +1,4 @@
-"""What an arm may do to a branch at most, by its own table and whatever a cell file says."""
+"""Greatest loads of an arm on a branch, by its own table and regardless of the cell file."""
 
 from typing import TYPE_CHECKING
 
@@ -9,9 +9,11 @@ if TYPE_CHECKING:
     from limber.robot.cell.cell import LimitsEntry
 
 MOST_FORCE = 140.0
-"""[N], also for an arm without a known payload: about what a clamped hand bears without harm."""
+"""[N], also for an arm without a known payload: about the force that a clamped hand bears without
+harm.
+"""
 MOST_SPEED = 0.25
-"""[m/s], the reduced speed of industrial arms while people are beside them."""
+"""[m/s], the reduced speed of industrial arms with people beside them."""
 MOST_TURN_SPEED = 1.5
 """[rad/s]"""
 _PAYLOADS = 2.0  # weights of its payload that an arm exerts: it moves it as well as it holds it
@@ -29,7 +31,7 @@ def greatest_torque(arm: Arm) -> float:
 
 
 def within_ratings(arm: Arm, limits: "LimitsEntry") -> "LimitsEntry":
-    """Return the limits, none of them beyond what the arm's table allows."""
+    """Return the limits, each within the arm's table."""
     force = greatest_force(arm)
     return limits.model_copy(update={
         name: min(getattr(limits, name), most) for name, most in (

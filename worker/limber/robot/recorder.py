@@ -1,4 +1,4 @@
-"""A pull while it is recorded: samples of the robot become lines of a growing ``robot.csv``."""
+"""A pull during its recording: samples of the robot become lines of a growing ``robot.csv``."""
 
 import json
 import select
@@ -20,7 +20,7 @@ HEADER = ",".join(("t_s", *POSE_COLUMNS, *WRENCH_COLUMNS))
 
 
 class Lines(Protocol):
-    """What lines are appended to, as a stream of the branch folder."""
+    """A destination for lines, such as a stream of the branch folder."""
 
     def append(self, line: str) -> None:
         """Append one line."""
@@ -30,7 +30,7 @@ class Lines(Protocol):
 class PullRecorder:
     """Writes samples as poses of the grasped piece of branch, and the wrench on it.
 
-    The piece is at its rest pose, not turned, when the gripper closes; from then on it moves with
+    The piece is at its rest pose, not rotated, when the gripper closes; from then on it moves with
     the gripper as one body.
 
     Attributes:
@@ -40,8 +40,7 @@ class PullRecorder:
     """
 
     def __init__(self, lines: Lines, point: np.ndarray, compliance: float = 0.0):
-        """Begin a recording of the piece at ``point`` [3]; arm, fingers and bark give way by
-        ``compliance`` [m/N], so much it stays behind the gripper.
+        """Begin a recording of the piece at ``point`` [3], which trails by ``compliance`` [m/N].
         """
         self._lines, self._point = lines, np.asarray(point, float)
         self._compliance = compliance
@@ -60,7 +59,7 @@ class PullRecorder:
         self._offset = inverted(matrices(self.last[1:7])) @ rest
 
     def take(self, samples: np.ndarray) -> None:
-        """Write a batch of samples [n, 37]; before the gripper has closed they only pass by."""
+        """Write a batch of samples [n, 37]; before the gripper has closed they are not written."""
         self.last = samples[-1]
         if self._offset is None:
             return
@@ -80,7 +79,7 @@ class PullRecorder:
 
 
 def known_noise(cell: Cell, position_sigma: float | None = None) -> SensorEntry:
-    """What a cell says of its force sensor's single readings, and what the resting points told.
+    """Noise of the force sensor's single readings from the cell, and noise from the points at rest.
 
     Args:
         position_sigma: Noise of a tracked point [m]; None: as is usual.
@@ -94,25 +93,25 @@ def known_noise(cell: Cell, position_sigma: float | None = None) -> SensorEntry:
 
 def known_errors(cell: Cell, seconds: float, *, tare_sigma: Sequence[float] | None = None,
                  ) -> CalibrationEntry:
-    """What a cell leaves open of a recording of ``seconds`` [s].
+    """Errors of a recording of ``seconds`` [s] that the cell leaves open.
 
     Args:
         tare_sigma: Standard error of the tare before it [N, N m], shape [6]; without one the zero
-            is as unknown as after a tare at some earlier time.
+            is as uncertain as after a tare at some earlier time.
     """
     usual = CalibrationEntry()
     minutes = seconds / 60.0
     drift = cell.sensor.drift_n_per_minute
     known = {"force_drift_sigma_n": drift * minutes}
     if tare_sigma is not None:
-        # It drifts on while the gripper closes.
+        # It continues to drift while the gripper closes.
         since = drift * (cell.tool.grip_seconds + 1.0) / 60.0
         known |= {"force_bias_sigma_n": float(np.hypot(max(tare_sigma[:3]), since)),
                   "torque_bias_sigma_nm": float(max(tare_sigma[3:]))}
     return usual.model_copy(update={
         "pose_sigma_m": cell.base.position_sigma_m, "pose_sigma_rad": cell.base.rotation_sigma_rad,
         "pose_noise_m": max(cell.robot.pose_sigma_m, 1e-6),
-        # A tracker on the robot's base is where the base is.
+        # A tracker on the robot's base has the base's errors.
         "camera_sigma_m": max(cell.base.position_sigma_m, usual.camera_sigma_m),
         "camera_sigma_rad": max(cell.base.rotation_sigma_rad, usual.camera_sigma_rad), **known})
 
@@ -121,14 +120,14 @@ class MarkerStream:
     """Tracked points from another program: JSON lines ``{"t_s", "points_m"}`` over TCP.
 
     Times are on the robot's clock. With ``"frame": "base"`` the points are in the robot's base
-    frame, else in the branch's. A point that is not seen is null; a frame with another number of
-    points than the first is left out, since it does not say which is which.
+    frame, else in the branch's. A point that is not seen is null. A frame with another number of
+    points than the first is omitted, since it does not state which is which.
 
     Args:
         base: The robot's base in the branch's frame [m, rad], shape [6].
 
     Raises:
-        WorkError: nothing answers.
+        WorkError: the stream does not answer.
     """
 
     def __init__(self, address: str, port: int, base: np.ndarray, timeout: float = 3.0):
@@ -144,7 +143,7 @@ class MarkerStream:
         self.left_out = 0
 
     def read(self, timeout: float = 0.0) -> list[tuple[float, np.ndarray]]:
-        """Return the frames that have come: time [s], points [n, 3] in the branch's frame.
+        """Return the frames that have arrived: time [s], points [n, 3] in the branch's frame.
 
         Raises:
             WorkError: the tracker has closed its connection.
@@ -171,14 +170,14 @@ class MarkerStream:
         return frames
 
     def at_rest(self) -> tuple[np.ndarray, float | None]:
-        """Return where the points have rested up to now, and how much one of them is noisy.
+        """Return the resting positions of the points so far, and the noise of one of them.
 
         Returns:
-            Their means [m], shape [n, 3], and the standard deviation of a coordinate of one frame
-            [m], or None where too few frames came to tell it.
+            Mean positions [m], shape [n, 3], and the standard deviation of a coordinate of one
+            frame [m], or None if too few frames arrived.
 
         Raises:
-            WorkError: no points come, one of them is never seen, or their number changes.
+            WorkError: no points arrive, one of them is never seen, or their number changes.
         """
         frames = self.read(1.0)
         if not frames:

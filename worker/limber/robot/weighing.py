@@ -1,7 +1,7 @@
 """A force sensor tested by the weight of the gripper: sign, unit, axes and stated mass.
 
-The gripper is tilted a little about two axes. What its weight changes by is known from the stated
-mass; a sensor of another sign, unit or other axes shows another change.
+The gripper is tilted a little about two axes. The change of its weight is known from the stated
+mass; a sensor with another sign, unit or other axes shows another change.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ _NEAR = 0.15  # relative
 
 @dataclass(frozen=True)
 class Weighing:
-    """What a sensor made of a tilted gripper.
+    """A sensor's readings of a tilted gripper.
 
     Attributes:
-        mass: That explains the changes [kg], as the sensor has it.
+        mass: Mass that explains the changes [kg], by the sensor.
         sigma: Its standard error [kg].
-        faults: What is wrong with the sensor or the stated mass, in words.
+        faults: Errors of the sensor or the stated mass, in words.
     """
 
     mass: float
@@ -39,7 +39,7 @@ class Weighing:
 def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
     """Return joint angles [6, n] from ``joints`` [n] and back, tilted by the two middle wrists.
 
-    So little that the weight of ``mass`` [kg] changes by no more than the guard lets pass.
+    So small that the weight of ``mass`` [kg] changes by no more than the guard allows.
     """
     tilt = min(_MOST_TILT, float(np.arcsin(min(1.0, _CHANGE_N / max(GRAVITY * mass, 1e-9)))))
     offs = np.zeros((6, len(joints)))
@@ -52,7 +52,7 @@ def require_tilts(downs: np.ndarray, stated: float) -> np.ndarray:
     """Return the axes [3, 3] along which directions of gravity [n, 3] differ, most first.
 
     Raises:
-        InputError: too few, about one axis alone, or no mass [kg] is stated.
+        InputError: too few directions, about one axis only, or no mass [kg] is stated.
     """
     if not stated > 0.0:
         raise InputError("The cell file states no tool.mass_kg above 0.", "Without a weight there "
@@ -68,21 +68,22 @@ def require_tilts(downs: np.ndarray, stated: float) -> np.ndarray:
 def weigh(downs: np.ndarray, forces: np.ndarray, times: np.ndarray, stated: float) -> Weighing:
     """Compare readings at some tilts with the weight of the stated mass.
 
-    Bias and a drift that is linear in time are fitted with them.
+    Bias and a linear drift in time are fitted with them.
 
     Args:
         downs: Direction of gravity in the flange's axes at each tilt, shape [n, 3].
         forces: Mean readings there, of the surroundings on the tool, flange axes [N], shape
             [n, 3], not corrected for any payload.
-        times: When [s], shape [n].
+        times: Times [s], shape [n].
         stated: Mass in the cell file [kg].
 
     Raises:
-        InputError: too few tilts, or about one axis alone; or no mass is stated.
+        InputError: too few tilts, or about one axis only; or no mass is stated.
     """
     axes = require_tilts(downs, stated)
     away = downs - downs[0]
-    # Along gravity itself a bias and a weight look nearly alike: only the two tilts tell.
+    # Along gravity itself bias and weight are nearly indistinguishable: only the two tilts separate
+    # them.
     tilts = away @ axes[:2].T
     columns = np.column_stack([away @ axes.T, np.ones(len(downs)), times - times.mean()])
     found, *_ = np.linalg.lstsq(columns, forces, rcond=None)

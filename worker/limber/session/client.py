@@ -27,7 +27,7 @@ _GRACE_SECONDS = 3.0
 
 
 class InteractiveSession:
-    """A branch in a process of its own that follows what holds it. ::
+    """A branch in a separate process that follows its grasps. ::
 
         with InteractiveSession("apple.branch", mode="pinned") as session:
             frame = session.wait(session.move(pose))
@@ -36,9 +36,9 @@ class InteractiveSession:
 
     Args:
         branch_folder: The branch.
-        mode: Of the marked grasp, which is held at the start: ``clamped`` or ``pinned``.
+        mode: Mode of the marked grasp, which is held at the start: ``clamped`` or ``pinned``.
         settings: Further fields of :class:`limber.session.settings.SessionSettings`.
-        start_seconds: How long the start may take.
+        start_seconds: Longest duration of the start.
 
     Attributes:
         hello: The session's description of itself.
@@ -82,7 +82,7 @@ class InteractiveSession:
 
     @property
     def alive(self) -> bool:
-        """Whether the session's process runs."""
+        """Whether the session's process is running."""
         return self._process.poll() is None
 
     @property
@@ -90,10 +90,10 @@ class InteractiveSession:
         return self._process.pid
 
     def move(self, pose: np.ndarray, grasp: int | None = None) -> int:
-        """Ask for a grasp (the first, if not named) at a pose [m, rad].
+        """Request a grasp (the first, if not named) at a pose [m, rad].
 
         Returns:
-            The number that the frame which answers will carry.
+            The number that the answering frame will contain.
 
         Raises:
             WorkError: the session has ended.
@@ -102,20 +102,20 @@ class InteractiveSession:
 
     def grab(self, *, vertex: int | None = None, point: Sequence[float] | None = None,
              mode: str = "pinned", radius: float = 0.01) -> dict[str, Any]:
-        """Hold the branch where it is now; return the reply with ``grasp`` and ``pose``.
+        """Hold the branch in its current position; return the reply with ``grasp`` and ``pose``.
 
         Args:
-            vertex: Of the surface; or ``point`` [m] on the branch as it was scanned.
-            radius: Of the patch [m].
+            vertex: Vertex of the surface; or ``point`` [m] on the branch as it was scanned.
+            radius: Radius of the patch [m].
 
         Raises:
-            InputError: nothing is there, or the base or another grasp is.
+            InputError: the branch is not there, or the base or another grasp is.
         """
         return self.request("grasp", vertex=vertex, mode=mode, radius_m=radius,
                             point=None if point is None else [float(x) for x in point])
 
     def release(self, grasp: int | None = None) -> dict[str, Any]:
-        """Let go of a grasp, or of all; return the reply."""
+        """Release a grasp, or all; return the reply."""
         return self.request("release", grasp=grasp)
 
     def set_young(self, young: np.ndarray) -> dict[str, Any]:
@@ -123,36 +123,37 @@ class InteractiveSession:
         return self.request("young", young_pa=np.asarray(young, float).tolist())
 
     def set_gravity(self, on: bool) -> dict[str, Any]:
-        """Let the branch bear its weight, or not; return the reply."""
+        """Switch the branch's weight on or off; return the reply."""
         return self.request("gravity", on=on)
 
     def set_loads(self, loads: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Hang forces on the branch, ``{"vertex" or "point", "force_n"}`` each, instead of those
-        before; return the reply."""
+        """Hang forces on the branch, ``{"vertex" or "point", "force_n"}`` each, replacing the
+        earlier ones; return the reply.
+        """
         return self.request("loads", loads=list(loads))
 
     def set_outdoors(self, **loads: Any) -> dict[str, Any]:
-        """Let wind (``wind_m_s``), ``snow_kg_m2`` and ``fruit`` act, and cut at ``cuts``.
+        """Apply wind (``wind_m_s``), ``snow_kg_m2`` and ``fruit``, and cut at ``cuts``.
 
         They replace the earlier ones; see `limber.session.worker` for their form.
         """
         return self.request("outdoors", **loads)
 
     def effects(self, *, seconds: float = 120.0, **question: Any) -> dict[str, Any]:
-        """Return what :meth:`set_outdoors` does to the branch: sag, strain over strength,
-        frequencies and, with ``limit_load=True``, how many times as much it bears; intervals where
-        an estimate has left them. Takes seconds; the branch can be moved meanwhile.
+        """Return the effects of :meth:`set_outdoors` on the branch: sag, strain over strength,
+        frequencies and, with ``limit_load=True``, the factor on the loads that it bears; with
+        intervals if an estimate exists. Takes seconds; the branch can be moved meanwhile.
 
         ``gust=0.3`` adds turbulence of that intensity, ``gust_record`` the gusts of a CSV file
-        (``time_s``, ``speed_m_s``) along the wind's direction: then all is of their peak.
+        (``time_s``, ``speed_m_s``) along the wind's direction: the results are then for their peak.
 
         Raises:
-            InputError: there is nothing outdoors, or the branch finds no rest under it.
+            InputError: there is no weather to apply, or the branch has no equilibrium under it.
             WorkError: there was no reply within ``seconds``.
         """
         record = question.get("gust_record")
         if isinstance(record, str | os.PathLike):
-            # It loads the mechanics, which a client has no other need of.
+            # It loads the mechanics, which a client does not need otherwise.
             from limber.mechanics.loads.gust_loads import WindRecord
 
             wind = WindRecord.read(Path(record))
@@ -161,7 +162,7 @@ class InteractiveSession:
         return self.request("effects", seconds, **question)
 
     def set_dynamics(self, on: bool) -> dict[str, Any]:
-        """Let the branch move in time, or answer with equilibria; return the reply."""
+        """Switch between motion over time and equilibria; return the reply."""
         return self.request("dynamics", on=on)
 
     def request(self, command: str, seconds: float = 30.0, **fields: Any) -> dict[str, Any]:
@@ -192,7 +193,7 @@ class InteractiveSession:
         """Return the newest frame, None before the first.
 
         Raises:
-            WorkError: the session has ended by itself.
+            WorkError: the session process has ended.
         """
         self._check()
         return present(self._frames, "frame of the session").read()
@@ -229,7 +230,7 @@ class InteractiveSession:
         self._process.wait()
         if self._frames is not None:
             self._frames.close()
-            # Where the session was killed it could not tidy up itself.
+            # A killed session could not clean up.
             Path(self.hello["positions"]).unlink(missing_ok=True)
             self._frames = None
             self._is_closed = True

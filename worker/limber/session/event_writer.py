@@ -1,4 +1,4 @@
-"""Writes a session's events in a thread of its own: a client that does not read stops no frames."""
+"""Writes a session's events in a thread: a client that does not read does not stop the frames."""
 
 import json
 import os
@@ -14,10 +14,10 @@ _WAITING_LIMIT = 1000
 
 
 class Events:
-    """JSON lines on standard output; what nobody reads is dropped.
+    """JSON lines on standard output; unread lines are dropped.
 
     Args:
-        gone: Called once when the reader has gone.
+        gone: Called once when the reader has closed.
     """
 
     def __init__(self, gone: Callable[[], None] = lambda: None):
@@ -47,7 +47,7 @@ class Events:
             try:
                 print(line, flush=True)
             except (OSError, ValueError):
-                # What Python still holds for it would fail once more, at the very end.
+                # Data that Python still buffers would fail again at exit.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 self._gone()
                 return

@@ -1,6 +1,6 @@
 """The file that passes a session's frames: memory-mapped, one writer, any number of readers.
 
-Little-endian; a reader needs nothing but numpy and mmap.
+Little-endian; a reader needs only numpy and mmap.
 
 =======  =====================  ==========================================================
 offset   type                   what
@@ -56,26 +56,26 @@ _SEQUENCE_AT = 40
 
 
 class Status(IntEnum):
-    """Who answers, and whether to believe it."""
+    """The model that answers, and whether its answer is reliable."""
 
     learning = 1
     """The full model, slowly, while a reduced model is being learnt."""
     reduced = 2
-    """The reduced model, within what it knows."""
+    """The reduced model, within its training."""
     full = 3
-    """The full model; no reduced one is coming for what is held."""
+    """The full model; no reduced one is being trained for this grasp."""
     untrusted = 4
-    """An answer that is not to be relied on: no equilibrium, or outside of what was learnt."""
+    """An unreliable answer: no equilibrium, or outside the training."""
 
 
 @dataclass(frozen=True)
 class HeldAt:
-    """A grasp in a frame: where it is and what the gripper exerts there.
+    """A grasp in a frame: its pose and the force of the gripper.
 
     Attributes:
-        number: Of the grasp, from 1.
+        number: Number of the grasp, from 1.
         pose: [m, rad], shape [6].
-        force, torque: Of the gripper on the branch [N, Nm], shape [3].
+        force, torque: Force and torque of the gripper on the branch [N, Nm], shape [3].
     """
 
     number: int
@@ -86,29 +86,30 @@ class HeldAt:
 
 @dataclass(frozen=True)
 class Frame:
-    """What a session answers.
+    """An answer of a session.
 
     Attributes:
         sequence: Number of the frame, from 1.
         positions: Surface positions [m], shape [vertex_count, 3], float32.
         strains: Largest principal strain about each vertex, shape [vertex_count], float32.
         move_id: The ``move`` that it answers.
-        status: Who answers, and whether to believe it.
+        status: The model that answers, and whether its answer is reliable.
         is_reduced: From the reduced model; else from the full one.
-        is_trusted: The model is within what it knows, and at the wanted pose.
+        is_trusted: The model is within its training and at the requested pose.
         is_converged: An equilibrium was found (in motion: the step was).
         is_reached: The grasps have reached the requested poses; else they are on the path to them.
         energy: Potential of strain and weight above the hanging branch [J]; its gradient to the
             pose is the gripper's force. kinetic_energy: [J].
-        reaction_force, reaction_torque: Of the first gripper on the branch [N, Nm], shape [3].
+        reaction_force, reaction_torque: Those of the first gripper on the branch [N, Nm], shape
+        [3].
         delay: From the worker's receipt of the command to the publication [s].
         time: Time of the simulated motion [s]; 0 in statics.
-        greatest_strain: Largest principal strain anywhere; ``strain_place`` [m], shape [3]:
-            where, on the branch as it is bent.
-        min_det_f: Smallest volume relative to that at rest; at 0 the branch is torn inside out.
-        gravity_on: Whether the branch bears its weight.
-        sag: How far what moved most along gravity has come down [m].
-        grasps: All that is held.
+        greatest_strain: Largest principal strain anywhere; ``strain_place`` [m], shape [3]: its
+            position on the bent branch.
+        min_det_f: Smallest volume relative to that at rest; at 0 an element is inverted.
+        gravity_on: Whether the branch's weight acts.
+        sag: Largest displacement along gravity [m].
+        grasps: All grasps.
         targets: Positions of the targets [m], shape [t, 3].
     """
 
@@ -230,7 +231,7 @@ class FrameWriter:
             slot.targets[:] = targets
         slot.positions[:] = positions
         slot.strains[:] = 0.0 if strains is None else strains
-        # The counter last: who sees it sees the frame.
+        # The counter is last: a reader that sees it sees the frame.
         self._sequence[0] = sequence
         return sequence
 
@@ -243,10 +244,10 @@ class FrameWriter:
 
 
 class FrameReader:
-    """Reads the newest frame; believes no size of the header that the file cannot hold.
+    """Reads the newest frame; rejects header sizes that the file cannot hold.
 
     Raises:
-        InputError: the file is not a session's, of another version, or cut short.
+        InputError: the file is not a session's, has another version, or is truncated.
     """
 
     def __init__(self, path: Path):
@@ -288,7 +289,7 @@ class FrameReader:
                 return _frame(sequence, **copied)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the file."""
         _release(self)
         self._map.close()
 
@@ -299,7 +300,7 @@ def _slots(mapped: mmap.mmap, layout: _Layout) -> list[_Slot]:
 
 
 def _release(owner: FrameReader | FrameWriter) -> None:
-    # A memory map cannot be closed while arrays look into it.
+    # A memory map cannot be closed while arrays refer to it.
     owner._slots = []
     owner._sequence = np.zeros(1, "<u8")
 

@@ -1,7 +1,7 @@
-"""The commands that wait, between the thread that reads the client and the one that solves.
+"""The waiting commands, between the thread that reads the client and the one that solves.
 
 Commands keep their order, but a ``move`` replaces the one before it of the same grasp: of poses
-that come while one is being solved, the newest wins. What waits is bounded.
+that arrive while one is being solved, the newest wins. The number of waiting commands is limited.
 """
 
 import os
@@ -20,14 +20,14 @@ _PIECE_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class Received:
-    """A command, or word from the trainer, and when it came [s, monotonic]."""
+    """A command, or a message from the trainer, and its arrival time [s, monotonic]."""
 
     content: Any
     at: float
 
 
 class Inbox:
-    """A queue of commands; ``closed`` once the client has closed or gone."""
+    """A queue of commands; ``closed`` once the client has closed or disconnected."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -36,7 +36,7 @@ class Inbox:
         self.last_at = 0.0
 
     def put(self, content: Any) -> bool:
-        """Add something; return False where too much waits already."""
+        """Add an item; return False if too many are waiting already."""
         new = Received(content, time.monotonic())
         with self._changed:
             if not (isinstance(content, Move) and self._replaces(new)):
@@ -54,7 +54,7 @@ class Inbox:
             self._changed.notify_all()
 
     def take(self, seconds: float) -> list[Received]:
-        """Return all that waits; where nothing does, wait for it, at most so long."""
+        """Return all waiting messages; if there are none, wait for one up to the given time."""
         with self._changed:
             if not self._waiting and not self.closed and seconds > 0:
                 self._changed.wait(seconds)
@@ -87,7 +87,7 @@ def read_commands(source: int, inbox: Inbox, refuse: Callable[[int, str], None])
     except OSError:
         pass  # the pipe is gone, which is its end
     finally:
-        # However this thread ends: a session without ears must not run on.
+        # However this thread ends, a session without input must not run on.
         inbox.close()
 
 

@@ -21,30 +21,32 @@ from limber.session.settings import SessionSettings
 from limber.session.trainer_process import Checked, Learning, Learnt, key_of
 
 RATE = 60.0
-"""Steps a second in dynamics."""
+"""Steps per second in dynamics."""
 _FASTEST = 2.0
-"""Fastest that the gripper moves in dynamics, in extents of the branch a second."""
+"""Largest speed of the gripper in dynamics, in extents of the branch per second."""
 _SOONEST, _LATEST = 0.6, 1.4
-"""Bounds of a step's length in dynamics, as parts of 1 / RATE."""
+"""Bounds of a step's length in dynamics, as fractions of 1 / RATE."""
 _STREAM_SECONDS = 0.1
 _IDLE_SECONDS = 0.1
 _DOUBTED = 0.02
-"""How near a pose is to one whose check failed to share its doubt, as part of the extent."""
+"""Distance, as a fraction of the extent, within which a pose shares the doubt of one whose check
+failed.
+"""
 _KNOWN_LIMIT = 3
-"""Reduced models that are kept in memory: of the grasps held last."""
+"""Number of reduced models kept in memory, for the most recent grasps."""
 _LIVE = NewmarkSettings(beta=0.3025, gamma=0.6, max_iterations=10)
-"""Damps what is too quick for the step: poses of a mouse come in jumps."""
+"""Damps motion that is too fast for the step: poses of a mouse are jerky."""
 _QUICK = ReducedStaticSettings(max_iterations=12, max_halvings=2, start_count=2)
 
 
 class Answering:
     """Answers for a branch: with the reduced model of its one grasp, else with the full one.
 
-    Loads, and weight taken away, are not among what the reduced model has learnt: under them
-    equilibria are the full model's, and motion is not trusted.
+    The reduced model has not learnt loads or missing weight: with them, equilibria are computed by
+    the full model, and motion is not reliable.
 
     Args:
-        folder, settings: Of the session, for the trainer.
+        folder, settings: Those of the session, for the trainer.
         held: The branch.
         tell: Passes the trainer's results to :meth:`hear`, from its thread.
         say: Writes an event.
@@ -66,7 +68,7 @@ class Answering:
 
     @property
     def is_moving(self) -> bool:
-        """Whether motion in time was asked for."""
+        """Whether motion over time was requested."""
         return self._wants_motion
 
     @property
@@ -77,7 +79,7 @@ class Answering:
                 and learning.key == key and not learning.has_failed)
 
     def status(self, answer: Answer) -> Status:
-        """Return who gave an answer, and whether to believe it."""
+        """Return the model that gave an answer, and whether it is reliable."""
         if not answer.is_converged:
             return Status.untrusted
         if answer.is_reduced:
@@ -94,24 +96,24 @@ class Answering:
             self.held.hold(self.held.loaded.marked_grasp(mode))
 
     def aim(self, number: int | None, pose: np.ndarray) -> None:
-        """Set the wanted pose of a grasp."""
+        """Set the target pose of a grasp."""
         self.held.aim(number, pose)
         self._is_due = self._is_new = True
 
     def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
              mode: Literal["clamped", "pinned"]) -> int:
-        """Hold a patch where it is now; return its number."""
+        """Hold a patch in its current position; return its number."""
         number = self.held.grab(vertex, point, radius, mode)
         self._changed()
         return number
 
     def release(self, number: int | None) -> None:
-        """Let go of a grasp, or of all."""
+        """Release a grasp, or all."""
         self.held.release(number)
         self._changed()
 
     def set_gravity(self, on: bool) -> None:
-        """Let the branch bear its weight, or not."""
+        """Switch the branch's weight on or off."""
         self.held.set_gravity(on)
         self._choose()
 
@@ -127,13 +129,13 @@ class Answering:
         self._choose()
 
     def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
-        """Let weather act and cut twigs off; see :meth:`.HeldBranch.set_outdoors`."""
+        """Apply weather and cut twigs off; see :meth:`.HeldBranch.set_outdoors`."""
         made = self.held.set_outdoors(loads)
         self._choose()
         return made
 
     def set_dynamics(self, on: bool) -> None:
-        """Let the branch move in time, or answer with equilibria."""
+        """Switch between motion over time and equilibria."""
         if on and not self._settings.reduced:
             raise InputError("Motion needs a reduced model.",
                              "This session was started without one.",
@@ -142,7 +144,7 @@ class Answering:
         self._choose()
 
     def hear(self, word: Learnt | Checked) -> None:
-        """Take a model or a comparison from the trainer."""
+        """Receive a model or a comparison from the trainer."""
         self._say(**word.event)
         if isinstance(word, Learnt):
             self._known.pop(word.key, None)
@@ -170,13 +172,13 @@ class Answering:
                                   self._tell, self._say)
 
     def seconds_left(self, last_received: float) -> float:
-        """Return how long there is to wait for another command before :meth:`answer` is due."""
+        """Return the waiting time for another command before :meth:`answer` is due."""
         if self._stepper is not None:
             return max(self._step_due(last_received) - time.monotonic(), 0.0)
         return 0.0 if self._is_due else _IDLE_SECONDS
 
     def answer(self, last_received: float) -> Answer | None:
-        """Return the next state to show, None if there is nothing new or it is not time yet."""
+        """Return the next state to show; None if there is nothing new or it is too early."""
         if self._stepper is not None:
             if self._step_due(last_received) > time.monotonic():
                 return None
@@ -196,7 +198,7 @@ class Answering:
         return answer
 
     def give_up(self) -> None:
-        """Go back to equilibria, and wait for the next command: this one has failed."""
+        """Return to equilibria, and wait for the next command: this one has failed."""
         self._is_due = self._wants_motion = False
         self._stepper = self._state = None
 
@@ -218,7 +220,7 @@ class Answering:
         self._choose()
 
     def _choose(self) -> None:
-        """Take the model that fits what is held, and stand still or move as is wanted."""
+        """Take the model for the current grasps, static or dynamic as requested."""
         key = self._key
         base = None if key is None else self._known.get(key)
         reduced = None if base is None else base.with_young(self.held.young)
@@ -235,7 +237,7 @@ class Answering:
     def _step_due(self, last_received: float) -> float:
         """Return when the next step in time is due: soon after a new pose, else at the rate.
 
-        While poses stream in a step waits a little for the next one: it would just miss it.
+        While poses stream in, a step waits briefly for the next one: it would just miss it.
         """
         streams = time.monotonic() - last_received < _STREAM_SECONDS
         part = _SOONEST if self._is_new else _LATEST if streams else 1.0
@@ -247,7 +249,7 @@ class Answering:
         if state.converged:
             self._state = state
             self.held.put(number, held.goal, reduced.displacement(state))
-        # Out of reach the branch stays where it was last: a false state would flicker.
+        # Out of reach the branch stays in its last position: a false state would flicker.
         shown = self._state or state
         displacement = self.held.displacement if self._state is not None else (
             reduced.displacement(shown))
@@ -259,13 +261,13 @@ class Answering:
                       is_trusted=state.trusted and not self._is_doubted(state.pose))
 
     def _is_doubted(self, pose: np.ndarray) -> bool:
-        """Whether the reduced model was found wrong about here, and has not learnt since."""
+        """Whether the reduced model was found wrong near here, and has not learnt since."""
         near = _DOUBTED * self.held.model.extent
         return any(np.linalg.norm(pose[:3] - bad[:3]) < near for bad in self._doubted)
 
     def _step(self, stepper: ReducedStepper) -> Answer:
         now = time.monotonic()
-        # A step that came late is not made up for: the motion slows down, it does not burst.
+        # A late step is not made up for: the motion slows down instead of catching up.
         length = min(max(now - self._last_step, _SOONEST / RATE), _LATEST / RATE)
         self._last_step = now
         ((number, held),) = self.held.grasps.items()
@@ -288,6 +290,6 @@ class Answering:
 
     def _within_reach(self, pose: np.ndarray, goal: np.ndarray, way: float,
                       seconds: float) -> np.ndarray:
-        """Return how far the gripper gets towards a pose: a jump would whip the branch."""
+        """Return how far the gripper moves towards a pose: a jump would whip the branch."""
         part = _FASTEST * self.held.model.extent * seconds / max(way, 1e-12)
         return goal if part >= 1.0 else pose_between(pose, goal, part)

@@ -12,7 +12,7 @@ from limber.store.loading import load_branch, load_skeleton, young_deviation
 
 
 def reduced_settings(settings: SessionSettings) -> ReducedSettings:
-    """Return what the reduced model is made of."""
+    """Return the data from which the reduced model is made."""
     training = TrainingSettings(grasp_count=settings.grasps, young_spread=settings.young_spread)
     return ReducedSettings(size=settings.size, field_count=settings.fields, training=training,
                            vibration_count=1 if settings.young_spread == 1 else 0)
@@ -20,7 +20,7 @@ def reduced_settings(settings: SessionSettings) -> ReducedSettings:
 
 def load_held(folder: Path, settings: SessionSettings,
               progress: Progress = SILENT) -> HeldBranch:
-    """Return the branch of a folder as it hangs, nothing held yet.
+    """Return the branch of a folder as it hangs, without grasps.
 
     Raises:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.

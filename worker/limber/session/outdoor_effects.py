@@ -1,7 +1,7 @@
 """The effects of outdoor loads on the held branch, computed in a separate process.
 
-It takes seconds: meanwhile the branch is moved on. The answer is of the branch as its folder has
-it, with the moduli and the loads that the session had when it was asked.
+It takes seconds; the branch can be moved meanwhile. The answer is for the branch as stored in its
+folder, with the moduli and loads of the session at the time of the request.
 """
 
 from concurrent.futures import CancelledError, Future
@@ -28,11 +28,11 @@ from limber.store.loading import known_damping
 
 
 class EffectsTeller:
-    """Answers one question at a time.
+    """Answers one request at a time.
 
     Args:
-        folder, settings: Of the session.
-        events: Where answers go.
+        folder, settings: Those of the session.
+        events: Receives the answers.
     """
 
     def __init__(self, folder: Path, settings: SessionSettings, events: Events):
@@ -41,18 +41,18 @@ class EffectsTeller:
         self._asked: Future | None = None
 
     def ask(self, question: Effects, held: HeldBranch) -> None:
-        """Have a question answered: its ``reply``, or its ``error``, comes when that is known.
+        """Compute the answer to a request; its ``reply`` or ``error`` is sent when it is known.
 
         Raises:
-            InputError: another one is being answered, no load acts, the weight is off, or gusts
-                are asked for without a wind.
+            InputError: another request is being answered, no load acts, the weight is off, or gusts
+                are requested without a wind.
         """
         if self._asked is not None and not self._asked.done():
             raise InputError("The effects of loads are being computed.",
                              "One request is answered at a time.", "Wait for its reply.")
         loads, gusts = held.outdoors(), gusts_of(question)
         loads = replace(loads, wind=blown(loads.wind, gusts))
-        # It stays for the next question: most of the first one's time is its beginning.
+        # It remains for the next request: most of the time of the first is its start.
         self._pool = self._pool or Pool(1, name="the effects of loads")
         self._asked = self._pool.submit(effects_of, self._folder, self._settings, held.young,
                                         loads, gusts, question)
@@ -73,17 +73,17 @@ class EffectsTeller:
         except LimberError as error:
             self._events.say(event="error", **about, message=str(error))
         except Exception as error:
-            # As all that a command sets off: the branch is still held.
+            # Like everything that a command triggers: the branch stays held.
             self._events.say(event="error", **about, message=f"{type(error).__name__}: {error}")
         else:
             self._events.say(event="reply", **about, **told)
 
 
 def gusts_of(question: Effects) -> Gusts | None:
-    """Return the gusts that a question is about.
+    """Return the gusts of a request.
 
     Raises:
-        InputError: its record is none of a wind.
+        InputError: its record is not one of a wind.
     """
     if question.gust_record is not None:
         return WindRecord.checked(np.array(question.gust_record.time_s),
@@ -94,10 +94,10 @@ def gusts_of(question: Effects) -> Gusts | None:
 
 def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads: Outdoors,
                gusts: Gusts | None, question: Effects, progress: Progress) -> dict[str, Any]:
-    """Return what loads do to a branch with these moduli at its control points [Pa].
+    """Return the effects of loads on a branch with these moduli at its control points [Pa].
 
     Raises:
-        LimberError: it cannot be loaded, or finds no rest.
+        LimberError: it cannot be loaded, or has no equilibrium.
     """
     held = load_held(folder, settings, progress)
     held.set_young(young)

@@ -1,6 +1,6 @@
 """The messages that a client may send to a session, checked before they take effect.
 
-One JSON object a line, UTF-8, at most ``LINE_LIMIT`` bytes. Every command may carry an ``id``,
+One JSON object per line, UTF-8, at most ``LINE_LIMIT`` bytes. Every command may carry an ``id``,
 which its reply repeats. An invalid line gets an ``error`` reply. Only ``close`` and the end of the
 input end the session.
 """
@@ -15,13 +15,13 @@ from limber.core.json_lines import json_object
 from limber.core.settings import GraspMode
 
 PROTOCOL = 2
-"""Version of commands, events and the frames' file; clients with another one are refused."""
+"""Version of commands, events and the frames' file; clients with another version are refused."""
 LINE_LIMIT = 1 << 20
 """Longest line [bytes]; a longer line is discarded and reported."""
 GRASP_LIMIT = 8
 """Most grasps at once."""
 _FAR = 1e3
-"""Farthest that any coordinate lies from 0 [m]: beyond, a unit is wrong."""
+"""Largest coordinate [m]; beyond it a unit is wrong."""
 _LARGEST_ID = 2**53
 """An id travels as a float64 with the frames."""
 
@@ -60,7 +60,7 @@ class Hello(_Command):
 
 
 class Grab(_Command, _OnBranch):
-    """Hold the branch at a position, where that is now."""
+    """Hold the branch at the current location of a position."""
 
     command: Literal["grasp"]
     mode: GraspMode = "pinned"
@@ -68,7 +68,7 @@ class Grab(_Command, _OnBranch):
 
 
 class Release(_Command):
-    """Let go of a grasp, or of all."""
+    """Release a grasp, or all."""
 
     command: Literal["release"]
     grasp: int | None = None
@@ -83,14 +83,14 @@ class Move(_Command):
 
 
 class Gravity(_Command):
-    """Let the branch bear its weight, or not."""
+    """Switch the branch's weight on or off."""
 
     command: Literal["gravity"]
     on: bool
 
 
 class Dynamics(_Command):
-    """Let the branch move in time, or answer with equilibria."""
+    """Switch between motion over time and equilibria."""
 
     command: Literal["dynamics"]
     on: bool
@@ -110,7 +110,7 @@ class Load(_OnBranch):
 
 
 class Loads(_Command):
-    """Forces that hang on the branch, instead of those before: a fruit, a weight, wind."""
+    """Forces that hang on the branch, replacing the earlier ones: a fruit, a weight, wind."""
 
     command: Literal["loads"]
     loads: list[Load] = Field(max_length=1000)
@@ -126,7 +126,7 @@ class Fruit(BaseModel):
 
 
 class Weather(_Command):
-    """Wind, snow, fruit and pruning cuts, instead of those before; see `limber load`."""
+    """Wind, snow, fruit and pruning cuts, replacing the earlier ones; see `limber load`."""
 
     command: Literal["outdoors"]
     wind_m_s: tuple[_Component, _Component, _Component] = (0.0, 0.0, 0.0)
@@ -137,7 +137,7 @@ class Weather(_Command):
 
 
 class RecordedWind(BaseModel):
-    """A wind as it was measured: times, and speeds along its mean direction."""
+    """A measured wind: times, and speeds along its mean direction."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -148,8 +148,8 @@ class RecordedWind(BaseModel):
 class Effects(_Command):
     """Request the effects of wind, snow, fruit and cuts on the branch, as `limber load` does.
 
-    With ``gust``, or a ``gust_record``, all of it is of the peak of the gusts; of a record the
-    wind's direction counts alone.
+    With ``gust``, or a ``gust_record``, the results are for the peak of the gusts; with a record,
+    only the wind's direction is used.
     """
 
     command: Literal["effects"]
@@ -169,7 +169,7 @@ class Effects(_Command):
 
 
 class Status(_Command):
-    """Ask for grasps, gravity and who answers."""
+    """Request the grasps, gravity and the model that answers."""
 
     command: Literal["status"]
 
@@ -211,7 +211,7 @@ def parse_command(line: bytes) -> Command:
 
 
 def _id_of(line: bytes) -> int:
-    """Return the id of a command that is wrong elsewhere, 0 if it has none."""
+    """Return the id of a command that is otherwise invalid, 0 if it has none."""
     found = (json_object(line) or {}).get("id")
     if isinstance(found, int) and not isinstance(found, bool) and 0 <= found <= _LARGEST_ID:
         return found
@@ -221,7 +221,7 @@ def _id_of(line: bytes) -> int:
 class Lines:
     """Cuts a stream of bytes into lines, in bounded memory.
 
-    ``feed`` gives the whole lines that a piece completes, None for one that was too long.
+    ``feed`` returns the complete lines that a chunk ends, None for one that was too long.
     """
 
     def __init__(self, limit: int = LINE_LIMIT):
@@ -230,7 +230,7 @@ class Lines:
         self._is_dropping = False
 
     def feed(self, piece: bytes) -> Iterator[bytes | None]:
-        """Take what was read; yield each line that ends in it, without its end."""
+        """Take a chunk; yield each line that ends in it, without its end."""
         *ended, rest = piece.split(b"\n")
         for end in ended:
             line = None if self._is_dropping or len(self._part) + len(end) > self._limit else (

@@ -1,7 +1,7 @@
 """The branch of a session with its grasps and loads, and its equilibria on the full model.
 
-Nothing here knows of clients, threads or files: :mod:`limber.session.worker` brings the wishes and
-publishes the answers.
+It does not depend on clients, threads or files: :mod:`limber.session.worker` passes the requests
+and publishes the answers.
 """
 
 from dataclasses import dataclass, replace
@@ -23,23 +23,24 @@ from limber.session.frame_buffer import HeldAt
 from limber.session.protocol import GRASP_LIMIT, Load
 
 FULL_STEP = 0.05
-"""Longest way to the wanted poses that the full model goes before it shows a frame, as part of the
-branch's extent."""
+"""Longest step towards the target poses that the full model takes before it shows a frame, as a
+fraction of the branch's extent.
+"""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A state of the branch, whichever model it is from.
+    """A state of the branch, from either model.
 
     Attributes:
-        displacement: Of all nodes from where the branch hangs [m], shape [node_count, 3].
+        displacement: Displacement of all nodes from the hanging branch [m], shape [node_count, 3].
         grasps: The held grasps, with forces.
         energy: Potential of strain and weight above the hanging branch [J].
-        kinetic_energy: [J]. time: Of a motion [s].
+        kinetic_energy: [J]. time: Time of a motion [s].
         is_converged: An equilibrium was found, or the step was.
-        is_reached: The grasps are where they were asked to be.
-        is_reduced: From the reduced model. is_trusted: Within what the model knows.
-        message: Why there is no equilibrium.
+        is_reached: The grasps are at their requested poses.
+        is_reduced: From the reduced model. is_trusted: Within the range that the model has learnt.
+        message: Reason for a missing equilibrium.
     """
 
     displacement: np.ndarray
@@ -56,7 +57,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Held:
-    """A grasp: its patch, where it is and where it is wanted [m, rad]."""
+    """A grasp: its patch, current pose and target pose [m, rad]."""
 
     grasp: Grasp
     pose: np.ndarray
@@ -64,7 +65,7 @@ class Held:
 
 
 class HeldBranch:
-    """A branch, what holds it and what hangs on it.
+    """A branch, its grasps and its loads.
 
     Args:
         loaded: The branch as it hangs, with its targets.
@@ -95,14 +96,14 @@ class HeldBranch:
 
     def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
              mode: Literal["clamped", "pinned"]) -> int:
-        """Hold a patch where it is now; return the number of the grasp.
+        """Hold a patch in its current position; return the number of the grasp.
 
         Args:
-            vertex: Of the surface; or ``point`` [m] on the branch as it hung at the start.
-            radius: Of the patch [m], on the branch as it hung; 0 takes one node.
+            vertex: Vertex of the surface; or ``point`` [m] on the branch as it hung at the start.
+            radius: Radius of the patch [m], on the branch as it hung; 0 takes one node.
 
         Raises:
-            InputError: too many grasps, nothing is there, or the base or another grasp is.
+            InputError: too many grasps, the branch is not there, or the base or another grasp is.
         """
         if len(self.grasps) >= GRASP_LIMIT:
             raise InputError(f"There are already {GRASP_LIMIT} grasps.",
@@ -110,7 +111,7 @@ class HeldBranch:
         return self.hold(Grasp.at(self.model.mesh, self._place(vertex, point), radius, mode))
 
     def hold(self, grasp: Grasp) -> int:
-        """Hold a patch that is known already; as :meth:`grab`."""
+        """Hold a known patch; as :meth:`grab`."""
         self.model.equations([*(held.grasp for held in self.grasps.values()), grasp])
         pose = grasp.pose_of(self.model.mesh.nodes, self.displacement)
         if grasp.mode == "pinned":
@@ -120,7 +121,7 @@ class HeldBranch:
         return self._count
 
     def release(self, number: int | None) -> None:
-        """Let go of a grasp, or of all.
+        """Release a grasp, or all.
 
         Raises:
             InputError: there is no such grasp.
@@ -131,7 +132,7 @@ class HeldBranch:
             del self.grasps[self.number(number)]
 
     def number(self, number: int | None) -> int:
-        """Return the number of a grasp that there is, of the first if none is named.
+        """Return the number of an existing grasp, of the first if none is named.
 
         Raises:
             InputError: there is none, or not that one.
@@ -145,7 +146,7 @@ class HeldBranch:
         return number
 
     def aim(self, number: int | None, pose: np.ndarray) -> None:
-        """Set the wanted pose of a grasp (the first, if not named) [m, rad]."""
+        """Set the target pose of a grasp (the first, if not named) [m, rad]."""
         number = self.number(number)
         held = self.grasps[number]
         if held.grasp.mode == "pinned":
@@ -153,7 +154,7 @@ class HeldBranch:
         self.grasps[number] = replace(held, goal=pose)
 
     def set_gravity(self, on: bool) -> None:
-        """Let the branch bear its weight, or not: without it, it rises from where it hangs.
+        """Switch the branch's weight on or off; without it, the branch rises from where it hangs.
 
         Raises:
             InputError: it was loaded without weight, so there is none to switch on.
@@ -164,10 +165,10 @@ class HeldBranch:
         self.gravity_on = on
 
     def set_young(self, young: np.ndarray) -> None:
-        """Set Young's modulus at the control points [Pa]; the branch hangs as it was scanned.
+        """Set Young's modulus at the control points [Pa]; the branch hangs as scanned.
 
         Raises:
-            InputError: another number of values.
+            InputError: the number of values is wrong.
         """
         if young.shape != self.young.shape:
             raise InputError(f"{young.size} moduli.",
@@ -177,7 +178,7 @@ class HeldBranch:
         self._carried = carried_strain(self.model)
 
     def set_loads(self, loads: list[Load]) -> None:
-        """Hang dead loads on the branch, instead of those before.
+        """Hang dead loads on the branch, replacing the earlier ones.
 
         Raises:
             InputError: a position is not on the branch.
@@ -191,7 +192,7 @@ class HeldBranch:
     def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
         """Apply wind, snow, fruit and cuts; they replace the earlier ones.
 
-        A cut part keeps its shape and has no weight: only the rest counts.
+        A cut part keeps its shape and has no weight: only the remainder counts.
 
         Raises:
             InputError: a position is not on the branch, or its axes are unknown.
@@ -207,7 +208,7 @@ class HeldBranch:
         return made
 
     def outdoors(self) -> Outdoors:
-        """Return the wind, snow, fruit and cuts that act.
+        """Return the active wind, snow, fruit and cuts.
 
         Raises:
             InputError: there are none, or the branch's weight is switched off.
@@ -228,8 +229,9 @@ class HeldBranch:
 
     @property
     def loads(self) -> np.ndarray | None:
-        """Forces on the nodes besides what the hanging branch carries [N], None where there are
-        none, shape [node_count, 3]."""
+        """Forces on the nodes in addition to those that the hanging branch carries [N], None if
+        there are none, shape [node_count, 3].
+        """
         acting = [forces for forces in (self._hung, self._weather) if forces is not None]
         if not self.gravity_on and self.model.prestress is not None:
             acting.append(-self.model.mass_load[:, None] * self.model.gravity)
@@ -244,21 +246,21 @@ class HeldBranch:
         return float(moved[np.abs(moved).argmax()])
 
     def way(self, number: int) -> float:
-        """Return how far a grasp is from where it is wanted [m]; turns count as lengths."""
+        """Return the distance of a grasp from its target [m]; rotations count as lengths."""
         held = self.grasps[number]
         move = held.goal - held.pose
         return float(np.linalg.norm(move[:3])
                      + RADIAN * self.model.extent * np.linalg.norm(move[3:]))
 
     def put(self, number: int, pose: np.ndarray, displacement: np.ndarray) -> None:
-        """Note that a grasp is at a pose now, with the branch displaced so."""
+        """Record that a grasp is now at a pose, with the branch displaced accordingly."""
         self.grasps[number] = replace(self.grasps[number], pose=pose)
         self.displacement = displacement
 
     def solve(self) -> Answer:
-        """Move towards the wanted poses with the full model, by a short step at most.
+        """Move towards the target poses with the full model, by a short step at most.
 
-        Where there is no equilibrium the branch stays where it was.
+        If there is no equilibrium, the branch keeps its last position.
         """
         longest = max((self.way(number) for number in self.grasps), default=0.0)
         part = min(1.0, FULL_STEP * self.model.extent / max(longest, 1e-12))
@@ -289,11 +291,11 @@ class HeldBranch:
         return self.model.mesh.nodes[self.surface] + answer.displacement[self.surface]
 
     def target_positions(self, answer: Answer) -> np.ndarray:
-        """Return where the targets are [m], shape [t, 3]."""
+        """Return the positions of the targets [m], shape [t, 3]."""
         return self.loaded.target_positions(answer.displacement)
 
     def strain(self, answer: Answer) -> tuple[np.ndarray, float, np.ndarray]:
-        """Return strain about the vertices [v], the largest of all, and where it is [m]."""
+        """Return the strain at the vertices [v], the largest of all, and its position [m]."""
         strains = self.model.largest_principal_strains(answer.displacement, self._carried)
         strains[self._is_gone] = 0.0
         worst = int(strains.argmax())
@@ -311,7 +313,7 @@ class HeldBranch:
 
 
 class _AtVertices:
-    """Takes values of tetrahedra to the surface's vertices: the largest about each."""
+    """Maps values of tetrahedra to the surface's vertices: the largest at each."""
 
     def __init__(self, model: BranchModel, surface: np.ndarray):
         tets = model.mesh.tets

@@ -1,4 +1,4 @@
-"""The process beside a session that makes its reduced model, checks it and refreshes it.
+"""The separate process of a session that makes its reduced model, checks it and refreshes it.
 
 It holds the full model, so that the session never waits for it. JSON lines, as in
 :mod:`limber.session.worker`:
@@ -103,7 +103,7 @@ def _serve(folder: Path, settings: SessionSettings, cache: ReducedCache) -> None
 
 
 def _listen(requests: queue.Queue[dict[str, Any] | None], progress: Progress) -> None:
-    """Hand on what the session asks; once it has gone, end what is being learnt as well."""
+    """Pass on the session's requests; when the session has ended, end the training as well."""
     for line in sys.stdin:
         requests.put(json.loads(line))
     progress.cancel()
@@ -111,9 +111,9 @@ def _listen(requests: queue.Queue[dict[str, Any] | None], progress: Progress) ->
 
 
 def _step_back() -> None:
-    """Run only when a core has nothing else to do: the session holds 60 Hz now.
+    """Run only when a core is idle: the session needs 60 Hz.
 
-    Before there is a model the session waits for it, and less patience is called for.
+    Before there is a model the session waits for it, so the trainer runs at a higher priority.
     """
     if hasattr(os, "SCHED_IDLE"):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

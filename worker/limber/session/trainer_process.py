@@ -52,10 +52,10 @@ class Learning:
     """A trainer at work on one grasp.
 
     Args:
-        folder, settings: Of the session.
-        grasp: What to learn.
-        tell: Gets :class:`Learnt` and :class:`Checked`, from another thread.
-        say: Gets the trainer's other events.
+        folder, settings: Those of the session.
+        grasp: Grasp to learn.
+        tell: Receives :class:`Learnt` and :class:`Checked`, from another thread.
+        say: Receives the trainer's other events.
     """
 
     def __init__(self, folder: Path, settings: SessionSettings, grasp: Grasp,
@@ -70,7 +70,7 @@ class Learning:
             [sys.executable, "-m", "limber.session.trainer", str(folder),
              settings.model_dump_json()],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            # Windows has no `nice` that the trainer could call itself.
+            # Windows has no `nice` for the trainer to call itself.
             creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0))
         self._write({"nodes": grasp.nodes.tolist(), "weights": grasp.weights.tolist(),
                      "mode": grasp.mode})
@@ -78,7 +78,7 @@ class Learning:
         self._listener.start()
 
     def check(self, state: ReducedState) -> None:
-        """Ask for a comparison with the full model, if the trainer has time and news."""
+        """Request a comparison with the full model, if the trainer is free and the pose is new."""
         now = time.monotonic()
         if self._busy or now - self._last_check < _CHECK_INTERVAL or (
                 self._checked is not None and np.allclose(self._checked, state.pose)):

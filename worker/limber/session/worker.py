@@ -1,8 +1,8 @@
-"""Interactive session: a process that holds a branch and answers "grasp at this pose now".
+"""Interactive session: a process that holds a branch and computes it for the current grasps.
 
 Start it with ``limber session NAME.branch`` or ``python -m limber.session.worker NAME.branch``
 (``--help``), or from Python with :class:`limber.session.client.InteractiveSession`. Any program can
-talk to it; nothing of Limber is needed on the other side.
+use it; the other side does not need Limber.
 
 Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each may carry an ``id``
 (an integer from 0). Its ``reply``, its ``error`` and the frame that answers it repeat the id:
@@ -50,7 +50,7 @@ Events, one JSON object a line on standard output; a client may leave them unrea
 - ``{"event": "reply", "id", "command", ...}`` and ``{"event": "error", "id", "command",
   "message"}``: the answer to a command. An invalid command also gets an error and has no effect.
 - ``{"event": "progress", "progress", "message"}``: a reduced model of the held branch is being
-  learnt. Until then the full model answers, a few times a second, on the path to the wanted pose.
+  learnt. Until then the full model answers, a few times a second, on the path to the target pose.
 - ``{"event": "model", "size", "seconds", "snapshots", "refreshes", "from_cache"}``: a reduced model
   now answers. It needs exactly one grasp; with none or several, under loads and without weight,
   the full model answers.
@@ -98,11 +98,11 @@ from limber.version import VERSION
 
 _SWITCH_SECONDS = 0.001
 _LAST_SECONDS = 5.0
-"""How long what is being computed may go on after the client has gone."""
+"""Time for a computation to continue after the client has disconnected."""
 
 
 class Session:
-    """Obeys the client, answers with frames.
+    """Executes the client's commands, and answers with frames.
 
     Raises:
         LimberError: the branch cannot be loaded.
@@ -129,7 +129,7 @@ class Session:
         self._asked = (0, time.monotonic())
 
     def run(self) -> None:
-        """Answer until the client closes or goes."""
+        """Answer until the client closes or disconnects."""
         _steady()
         self._publish(self.answering.rest())
         self.events.say(**self._hello())
@@ -150,7 +150,7 @@ class Session:
     def _read(self) -> None:
         read_commands(sys.stdin.fileno(), self.inbox, self._refuse)
         if not self._ended.wait(_LAST_SECONDS):
-            # Still in one long solve, and nobody waits for it.
+            # Still in one long solve, whose result is not needed any more.
             self.answering.close()
             with contextlib.suppress(OSError):
                 self.frames.path.unlink()
@@ -171,14 +171,14 @@ class Session:
                             message=str(error))
             return
         except Exception as error:
-            # The door of the process: whatever a command sets off, the branch is still held.
+            # Outermost handler of the process: whatever a command triggers, the branch stays held.
             traceback.print_exc()
             self.events.say(event="error", id=command.id, command=command.command,
                             message=f"{type(error).__name__}: {error}")
             return
         if not isinstance(command, protocol.Hello | protocol.Status | protocol.Effects):
             self._asked = (max(command.id, self._asked[0]), received.at)
-        # Effects are told when they are known.
+        # Effects are reported when they are known.
         if not isinstance(command, protocol.Move | protocol.Effects):
             self.events.say(event="reply", id=command.id, command=command.command, **reply)
 
@@ -221,7 +221,7 @@ class Session:
         try:
             answer = self.answering.answer(self.inbox.last_at)
         except Exception as error:
-            # As in _obey: a solver that fails in a way of its own must not end the session.
+            # As in _obey: an unexpected failure of a solver must not end the session.
             traceback.print_exc()
             self.answering.give_up()
             self.events.say(event="error", id=self._asked[0], command=None,
@@ -273,10 +273,10 @@ def _outdoors(command: protocol.Weather) -> Outdoors:
 
 
 def _steady() -> None:
-    """Take away what would hold up a frame now and then.
+    """Remove what would occasionally delay a frame.
 
     Kernels are loaded before the first frame needs them; a waiting thread gets the interpreter
-    within a millisecond; garbage collection looks at what is new only.
+    within a millisecond; garbage collection examines new objects only.
     """
     compile_kernels()
     sys.setswitchinterval(_SWITCH_SECONDS)

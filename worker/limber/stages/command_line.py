@@ -1,9 +1,9 @@
-"""Options of a command line from a settings model, and the command line from settings.
+"""Command line options from a settings model, and the command line from settings.
 
 A field's description is its option's help, its default the option's. ``bool`` fields become
 ``--name/--no-name``, ``tuple[float, float, float]`` takes three values, a tuple of such tuples may
-be given several times. What a field's ``json_schema_extra`` may say beside that: ``argument``
-(given without its name), ``short`` (a short option), ``switch`` (no ``--no-name``), ``metavar``.
+be given several times. A field's ``json_schema_extra`` may also have: ``argument`` (given without
+its name), ``short`` (a short option), ``switch`` (no ``--no-name``), ``metavar``.
 """
 
 import functools
@@ -22,7 +22,7 @@ from limber.stages.registry import StageDescription
 
 
 class GroupedOption(click.Option):
-    """An option that stands under a title in the help; an expert's one only in --help-all."""
+    """An option below a title in the help; an expert option is shown only by --help-all."""
 
     def __init__(self, *declarations: Any, group: str = "running", expert: bool = False,
                  **attributes: Any):
@@ -31,7 +31,7 @@ class GroupedOption(click.Option):
 
 
 class DescribedArgument(click.Argument):
-    """An argument with a help text that stands under a title."""
+    """An argument with a help text below a title."""
 
     def __init__(self, *declarations: Any, description: str, group: str, **attributes: Any):
         super().__init__(*declarations, **attributes)
@@ -39,7 +39,7 @@ class DescribedArgument(click.Argument):
 
 
 class GroupedCommand(click.Command):
-    """A command whose help shows options under titles, and experts' options on demand."""
+    """A command whose help shows options below titles, and expert options on demand."""
 
     def __init__(self, *args: Any, **attributes: Any):
         super().__init__(*args, **attributes)
@@ -62,7 +62,7 @@ class GroupedCommand(click.Command):
             record = param.get_help_record(ctx)
             if record is not None:
                 sections.setdefault(getattr(param, "group", "running"), []).append(record)
-        # What is about running stands last in every command.
+        # Options of the run itself come last in every command.
         running = sections.pop("running", [])
         for title, records in {**sections, "running": running}.items():
             if records:
@@ -84,16 +84,16 @@ def _show_all(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None
 
 
 def options_of(command: click.Command) -> frozenset[str]:
-    """Return the options that a command has, as they are typed."""
+    """Return the options of a command, as they are typed."""
     return frozenset(flag for param in command.params if isinstance(param, click.Option)
                      for flag in (*param.opts, *param.secondary_opts))
 
 
 def without_foreign_options(text: str, own: Collection[str]) -> str:
-    """Return a message without what names options that are not among ``own``.
+    """Return a message without the parts that name options not among ``own``.
 
-    For a command that runs others: of its user's options theirs are none. Brackets and sentences
-    that name such an option are left out.
+    For a command that runs others: its user cannot give their options. Brackets and sentences that
+    name such an option are removed.
     """
     def is_foreign(part: str) -> bool:
         return not {*_OPTION.findall(part)} <= {*own}
@@ -112,7 +112,7 @@ def settings_options(model: type[BaseModel], name: str = "settings", *,
 
     Args:
         model: The model.
-        name: Of the function's argument.
+        name: Name of the function's argument.
         without: Fields that get no option and keep their defaults.
 
     Raises:
@@ -128,8 +128,8 @@ def settings_options(model: type[BaseModel], name: str = "settings", *,
 
 
 def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
-    """Add one option for each input, setting and option of a stage; the function gets ``values``,
-    what was given by name, as :meth:`StageDescription.models` takes it.
+    """Add one option for each input, setting and option of a stage. The function gets ``values``,
+    the values given by name, as :meth:`StageDescription.models` takes them.
     """
     fields = {field: model for model in (stage.inputs, stage.settings, stage.options)
               for field in model.model_fields}
@@ -138,7 +138,7 @@ def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
 
 def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
                   prefix: str) -> Callable:
-    """Add an option a field of a model; the function gets ``values``, those that were given."""
+    """Add an option per field of a model; the function gets ``values``, those that were given."""
     @functools.wraps(function)
     def body(*args: Any, **options: Any) -> Any:
         given = {field: options.pop(f"{prefix}__{field}") for field in fields}
@@ -150,7 +150,7 @@ def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
 
 
 def command_line(*models: Settings) -> list[str]:
-    """Return the arguments that give a command these values; defaults are left out."""
+    """Return the arguments that give a command these values; defaults are omitted."""
     arguments: list[str] = []
     options: list[str] = []
     for model in models:
@@ -210,7 +210,7 @@ def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) 
         if isinstance(part, OneOf):
             return click.option(*flags, destination, type=click.Choice(part.names()), **common)
         if isinstance(part, Renamed):
-            # Scripts may go on with the names that files keep.
+            # Scripts may continue to use the old names that files keep.
             taken = click.Choice([*part.kept, *typing.get_args(kind)])
             common = {"metavar": f"[{'|'.join(part.kept)}]", **common}
             return click.option(*flags, destination, type=taken, **common)
@@ -222,7 +222,7 @@ def _tuple_option(names: list[str], items: tuple, common: dict[str, Any]) -> Cal
         parts = typing.get_args(items[0])
         return click.option(*names, nargs=len(parts), type=parts[0], multiple=True, **common)
     if items[-1] is Ellipsis:
-        # Given twice it adds up: the last one alone would drop the others without a word.
+        # Repeated values add up: using only the last would silently drop the others.
         return click.option(*names, callback=_listed, multiple=True,
                             **{"metavar": "A,B,...", **common})
     if len(items) == 3:
@@ -265,7 +265,7 @@ def _help(name: str, field: Any, kind: Any, default: Any) -> str:
 
 
 def _new_name(field: Any, value: Any) -> Any:
-    """What a value that files keep is called today."""
+    """Today's name of a value that files keep under an old one."""
     kept = next((part.kept for part in field.metadata if isinstance(part, Renamed)), {})
     return next((new for new, old in kept.items() if old == value), value)
 

@@ -11,7 +11,7 @@ from limber.core.progress import Progress
 from limber.core.settings import Groups, Settings
 
 Run = Callable[[Any, Any, Any, Progress], dict[str, Any]]
-"""How a stage is run: by inputs, settings, options and progress."""
+"""Run of a stage: inputs, settings, options and progress."""
 
 
 def argument(description: str) -> Any:
@@ -20,20 +20,20 @@ def argument(description: str) -> Any:
 
 
 def required(description: str, example: str) -> Any:
-    """Return the field of an option that must be given; ``example`` is proposed where it is not.
+    """Return the field of a required option; ``example`` is proposed if it is missing.
 
-    ``{stem}`` in it stands for the name of the first file or folder that is given.
+    ``{stem}`` in it is the stem of the first file or folder that is given.
     """
     return Field(description=description, json_schema_extra={"example": example})
 
 
 def by_name(function: Callable[..., dict[str, Any]], **fields: str) -> Run:
-    """Return how a stage is run by a function whose parameters are called as its fields.
+    """Return a run that calls a function whose parameters are named like its fields.
 
     Args:
         function: Takes fields of inputs, settings and options, or ``inputs``, ``settings`` and
             ``options`` whole, and ``progress``.
-        fields: Of a parameter with a name of its own, the field that it takes.
+        fields: Parameters with a name of their own, each with its field.
     """
     taken = {name: fields.get(name, name) for name in inspect.signature(function).parameters}
 
@@ -47,7 +47,7 @@ def by_name(function: Callable[..., dict[str, Any]], **fields: str) -> Run:
 
 
 NOT_KEPT = {"panel": False}
-"""Of a field that the add-on's panels do not keep: it is typed each time, or given elsewhere."""
+"""For a field that the add-on's panels do not store: it is typed each time, or given elsewhere."""
 
 
 class BranchInputs(Settings):
@@ -59,7 +59,7 @@ class BranchInputs(Settings):
 
 
 class RunOptions(Settings):
-    """How a stage is run; none of it changes the result."""
+    """Options of a stage's run; none of them changes the result."""
 
     groups: ClassVar[Groups] = {"running": ("force",)}
 
@@ -68,7 +68,7 @@ class RunOptions(Settings):
 
 
 class ParallelOptions(RunOptions):
-    """For stages that work in several processes."""
+    """For stages that use several processes."""
 
     groups: ClassVar[Groups] = {"running": ("workers",)}
 
@@ -78,8 +78,8 @@ class ParallelOptions(RunOptions):
 
 
 class NoOptions(Settings):
-    """For stages that have nothing to choose about how they run."""
+    """For stages without options of the run."""
 
 
 class NoSettings(Settings):
-    """For stages that have nothing to set."""
+    """For stages without settings."""

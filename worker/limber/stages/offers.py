@@ -1,4 +1,4 @@
-"""What an error's text offers to do instead: options of the stage, with the value to give them."""
+"""Remedies offered in an error's text: options of the stage, with their values."""
 
 import re
 from typing import Any
@@ -10,12 +10,12 @@ def offers(schema: dict[str, Any], text: str) -> list[dict[str, Any]]:
     """Return the options that a text offers with a value, in its order, each once.
 
     Args:
-        schema: Of the stage, from :func:`limber.stages.registry.stage_schema`.
+        schema: Schema of the stage, from :func:`limber.stages.registry.stage_schema`.
         text: What the user reads, for example "join them (--plants joined)".
 
     Returns:
-        For each the ``option`` (the name of its field) and its ``value``. An option without a value
-        is not among them: what to give it only the user knows.
+        For each the ``option`` (the name of its field) and its ``value``. Options without a value
+        are excluded: only the user knows the value.
     """
     fields = {name: about for part in ("inputs", "settings", "options")
               for name, about in schema[part].get("properties", {}).items()}

@@ -1,10 +1,9 @@
-"""The registry of stages: the one source of commands, options, schemas and job tables.
+"""The registry of stages: the single source of commands, options, schemas and job tables.
 
 A stage is a module that assigns ``STAGE = StageDescription("name", ...)``: below this folder, in
 another package that names it under the entry points ``limber.stages``, or given to
-:func:`register`. Its docstring is the command's help, the first line what ``limber --help`` says
-of it. The names are found without importing a stage, so that ``limber --help`` waits for no
-package.
+:func:`register`. Its docstring is the command's help; ``limber --help`` shows the first line. The
+names are found without importing a stage, so that ``limber --help`` imports no heavy package.
 """
 
 import ast
@@ -25,31 +24,31 @@ if TYPE_CHECKING:
     from limber.core.settings import Settings
 
 FORMAT = 1
-"""Of the schemas that :func:`all_schemas` returns."""
+"""Format version of the schemas that :func:`all_schemas` returns."""
 
 
 @dataclass(frozen=True)
 class StageDescription:
-    """What a stage is; everything that must know it reads it here.
+    """Description of a stage, read by everything that needs to know the stage.
 
     Attributes:
-        name: The command's.
-        position: Where it stands in ``limber --help``, in the order in which stages run.
+        name: Name of the command.
+        position: Its position in ``limber --help``, in the order in which stages run.
         run: Called with inputs, settings, options of the run and progress; returns the result.
-        inputs: Files, folders and names: where from and where to.
-        settings: What the result depends on beside the inputs; the manifest remembers them.
-        options: How it is run, which does not change the result.
-        key: Its entry in the manifest; ``{name}`` stands for that input or setting. Empty: it
-            makes none.
+        inputs: Files, folders and names: source and target.
+        settings: What the result depends on beside the inputs; the manifest records them.
+        options: Options of the run, which do not change the result.
+        key: Key of its entry in the manifest; ``{name}`` is replaced by that input or setting.
+            Empty: it makes none.
         reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
-        writes: Names of those that it writes.
-        tables: Titles and rows to show a person beside the result, the first row the header.
-        found: Lines that say what was found, as :func:`limber.cli.terminal.found_lines` fills
-            them from inputs, settings and result; without any, all of the result is shown.
-        then: The command that mostly follows, its names and paths filled in alike.
-        step: The panel of the add-on (:data:`addon.steps.STEPS`) that it stands in; empty: none.
-        label: What its button says there.
-        moves_robot: Whether it does; batches do not run it then.
+        writes: Names of the files that it writes.
+        tables: Titles and rows to show beside the result; the first row is the header.
+        found: Lines of findings, which :func:`limber.cli.terminal.found_lines` fills from inputs,
+            settings and result; without any, the whole result is shown.
+        then: The usual next command, its names and paths filled in likewise.
+        step: Its panel in the add-on (:data:`addon.steps.STEPS`); empty: none.
+        label: Label of its button there.
+        moves_robot: Whether it moves a robot; batches then do not run it.
     """
 
     name: str
@@ -70,10 +69,10 @@ class StageDescription:
     moves_robot: Literal["", "when armed", "always"] = ""
 
     def models(self, values: Mapping[str, Any]) -> "tuple[Settings, Settings, Settings]":
-        """Return inputs, settings and options of values by name; no name belongs to two of them.
+        """Return inputs, settings and options from values by name; each name is in only one.
 
         Raises:
-            InputError: a name is not known, an input is missing, or a value is refused.
+            InputError: a name is unknown, an input is missing, or a value is refused.
         """
         from limber.core.errors import InputError
         from limber.core.settings import checked_settings, nearest
@@ -89,7 +88,7 @@ class StageDescription:
         return inputs, settings, options
 
     def entry(self, inputs: "Settings", settings: "Settings") -> str:
-        """Return the name of the manifest's entry for these models; empty where it makes none."""
+        """Return the name of the manifest's entry for these models; empty if there is none."""
         name = getattr(inputs, "name", None) or getattr(settings, "name", None) or ""
         return self.key.replace("{name}", name)
 
@@ -98,7 +97,7 @@ _registered: list[ModuleType] = []
 
 
 def register(module: ModuleType) -> None:
-    """Make a module's ``STAGE`` a stage of this process; entry points make it one of all."""
+    """Add a module's ``STAGE`` in this process; entry points add it in all."""
     _registered.append(module)
     _stages.cache_clear()
 
@@ -118,7 +117,7 @@ def _stages() -> dict[str, tuple[str, str]]:
 
 
 def _in_files() -> Iterator[tuple[int, str, str, str]]:
-    """Position, name, summary and module of the stages below this folder and of other packages."""
+    """Position, name, summary and module of the stages in this folder and in other packages."""
     folder = Path(__file__).parent
     for path in folder.rglob("*.py"):
         if about := _described(path):
@@ -173,12 +172,11 @@ def stage_description(name: str) -> StageDescription:
 
 
 def stage_schema(name: str) -> dict[str, Any]:
-    """Return what a program must know to run a stage, as plain JSON.
+    """Return what a program needs to know to run a stage, as plain JSON.
 
-    ``inputs``, ``settings`` and ``options`` are JSON schemas; their properties also have
-    ``group`` (the title under which they stand), ``expert`` and, where they have one, ``unit``;
-    ``panel`` is false where no panel may keep it.
-    An input with ``argument`` is given without its name; ``short`` is its short option.
+    ``inputs``, ``settings`` and ``options`` are JSON schemas. Their properties also have ``group``
+    (their title), ``expert`` and possibly ``unit``; ``panel`` is false if no panel may store it. An
+    input with ``argument`` is given without its name; ``short`` is its short option.
     """
     stage = stage_description(name)
     return {
@@ -201,7 +199,7 @@ def all_schemas() -> dict[str, Any]:
 
 
 def stage_table() -> str:
-    """Return the Markdown table of stages: the shortest command of each, and what it does."""
+    """Return the Markdown table of stages: the shortest command of each, and its summary."""
     rows = ["| stage | what it does |", "|---|---|"]
     for name, summary in stage_summaries().items():
         words = [f"limber {name}"]

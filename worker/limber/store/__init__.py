@@ -1,4 +1,4 @@
-"""The branch folder on disk: manifest, stages that enter all or not at all, locks, streams."""
+"""The branch folder on disk: manifest, stages committed whole or not at all, locks, streams."""
 
 from limber.store.branch import Branch, Stage
 from limber.store.growing_files import Stream, stream_lines

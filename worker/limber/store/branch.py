@@ -7,10 +7,10 @@ Every stage of the pipeline writes through :meth:`Branch.stage`::
         write_mesh(stage.path("mesh.vtu"))
         stage.result["tet_count"] = 2500
 
-Files are written beside the folder's own and enter it together when the block ends without an
-error; otherwise the folder stays as it was (:mod:`limber.store.journal`). One program at a time
-writes (:mod:`limber.store.lock`), any number read (:meth:`Branch.read`, which changes nothing).
-What killed programs left behind is finished or swept by the next one that writes.
+Files are written to a work folder and enter the branch folder together when the block ends without
+an error; otherwise the folder stays unchanged (:mod:`limber.store.journal`). One program at a time
+writes (:mod:`limber.store.lock`), any number read (:meth:`Branch.read`, which changes nothing). The
+next writer finishes or removes the leftovers of killed programs.
 """
 
 import os
@@ -60,7 +60,7 @@ RESULTS = "results"
 
 
 class Stage:
-    """A stage in progress. ``path`` gives where to write; ``result`` goes to the manifest."""
+    """A stage in progress. ``path`` gives the path to write to; ``result`` goes to the manifest."""
 
     def __init__(self, folder: Path, manifest: Manifest, streams: Path):
         self._folder = folder
@@ -71,24 +71,24 @@ class Stage:
         self.adopted: list[Path] = []
 
     def path(self, name: str) -> Path:
-        """Return where to write file ``name`` (relative, ``/``) of the branch folder.
+        """Return the path for writing file ``name`` (relative, ``/``) of the branch folder.
 
         Raises:
-            WorkError: the branch folder is gone.
+            WorkError: the branch folder no longer exists.
         """
         path = self._folder / checked_name(name)
         if not self._folder.is_dir():
-            # Not made anew: below the empty place of a lost disk there is another disk.
+            # Not created again: below the empty mount point of a lost disk is another disk.
             raise gone(self._folder.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def remove(self, name: str) -> None:
-        """Drop file ``name`` of an earlier run when this stage ends well."""
+        """Drop file ``name`` of an earlier run when this stage succeeds."""
         self.removes.add(checked_name(name))
 
     def adopt(self, name: str) -> None:
-        """Take over what the closed stream ``name`` of the branch holds, as the file ``name``."""
+        """Take over the content of the closed stream ``name`` as the file ``name``."""
         stream = self._streams / checked_name(name)
         shutil.copyfile(stream, self.path(name))
         self.adopted.append(stream)
@@ -114,12 +114,12 @@ class Branch:
 
     @property
     def uuid(self) -> str | None:
-        """What names the branch wherever it goes; None for one of format 1, until written to."""
+        """Identifier of the branch, independent of its folder; None in format 1 until written."""
         return self.manifest.uuid
 
     @property
     def gravity(self) -> tuple[float, float, float]:
-        """Gravity [m/s^2] in the branch's frame: the upright turn of a scan turns it too."""
+        """Gravity [m/s^2] in the branch's frame; the upright rotation of a scan rotates it too."""
         return tuple(self.made.result.get("gravity_m_s2", GRAVITY)) if self.made else GRAVITY
 
     @property
@@ -149,10 +149,11 @@ class Branch:
 
     @classmethod
     def open(cls, folder: str | os.PathLike, *, verify: bool = False) -> "Branch":
-        """Open an existing branch folder to write to it; what a killed program left is finished.
+        """Open an existing branch folder to write to it; an interrupted commit is finished.
 
-        A file is compared with its checksum when it is used (:meth:`path`), so that a damaged
-        one stops what needs it but not the stage that makes it anew; ``verify`` compares all.
+        A file is compared with its checksum when it is used (:meth:`path`). A damaged file thus
+        stops the stages that need it, but not the stage that makes it again; ``verify`` compares
+        all.
 
         Raises:
             BranchFolderError: not a branch folder, damaged, of a newer format, or with links or
@@ -168,17 +169,17 @@ class Branch:
 
     @classmethod
     def read(cls, folder: str | os.PathLike, *, unfinished: bool = False) -> "Branch":
-        """Open an existing branch folder only to read it: nothing in it is changed.
+        """Open an existing branch folder only to read it; it is not changed.
 
-        Where another program is entering results, it waits for the end of that.
+        If another program is committing results, it waits until that is finished.
 
         Args:
-            unfinished: Take a folder with an interrupted commit as it will be when that is
+            unfinished: Read a folder with an interrupted commit as it will be when that is
                 finished. Only :meth:`damages` finds the files that are not in place yet.
 
         Raises:
-            BranchFolderError: as :meth:`open`; or a commit was interrupted, and ``unfinished`` is
-                not set.
+            BranchFolderError: as for :meth:`open`; or a commit was interrupted, and ``unfinished``
+                is not set.
         """
         folder = Path(folder)
         with opening(folder):
@@ -194,7 +195,7 @@ class Branch:
         """Return the path of file or folder ``name``, whether it exists or not.
 
         Raises:
-            BranchFolderError: the manifest has it, or files in it, and they are damaged.
+            BranchFolderError: the manifest lists it, or files in it, and they are damaged.
         """
         name = checked_name(name)
         path = inside(self.folder, name)
@@ -254,16 +255,16 @@ class Branch:
 
     @contextmanager
     def writing(self, purpose: str) -> Iterator[None]:
-        """Hold the right to write to this folder, and sweep what killed programs left in it.
+        """Hold the right to write to this folder, and remove the leftovers of killed programs.
 
-        :meth:`stage` takes it by itself; a stage whose work begins long before asks for it first.
+        :meth:`stage` acquires it itself; a stage that starts work long before acquires it first.
 
         Args:
-            purpose: What another program's user reads that finds the folder taken.
+            purpose: Text for the user of another program that finds the folder locked.
 
         Raises:
             BranchFolderError: another program has it locked; states which and since when.
-            WorkError: the disk is full or nearly so, or the folder is lost, now or until the end.
+            WorkError: the disk is full or nearly so, or the folder is lost, now or later.
         """
         require_there(self.folder)
         with in_words(self.folder), run_lock(self.folder, purpose) as is_first:
@@ -274,8 +275,9 @@ class Branch:
 
     @contextmanager
     def dropped_if_empty(self) -> Iterator[None]:
-        """Remove the folder if what follows fails before any result has come into it: a stage that
-        begins a branch leaves no half one."""
+        """Remove the folder if the block fails before it has any result, so that no half-made
+        branch is left.
+        """
         try:
             yield
         except BaseException:
@@ -326,10 +328,11 @@ class Branch:
         """Run stage ``key``; see the module's docstring.
 
         Args:
-            key: The stage's name, with the entry's where there are several ("plan:to-light").
-            settings: What the result depends on beside the inputs; stored as plain JSON.
+            key: The stage's name, with the entry's if there are several ("plan:to-light").
+            settings: Values that determine the result in addition to the inputs; stored as plain
+            JSON.
             reads: Names of files of this folder that the stage reads.
-            digests: Further inputs, label to digest (a file from outside, part of a file).
+            digests: Further inputs, label to digest (an external file, part of a file).
         """
         started = time.perf_counter()
         with self.writing(f"the stage {key}"):
@@ -357,7 +360,7 @@ class Branch:
                    for name in entry.writes}
         require_there(self.folder)
         with commit_lock(self.folder):
-            # One that a killed program left comes first: its files count already.
+            # An entry left by a killed program comes first: its files already count.
             journal.roll_forward(self.folder)
             manifest = read_manifest(self.folder)
             manifest.alignment, manifest.source = stage.manifest.alignment, stage.manifest.source

@@ -13,7 +13,7 @@ from limber.store import journal
 from limber.store.manifest import MANIFEST
 
 LEAST_FREE_BYTES = 200e6
-"""A stage does not begin with less room on the disk: it would lose its work at the end."""
+"""A stage does not start with less free space on the disk: it would lose its results at the end."""
 
 
 @contextmanager
@@ -27,15 +27,15 @@ def in_words(folder: Path) -> Iterator[None]:
         told = machine_error(error, folder)
         if told is None:
             raise
-        # A file that the failed writer still has open keeps its room, removed or not; the next
-        # stage of this process would find the disk as full.
+        # A file still open in the failed writer keeps its space, removed or not; the next stage of
+        # this process would find the disk full as well.
         traceback.clear_frames(error.__traceback__)
         gc.collect()
         raise told from error
 
 
 def require_there(folder: Path) -> None:
-    """Refuse a folder that was there and is not any more: locks would make an empty one."""
+    """Refuse a folder that has disappeared: locks would create an empty one."""
     if _is_gone(folder):
         raise gone(folder)
 
@@ -44,7 +44,7 @@ def _is_gone(folder: Path) -> bool:
     try:
         return not (folder / MANIFEST).is_file() and not journal.is_pending(folder)
     except OSError:
-        # The place does not answer: another error says so better.
+        # The file system does not answer; another error reports that better.
         return False
 
 

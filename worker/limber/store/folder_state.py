@@ -25,7 +25,7 @@ from limber.store.manifest import MANIFEST, Manifest, read_manifest
 
 
 def begin(folder: Path, manifest: Manifest) -> None:
-    """Make the folder with its manifest: a new one appears whole, an empty one is filled."""
+    """Make the folder with its manifest: a new one appears complete, an empty one is filled."""
     unfinished = folder.with_name(owned_name(folder.name))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def begin(folder: Path, manifest: Manifest) -> None:
         flush_folder(folder.parent)
     except OSError as error:
         if (folder / MANIFEST).exists():
-            # Another program made it in the same moment.
+            # Another program made it at the same time.
             return
         raise BranchFolderError(
             f"{folder} cannot be written to ({error.strerror}).",
@@ -55,12 +55,12 @@ def begin(folder: Path, manifest: Manifest) -> None:
 
 
 def settled_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a branch folder, once what a killed program left is finished.
+    """Return the manifest of a branch folder, after finishing an interrupted commit.
 
     For callers that copy a folder without reading it.
 
     Raises:
-        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`; or it has links.
+        BranchFolderError: as for :func:`~limber.store.manifest.read_manifest`; or it has links.
     """
     refuse_links(folder)
     finish_pending(folder)
@@ -80,7 +80,7 @@ def opening(folder: Path) -> Iterator[None]:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a folder that has links in it: they may lead out of it."""
+    """Refuse a folder that contains links: they may lead out of it."""
     try:
         safe_names.refuse_links(folder)
     except InputError as error:
@@ -88,7 +88,7 @@ def refuse_links(folder: Path) -> None:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Return the path of ``name`` in a folder; refuse one that leads out of it."""
+    """Return the path of ``name`` in a folder; refuse one outside the folder."""
     try:
         return safe_names.inside(folder, name)
     except InputError as error:
@@ -96,7 +96,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def settle(folder: Path, *, unfinished: bool = False) -> None:
-    """Wait for a program that enters results; refuse what a killed one left, unless ``unfinished``.
+    """Wait for a committing program; refuse an interrupted commit, unless ``unfinished``.
     """
     if journal.is_pending(folder):
         wait_for_commit(folder)
@@ -105,31 +105,31 @@ def settle(folder: Path, *, unfinished: bool = False) -> None:
 
 
 def drop_empty(folder: Path) -> None:
-    """Remove a branch folder that has a manifest and nothing in it; any other stays as it is.
+    """Remove a branch folder with a manifest but no other content; keep any other.
 
-    It also stays where another program writes to it.
+    It is also kept if another program writes to it.
     """
     own = (COMMIT_LOCK, RUN_LOCK, HOLDER)
-    # What cannot be removed stays: the failure that leads here is what the user must read.
+    # A file that cannot be removed stays: the user must see the original failure.
     with (contextlib.suppress(OSError, BranchFolderError),
           run_lock(folder, "removing an empty branch"), commit_lock(folder)):
         manifest = read_manifest(folder)
         if manifest.stages or manifest.files or {path.name for path in folder.iterdir()} - {
                 MANIFEST, *own}:
             return
-        # The locks are held until the end, so that nobody begins to write meanwhile.
+        # The locks are held until the end, so that no program starts to write meanwhile.
         for name in (MANIFEST, *own):
             (folder / name).unlink(missing_ok=True)
         folder.rmdir()
 
 
 def finish_pending(folder: Path) -> None:
-    """Finish the commit of a program that was killed in it."""
+    """Finish the commit of a program that was killed during it."""
     if journal.is_pending(folder):
         with commit_lock(folder):
             journal.roll_forward(folder)
 
 
 def is_litter(name: str) -> bool:
-    """Whether a file of this name may be in a folder that was killed while it was made."""
+    """Whether a file of this name may be in a folder whose creation was interrupted."""
     return name in (COMMIT_LOCK, RUN_LOCK) or is_owned_name(name)

@@ -1,8 +1,8 @@
-"""Streams: files that grow while something happens, as a recording or a log does.
+"""Streams: files that grow during an operation, such as a recording or a log.
 
-A stream holds lines. What was appended is handed to the system within a quarter of a second and
-brought to the disk within one: a killed program loses at most that, and so does a power cut. A
-line that was cut off in the middle is cut away when the stream is taken over.
+A stream holds lines. Appended lines are passed to the system within a quarter of a second and
+written to the disk within one second: a killed program loses at most that, and so does a power
+failure. An incomplete line is removed when the stream is taken over.
 """
 
 import os
@@ -25,14 +25,14 @@ Shorten = Callable[[Iterator[str]], list[str] | None]
 
 
 class Stream:
-    """Appends lines to a file; a thread writes them, so that who appends never waits for a disk.
+    """Appends lines to a file; a thread writes them, so that the caller never waits for a disk.
 
-    Use it in a ``with``, or close it. A file that is there is gone on with.
+    Use it in a ``with``, or close it. An existing file is continued.
 
     Args:
-        path: The file; its folder is made.
-        shorten: Asked, while nobody else appends, for the lines to keep of those that are there;
-            None keeps all.
+        path: The file; its folder is created.
+        shorten: Called while no other program appends; returns the existing lines to keep, None for
+            all.
 
     Raises:
         BranchFolderError: another program appends to it, or it cannot be written.
@@ -46,7 +46,7 @@ class Stream:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
             if self.path.exists() and has_other_names(self.path):
-                # An archive can bring a second name of a file elsewhere: that one must not grow.
+                # An archive can create a second name of a file elsewhere: that file must not grow.
                 write_atomically(self.path, self.path.read_bytes())
             self.cut_bytes = _cut_torn_line(self.path)
             kept = shorten(stream_lines(self.path)) if shorten and self.path.exists() else None
@@ -74,7 +74,7 @@ class Stream:
         """Append one line, given without its end; does not wait.
 
         Raises:
-            InputError: the text has a line end in it.
+            InputError: the text contains a line end.
             WorkError: an earlier line could not be written, as on a full disk.
         """
         if "\n" in line or "\r" in line:
@@ -89,7 +89,7 @@ class Stream:
         """Write all appended lines to the disk.
 
         Raises:
-            WorkError: that could not be done.
+            WorkError: they could not be written.
         """
         self._closing.set()
         self._writer.join()
@@ -140,7 +140,7 @@ def stream_lines(path: Path) -> Iterator[str]:
 
 
 def _cut_torn_line(path: Path) -> int:
-    """Cut away what stands behind the last line end; returns how many bytes that were."""
+    """Remove everything after the last line end; return the number of bytes removed."""
     if not path.exists():
         return 0
     with open(path, "rb+") as stream:

@@ -1,7 +1,7 @@
-"""How a stage's files enter a branch folder: all or none, even if the program is killed.
+"""Commits a stage's files to a branch folder: all or none, even if the program is killed.
 
-The work folder, with the new manifest in it, is renamed to ``.commit``: that is the moment from
-which the stage counts. Then its files are moved into place, the manifest last. Whoever finds a
+The work folder, with the new manifest in it, is renamed to ``.commit``. From that moment on, the
+stage counts. Then its files are moved into position, the manifest last. Any program that finds a
 ``.commit`` finishes it first.
 """
 
@@ -20,28 +20,28 @@ _COMMIT = ".commit"
 
 
 def is_pending(folder: Path) -> bool:
-    """Whether a killed program left a commit to finish, or a living one is in the middle of it."""
+    """Whether a killed program left a commit to finish, or a running one is in the middle of it."""
     return (folder / _COMMIT).is_dir()
 
 
 def current_manifest(folder: Path) -> Manifest:
-    """Return the manifest that counts: that of a pending commit, if any. Changes nothing.
+    """Return the valid manifest: that of a pending commit, if any. Changes no files.
 
     Raises:
-        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`.
+        BranchFolderError: as for :func:`~limber.store.manifest.read_manifest`.
     """
     pending = folder / _COMMIT
     return read_manifest(pending if (pending / MANIFEST).exists() else folder)
 
 
 def current_path(folder: Path, name: str) -> Path:
-    """Return where file ``name`` of :func:`current_manifest` is, in place or waiting for it."""
+    """Return the path of file ``name`` of :func:`current_manifest`, in place or pending."""
     waiting = inside(folder, f"{_COMMIT}/{name}")
     return waiting if waiting.is_file() else inside(folder, name)
 
 
 def unfinished_error(folder: Path) -> BranchFolderError:
-    """Return the error of a command that only reads and meets a commit that was cut off."""
+    """Return the error of a read-only command that finds an interrupted commit."""
     return BranchFolderError(
         f"{folder} has results of an interrupted command that are not in place yet "
         f"({_COMMIT}).", "This command only reads, and changes nothing in the folder.",
@@ -50,15 +50,16 @@ def unfinished_error(folder: Path) -> BranchFolderError:
 
 
 def commit(folder: Path, work: Path, manifest: Manifest) -> None:
-    """Enter the files in ``work``, and ``manifest``; under the commit lock.
+    """Commit the files in ``work``, and ``manifest``; under the commit lock.
 
     Args:
         folder: The branch folder, without a pending commit.
         work: A folder in it with the new files under their names.
-        manifest: What ``branch.json`` shall be.
+        manifest: The new content of ``branch.json``.
 
     Raises:
-        BranchFolderError: something that is no file of a branch is in the way; nothing was entered.
+        BranchFolderError: an entry that is not a file of a branch is in the way; no file was
+        committed.
     """
     _require_places(folder, (path.relative_to(work).as_posix() for path in work.rglob("*")
                              if path.is_file()))
@@ -73,7 +74,7 @@ def roll_forward(folder: Path) -> None:
     """Finish a pending commit, if any; under the commit lock. Safe to repeat from any point.
 
     Raises:
-        BranchFolderError: a file cannot be replaced, or something else is in its place.
+        BranchFolderError: a file cannot be replaced, or another entry is in its place.
     """
     pending = folder / _COMMIT
     if not pending.is_dir():
@@ -81,7 +82,7 @@ def roll_forward(folder: Path) -> None:
     try:
         if (pending / MANIFEST).exists():
             _move_into_place(folder, pending)
-        # Without its manifest everything has been moved already.
+        # Without its manifest, all files have already been moved.
         shutil.rmtree(pending)
         flush_folder(folder)
     except PermissionError as error:
@@ -100,7 +101,7 @@ def _move_into_place(folder: Path, pending: Path) -> None:
     for name in sorted(new.files):
         path = inside(pending, name)
         if not path.is_file():
-            # Of an earlier stage, or moved already.
+            # From an earlier stage, or already moved.
             continue
         target = inside(folder, name)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -116,9 +117,9 @@ def _move_into_place(folder: Path, pending: Path) -> None:
 
 
 def _require_places(folder: Path, names: Iterable[str]) -> None:
-    """Refuse to enter files where a folder, or a pipe or file in place of a folder, is in the way.
+    """Refuse to commit files if a folder, or a pipe or file in place of a folder, is in the way.
 
-    Asked before the first of them is moved: a commit that stops halfway would never end.
+    Checked before the first of them is moved: a commit that stops halfway would never end.
     """
     for name in names:
         path = inside(folder, name)

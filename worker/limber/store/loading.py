@@ -1,7 +1,7 @@
 """The data that stages read from a branch folder, as values for the packages below.
 
-The packages know no folder: whatever of a branch's mesh, masses, axes and pulls goes into a
-computation comes through here.
+The packages know no folder: all of a branch's mesh, masses, axes and pulls in a computation is
+loaded here.
 """
 
 import hashlib
@@ -82,10 +82,10 @@ def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skel
     """Return the axes as reconstruct found them, before edits, in the frame of ``alignment`` [m].
 
     Args:
-        unit: Of the scan's file, in which they are kept.
+        unit: Unit of the scan's file, in which they are kept.
 
     Raises:
-        BranchFolderError: they are not kept: an older Limber made the branch.
+        BranchFolderError: they were not kept: an older Limber made the branch.
     """
     found = read_skeleton(branch.require(f"{FOUND_SKELETON}.csv", "reconstruct"),
                           scale=UNIT_METRES[unit])
@@ -101,10 +101,10 @@ def load_masses(branch: Branch) -> list[dict[str, Any]]:
 
 
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
-    """Return what hung on the branch when it was scanned, and its mesh leaves out.
+    """Return the masses that hung on the branch when it was scanned, and are not in its mesh.
 
-    Twigs and leaves, as stiff bodies that go with the section they grow from; masses that somebody
-    has stated in a table; and targets.
+    Twigs and leaves, as rigid bodies that move with the section they grow from; masses stated in a
+    table; and targets.
     """
     return (*(_hung(mass) for mass in load_masses(branch)), *target_masses(load_targets(branch)))
 
@@ -142,7 +142,7 @@ def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
 
 
 class ModelOptions(TypedDict, total=False):
-    """Options of a branch's model, as of BranchModel."""
+    """Options of a branch's model, as for BranchModel."""
 
     material: str | MaterialLaw
     damping: RayleighDamping
@@ -160,11 +160,11 @@ class Overrides(ModelOptions, total=False):
 
 def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SILENT,
                 **overrides: Unpack[Overrides]) -> LoadedBranch:
-    """Return the branch as everything computes on it: as it hangs, with targets and grasp.
+    """Return the branch for all computations: as it hangs, with targets and grasp.
 
     Args:
-        gravity: Whether it has any weight.
-        progress: Is told where it cannot carry itself and its weight is left out.
+        gravity: Whether it has weight.
+        progress: Warned if the branch cannot carry itself and its weight is ignored.
         overrides: As for :func:`load_model`.
 
     Raises:
@@ -189,8 +189,8 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
 
 
 def young_deviation(branch: Branch) -> float | None:
-    """Return the standard deviation of log E that the last estimate, swing or ringing left, taken
-    as one for all moduli; None where nothing has told it.
+    """Return the standard deviation of log E from the last estimate, swing or ringing, assumed
+    equal for all moduli; None if there is none.
 
     Raises:
         InputError: ``estimate.json`` is damaged.
@@ -220,12 +220,13 @@ def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarra
                **options: Unpack[ModelOptions]) -> BranchModel:
     """Return the model of a branch folder's ``mesh.vtu``.
 
-    The mesh is taken as the shape without load: see :func:`load_branch`. Gravity is that of the
-    scan, which the upright turn has turned with the branch; what its mesh leaves out hangs on it.
+    The mesh is taken as the unloaded shape: see :func:`load_branch`. Gravity is that of the scan,
+    which the upright rotation has rotated with the branch; masses that are not in the mesh hang on
+    it.
 
     Args:
-        gravity: Whether the branch has any weight.
-        young, poisson, density, point_masses: Instead of those of the folder.
+        gravity: Whether the branch has weight.
+        young, poisson, density, point_masses: Replace those of the folder.
         options: As for BranchModel.
 
     Raises:
@@ -249,7 +250,7 @@ def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarra
 
 
 def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILENT) -> GraspModel:
-    """Return what planning asks of a branch.
+    """Return the data of a branch for planning.
 
     See :func:`limber.planning.field.grasp_model.grasp_model_of`.
 
@@ -261,7 +262,7 @@ def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILE
 
 
 def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
-    """Return the branch that is estimated; the start is uniform.
+    """Return the branch to estimate; the initial modulus is uniform.
 
     Raises:
         BranchFolderError: a file is missing. InputError: its moduli are not positive.
@@ -271,11 +272,11 @@ def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
 
 
 def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bool) -> Subject:
-    """Return the branch as an estimate took it, so that the numbers it found mean the same.
+    """Return the branch as used by an estimate, so that its results have the same meaning.
 
     Args:
         known: Content of ``estimate.json``.
-        gravity: Whether the branch's weight acts, if the estimate did not have to leave it out.
+        gravity: Whether the branch's weight acts, unless the estimate had to leave it out.
     """
     subject = load_subject(branch, EstimateSettings(
         fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
@@ -294,7 +295,7 @@ def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
     """Return the pulls to use, checked.
 
     Raises:
-        InputError: there are none, or one that was asked for is missing.
+        InputError: there are none, or a requested one is missing.
     """
     known = known_pulls(branch)
     missing = [name for name in settings.pull if name not in known]

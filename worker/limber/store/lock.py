@@ -1,6 +1,6 @@
 """The right to write to a branch folder: one program at a time, one result after another.
 
-Both locks are the operating system's, so that a program's end, however it came, sets them free.
+Both locks are the operating system's, so the end of a program always releases them.
 """
 
 import errno
@@ -31,11 +31,11 @@ _NO_LOCKS = frozenset((errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOL
 def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
     """Hold the right to write to ``folder``: for a whole stage, from before its work begins.
 
-    A program that holds it may ask for it again. Readers need none of it.
+    The holder may request it again. Readers do not need it.
 
     Args:
         folder: The branch folder.
-        purpose: What for, as another program's user shall read it.
+        purpose: Purpose, as text for the user of another program.
 
     Yields:
         Whether this program did not hold it yet.
@@ -43,7 +43,7 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
     Raises:
         BranchBusyError: another program has it locked; states which and since when.
     """
-    # One lock object a folder in this program, however often it is asked for.
+    # One lock object per folder in this program, for any number of requests.
     lock = FileLock((folder / RUN_LOCK).resolve(), is_singleton=True, thread_local=False)
     try:
         _acquire(lock, folder, 0.0)
@@ -72,10 +72,10 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
 
 @contextmanager
 def commit_lock(folder: Path) -> Iterator[None]:
-    """Hold the right to move results into ``folder``: for moments; another waits for it.
+    """Hold the right to move results into ``folder``, for a moment; other programs wait for it.
 
     Raises:
-        BranchFolderError: it was not to be had for a minute, or the folder cannot be written to.
+        BranchFolderError: it was not available within a minute, or the folder cannot be written to.
     """
     lock = FileLock(folder / COMMIT_LOCK)
     try:
@@ -96,8 +96,8 @@ def commit_lock(folder: Path) -> Iterator[None]:
 def wait_for_commit(folder: Path) -> None:
     """Wait, a minute at most, while another program moves results into ``folder``.
 
-    For those that only read: the lock is asked for on a handle that cannot write, and no file is
-    made. Without a lock file there is no such program.
+    For readers: the lock is requested on a read-only handle, and no file is made. Without a lock
+    file there is no such program.
     """
     until = time.monotonic() + _COMMIT_WAIT_SECONDS
     while _is_held(folder / COMMIT_LOCK) and time.monotonic() < until:
@@ -122,15 +122,16 @@ def _is_held(path: Path) -> bool:
             fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
         return False
     except OSError as error:
-        # Anything else means that this file system has no locks.
+        # Any other error means that this file system has no locks.
         return error.errno in (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
     finally:
         os.close(handle)
 
 
 def _lacks_locks(path: Path) -> bool:
-    """Whether the file system has no locks: that a file is there then stands for one, and stays
-    when its program is killed."""
+    """Whether the file system has no locks. A lock is then represented by a file, which remains
+    when its program is killed.
+    """
     if sys.platform == "win32":
         return False
     import fcntl
@@ -171,7 +172,7 @@ def _acquire(lock: BaseFileLock, folder: Path, wait_seconds: float) -> None:
 
 
 def _holder(folder: Path) -> str:
-    """Who has the run lock, in words."""
+    """The holder of the run lock, as text."""
     for _ in range(5):
         try:
             found = json.loads((folder / HOLDER).read_text(encoding="utf-8"))
@@ -180,7 +181,7 @@ def _holder(folder: Path) -> str:
             return (f"{found['purpose']}, process {found['process']} of {found['user']} on "
                     f"{found['host']}, since {since:%Y-%m-%d %H:%M:%S} UTC ({minutes:.0f} min)")
         except (OSError, ValueError, KeyError, TypeError):
-            # It has just begun, or just ended.
+            # It has just started, or just ended.
             time.sleep(0.05)
     return "an unknown process"
 

@@ -22,12 +22,12 @@ FORMAT_VERSION = 2
 """1: until 0.1; 2: with the branch's UUID. Older ones are read, and written as this one."""
 MANIFEST = "branch.json"
 REPORT = "report"
-"""The stage that shows all of the others."""
+"""The stage that shows the results of all others."""
 _PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
 
 
 class FileEntry(BaseModel):
-    """What the manifest vouches for: the bytes of one file, and which stage wrote them."""
+    """An entry of the manifest for one file: its bytes, and the stage that wrote it."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -37,7 +37,7 @@ class FileEntry(BaseModel):
 
 
 class StageEntry(BaseModel):
-    """One finished stage: its settings, what it read (name to sha256), wrote and found."""
+    """One finished stage: settings, files read (name to sha256) and written, and result."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -53,7 +53,7 @@ class StageEntry(BaseModel):
 class Manifest(BaseModel):
     """Content of ``branch.json``.
 
-    ``uuid`` names the branch wherever its folder is moved and whatever it is called; a folder of
+    ``uuid`` identifies the branch independent of the path and name of its folder; a folder of
     format 1 has none until a stage writes to it.
     """
 
@@ -76,7 +76,7 @@ class Manifest(BaseModel):
         return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
 
     def content_digest(self) -> str:
-        """Return a sha256 of all that the branch has, its report aside."""
+        """Return a sha256 of all contents of the branch except its report."""
         held = {"files": {name: entry.sha256 for name, entry in self.files.items()
                           if entry.stage != REPORT},
                 "stages": {key: entry.model_dump(mode="json") for key, entry in self.stages.items()
@@ -90,7 +90,7 @@ def read_manifest(folder: Path) -> Manifest:
     Raises:
         BranchFolderError: there is none, it is damaged or of a newer format, or it lists a file
             outside the folder.
-        WorkError: the disk that it is on does not answer.
+        WorkError: its disk does not respond.
     """
     path = folder / MANIFEST
     if not path.is_file():
@@ -126,7 +126,7 @@ def checked_name(name: str) -> str:
     """Return the name of a file in a branch folder, relative with ``/``.
 
     Raises:
-        InputError: it leads out of the folder, or is one of the folder's own.
+        InputError: it is outside the folder, or is one of the folder's own.
     """
     plain = relative_name(name)
     if plain.casefold() == MANIFEST or plain.startswith("."):
@@ -151,7 +151,7 @@ def _require_inside(path: Path, manifest: Manifest) -> None:
 
 
 def program_versions() -> dict[str, str]:
-    """Return the versions of Limber, Python and the numerical packages that are installed."""
+    """Return the installed versions of Limber, Python and the numerical packages."""
     return dict(_installed())
 
 

@@ -21,7 +21,7 @@ class Damage:
 
 
 class Checker:
-    """Compares files with checksums; one that has not changed since is not read again."""
+    """Compares files with checksums; a file that has not changed since is not read again."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -63,7 +63,7 @@ def damage_error(folder: Path, damages: list[Damage], shown_count: int = 4) -> B
 def unlisted(folder: Path, manifest: Manifest) -> list[str]:
     """Return names of files that no stage wrote, without the folder's own hidden ones, sorted."""
     if journal.is_pending(folder):
-        # Files that go when the commit is finished were listed all the same.
+        # Files that are removed when the commit is finished were also listed.
         listed = set(manifest.files) | set(read_manifest(folder).files)
     else:
         listed = set(manifest.files)

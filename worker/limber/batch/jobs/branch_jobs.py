@@ -22,7 +22,7 @@ class StageTask:
 
     @property
     def label(self) -> str:
-        """The stage's name, with that of what it makes where there may be several."""
+        """The stage's name, with the name of its result if there may be several."""
         name = getattr(self.inputs, "name", None) or getattr(self.settings, "name", None)
         return f"{self.stage}:{name}" if name else self.stage
 
@@ -37,8 +37,8 @@ class StageTask:
 class BranchJob:
     """The stages to run on one branch, in this order; ``sweep`` contains its own values.
 
-    ``fetched`` has the addresses of its inputs and where those go here, ``home`` the address that
-    the branch folder itself has, or nothing.
+    ``fetched`` has the addresses of its inputs and their local paths, ``home`` the address of the
+    branch folder itself, or an empty text.
     """
 
     name: str
@@ -50,7 +50,7 @@ class BranchJob:
 
     @property
     def is_moved(self) -> bool:
-        """Whether it, or an input of it, is remote."""
+        """Whether it, or one of its inputs, is remote."""
         return bool(self.fetched or self.home)
 
 

@@ -1,8 +1,8 @@
 """The job file: which stages are run on which scans or branch folders, and with what settings.
 
-`limber batch --help` shows one. It is checked whole against the stages' settings before anything
-runs. Nothing in it is executed; what it makes stays in ``out``, or in the folders that it names.
-Scans, folders, inputs and ``out`` may be addresses, as fsspec knows them
+`limber batch --help` shows one. The whole file is checked against the stages' settings before
+anything runs. No part of it is executed; results stay in ``out``, or in the folders that it names.
+Scans, folders, inputs and ``out`` may be addresses for fsspec
 (:mod:`limber.batch.machines.staging`).
 """
 
@@ -25,7 +25,7 @@ from limber.core.settings import nearest
 from limber.core.units import in_unit
 
 CLUSTERS = ("local", "slurm", "pbs", "lsf", "sge", "oar", "moab", "htcondor")
-"""Where a batch may run beside this process's own pool: a Dask cluster here, or of a queue."""
+"""Where a batch may run besides this process's own pool: a Dask cluster, local or on a queue."""
 _KEYS = ("out", "work", "workers", "cluster", "time_limit", "memory_limit", "job")
 _JOB_KEYS = ("scans", "folders", "stage", "sweep")
 _MOST_BRANCHES = 100_000

@@ -17,12 +17,12 @@ class JobPaths:
     """Finds the files that a job file names, and remembers their addresses.
 
     Args:
-        folder: Of the job file: paths in it begin there.
-        problems: Collects what is wrong with a path, and its position in the job file.
+        folder: Folder of the job file: paths in it are relative to it.
+        problems: Collects the errors of a path, with its position in the job file.
 
     Attributes:
         out: Folder of results and fetched files.
-        home: The address of results; empty where they stay in ``out``.
+        home: The address of results; empty if they stay in ``out``.
     """
 
     def __init__(self, folder: Path, problems: Problems):
@@ -32,7 +32,7 @@ class JobPaths:
         self.home = ""
 
     def read_out(self, out: str, work: str, otherwise: str) -> None:
-        """Results go to a folder; or to an address, and are worked on in a folder here."""
+        """Results go to a folder; or to an address, with a local working folder."""
         self.out = self._folder / otherwise
         if work and (is_address(work) or not is_address(out)):
             self._problems.add(
@@ -69,7 +69,7 @@ class JobPaths:
         return self._file(address, place) if address else self.out
 
     def written(self, name: str, place: Place) -> Path:
-        """Return where a stage writes a file: never outside ``out``."""
+        """Return the path for a stage's output file: never outside ``out``."""
         path = (self.out / name).resolve()
         if is_address(name):
             if self._tried(checked_address, name, place):
@@ -89,7 +89,7 @@ class JobPaths:
                      if path in self._known)
 
     def _tried(self, function: Callable[[str], Any], address: str, place: Place) -> Any:
-        """Return ``function(address)``; None where it refuses the address."""
+        """Return ``function(address)``; None if it refuses the address."""
         try:
             return function(address)
         except LimberError as error:
@@ -97,7 +97,7 @@ class JobPaths:
             return None
 
     def _file(self, address: str, place: Place) -> Path:
-        """Return where one file, or folder, goes: beside what stands beside it there."""
+        """Return the local path of a file or folder; neighbours stay neighbours."""
         around = address.rpartition("/")[0]
         own = hashlib.sha256(around.encode("utf-8")).hexdigest()[:12]
         return self._here(address, self.out / ".inputs" / own, place)

@@ -1,7 +1,7 @@
 """A job file as a script for other schedulers: a Slurm array, or a Snakefile.
 
-Each branch is one task: its stages one after the other, as command lines. What is up to date is
-kept, as ever, so a task that was cut off is simply run again.
+Each branch is one task: its stages one after the other, as command lines. Up-to-date results are
+kept, so an interrupted task can simply be run again.
 """
 
 import math
@@ -16,7 +16,7 @@ from limber.core.files.atomic import write_atomically
 
 KINDS = ("slurm", "snakemake")
 _HOURS = 24.0
-"""What a task may take where the job file sets no limit."""
+"""Limits of a task if the job file sets none."""
 
 
 def emitted(jobs: JobFile, kind: str) -> str:

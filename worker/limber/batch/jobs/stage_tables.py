@@ -43,7 +43,7 @@ def why_not_in_batches(name: str) -> str:
 
 @dataclass(frozen=True)
 class Source:
-    """What a branch begins with: a scan, or its own folder."""
+    """Input of a branch: a scan, or its own folder."""
 
     path: Path
     is_scan: bool
@@ -55,7 +55,7 @@ class Source:
 
 @dataclass(frozen=True)
 class StageTables:
-    """Makes the tasks of one branch; ``sweep`` has the values that are its own."""
+    """Makes the tasks of one branch; ``sweep`` has the branch's own values."""
 
     problems: Problems
     paths: JobPaths
@@ -93,7 +93,7 @@ class _StageValues:
         self._fields = {key: about for part in ("inputs", "settings", "options")
                         for key, about in schema[part].get("properties", {}).items()}
         self._refused: set[str] = set()
-        """Fields whose value was refused before it came to the stage's settings."""
+        """Fields whose value was refused before reaching the stage's settings."""
 
     def tasks(self) -> list[StageTask]:
         own = self._own_inputs()
@@ -142,7 +142,7 @@ class _StageValues:
         return _PLACEHOLDER.sub(fill, text)
 
     def _runs(self, values: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return the values of each run: as many as a pattern among the inputs has files."""
+        """Return the values of each run: one run per file that matches a pattern in the inputs."""
         choices = [self._files(key, value) for key, value in values.items()
                    if "path" in _said_of(self._fields[key], "format") and isinstance(value, str)]
         found = []
@@ -177,7 +177,7 @@ class _StageValues:
         return StageTask(self._stage.name, *made) if len(made) == 3 else None
 
     def _told(self, refusal: Any) -> None:
-        """Tell why the stage's settings refuse a value."""
+        """Report why the stage's settings refuse a value."""
         key = str(refusal["loc"][0]) if refusal["loc"] else ""
         if key in self._refused:
             return
@@ -189,7 +189,7 @@ class _StageValues:
 
 
 def _trouble(name: str) -> str:
-    """Return why ``run = name`` cannot be; nothing where it can."""
+    """Return why ``run = name`` is impossible; an empty string if it is possible."""
     known = stage_summaries()
     if name in known:
         return why_not_in_batches(name)

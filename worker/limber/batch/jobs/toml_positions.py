@@ -12,7 +12,7 @@ _KEY = re.compile(rf"({_PART}(?:\s*\.\s*{_PART})*)\s*=")
 def toml_lines(text: str) -> dict[Place, int]:
     """Return the line, from 1, of every table and key: ``("job", 0, "stage", 1, "run")``.
 
-    What looks like a key inside a text of several lines counts as one; nobody asks for it.
+    Text in a multi-line string that looks like a key counts as one, which does no harm.
     """
     found: dict[Place, int] = {(): 1}
     counts: dict[Place, int] = {}
@@ -39,7 +39,7 @@ def toml_lines(text: str) -> dict[Place, int]:
 
 
 def line_of(lines: dict[Place, int], place: Place) -> int:
-    """Return the line of ``place``, or of the nearest table around it."""
+    """Return the line of ``place``, or of the nearest table that contains it."""
     while place not in lines:
         place = place[:-1]
     return lines[place]

@@ -1,8 +1,8 @@
 """Machines beyond this process, by Dask: a cluster started here, by a queue, or already running.
 
-Command lines go out, outcomes come back; branch folders stand where all machines see them. What
-is sent is encrypted and both ends are known to each other (TLS); only a scheduler that somebody
-else has started on this computer may do without.
+Command lines are sent out, outcomes are returned; branch folders are where all machines see them.
+Messages are encrypted and both ends are authenticated (TLS); only a scheduler that another user has
+started on this computer may do without.
 """
 
 import ipaddress
@@ -26,19 +26,19 @@ from limber.version import VERSION
 
 _QUEUES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "sge": "SGECluster",
           "oar": "OARCluster", "moab": "MoabCluster", "htcondor": "HTCondorCluster"}
-"""Queues and what dask-jobqueue calls their clusters."""
+"""Queues and the names of their clusters in dask-jobqueue."""
 _LOOPBACK = "127.0.0.1"
 _NO_DAEMON = {"distributed.worker.daemon": False}
-"""A worker's processes are its own: those of Dask are not allowed any otherwise."""
+"""A worker starts processes of its own, which Dask's workers are not allowed otherwise."""
 _UNSERVED: dict[str, list[str]] = {
     "distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-"""Dask's pages are not asked for."""
+"""Dask's pages are not needed."""
 _NOT_OBSERVED = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "2s",
 }
-"""Nor how Dask's own processes spend their time, which takes some of the stages'."""
+"""Nor is the profiling of Dask's own processes, which takes some of the stages' time."""
 _WAIT_SECONDS = 0.5
 _MEMORY_MB = 4000.0
 """The memory requested for a job if neither the job file nor Dask's settings state it."""
@@ -54,7 +54,7 @@ class Cluster:
     Args:
         jobs: The job file; its limits hold for each stage.
         kind: One of :data:`~limber.batch.jobs.job_file.CLUSTERS`, or None with an ``address``.
-        address: Of a scheduler that runs already: ``tls://HOST:PORT``, or ``tcp://`` on loopback.
+        address: Address of a running scheduler: ``tls://HOST:PORT``, or ``tcp://`` on loopback.
         workers: Number of workers to start, or of jobs to request from a queue.
         progress: Reports the wait for the first worker; cancelling it ends the wait.
 
@@ -62,7 +62,7 @@ class Cluster:
         InputError: the address is not safe, or the number of jobs for a queue is missing.
         MissingDependencyError: Dask is not installed.
         WorkError: the cluster could not be started, or a worker of it cannot run the tasks.
-        Cancelled: it was, before a worker came.
+        Cancelled: it was cancelled before a worker came.
     """
 
     def __init__(self, jobs: JobFile, kind: str | None = None, *, address: str | None = None,
@@ -83,9 +83,9 @@ class Cluster:
         return self._wanted or max(sum(self._client.nthreads().values()), 1)
 
     def submit(self, task: StageTask, folder: Path) -> Future:
-        """Have a task run; its future holds what :func:`~limber.batch.stage_task.run_task` returns.
+        """Submit a task; its future holds the result of :func:`~limber.batch.stage_task.run_task`.
 
-        A worker that is lost costs this stage: another runs it again.
+        If a worker is lost, only this stage is lost: another worker runs it again.
         """
         from distributed.utils import TimeoutError as NoAnswer
 
@@ -100,7 +100,7 @@ class Cluster:
         return future
 
     def cancel(self) -> None:
-        """Stop all tasks and what they have started."""
+        """Stop all tasks and their child processes."""
         self._is_cancelled = True
         self._client.cancel(list(self._client.futures.values()), force=True)
         self._client.run(stop_lines, on_error="ignore")
@@ -143,7 +143,7 @@ class Cluster:
                 raise WorkError(f"No Dask scheduler responds at {address} ({error}).", "",
                                 "Start `dask scheduler` and `dask worker --no-nanny`, with the "
                                 "same certificates in Dask's settings on all machines.") from error
-        # As long as the cluster is there: it may start a lost worker anew.
+        # As long as the cluster exists: it may restart a lost worker.
         stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _NOT_OBSERVED))
         cluster = stack.enter_context(
             self._local(jobs) if kind == "local"
@@ -183,7 +183,7 @@ class Cluster:
                     "export DASK_DISTRIBUTED__WORKER__DAEMON=False", f"export {CORES}={cores}"]
         memory = own.get("memory") or f"{cores * (jobs.limits.memory_mb or _MEMORY_MB):.0f}MB"
         try:
-            # One worker a job, with a thread for each stage that it may run at a time.
+            # One worker per job, with one thread per stage that it may run at a time.
             cluster = made(
                 cores=cores, processes=1, memory=memory, security=True, protocol="tls://",
                 shared_temp_directory=str(jobs.out.resolve()), job_script_prologue=prologue,
@@ -193,13 +193,13 @@ class Cluster:
         except (OSError, RuntimeError, ValueError) as error:
             raise WorkError(f"The cluster of {kind} could not be started: {error}", "",
                             f"Its settings are Dask's own (jobqueue.{kind}).") from error
-        # An allocation that has expired is asked for anew.
+        # An expired allocation is requested again.
         cluster.adapt(minimum_jobs=self._wanted, maximum_jobs=self._wanted)
         self._wanted *= cores
         return cluster
 
     def _wait(self, name: str, progress: Progress) -> None:
-        """Wait until a worker is there, and hold those that are to what they must be."""
+        """Wait for a worker, and check the version of those that are connected."""
         while not self._client.nthreads():
             progress(0.0, f"waiting for the first worker of {name}")
             try:
@@ -224,7 +224,7 @@ def _lost(error: Exception | None) -> ClusterLostError:
 
 
 def _check_address(address: str) -> None:
-    """Only what is encrypted leaves this computer: whoever reaches a worker can run programs."""
+    """Only encrypted data leaves this computer: whoever reaches a worker can run programs."""
     protocol, _, place = address.partition("://")
     host = place.rpartition(":")[0].strip("[]")
     if protocol not in ("tls", "tcp") or not host:

@@ -1,7 +1,7 @@
 """The work of a Dask worker for a batch: it runs command lines in processes of its own pool.
 
-A stage's crash, its memory and its time are then the stage's alone, and what was imported stays
-for the next one. A worker that is lost takes its processes with it.
+Crash, memory and time are then confined to the stage, and imported modules remain for the next one.
+A lost worker takes its processes with it.
 """
 
 import os
@@ -19,7 +19,7 @@ from limber.core.progress import Progress
 from limber.version import VERSION
 
 _BUSY_SECONDS = 600.0
-"""How long a stage waits for a branch: the worker that was thought lost may still end with it."""
+"""Time that a stage waits for a branch: a worker that was taken for lost may still finish it."""
 _TICK_SECONDS = 1.0
 
 _guard = threading.Lock()
@@ -39,20 +39,20 @@ def unfit(version: str) -> str:
 
 def run_line(line: list[str], place: str, folder: str, limits: Limits, version: str,
              ) -> dict[str, Any]:
-    """Run a stage's command line in a process of this worker's pool; returns how it ended.
+    """Run a stage's command line in a process of this worker's pool; return its outcome.
 
     Args:
-        line: The stage and its arguments, as they are typed after ``limber``.
+        line: The stage and its arguments, as typed after ``limber``.
         place: The folder to which the paths in it are relative.
         folder: The branch folder.
         limits: Its limits on time and memory.
-        version: The batch's.
+        version: Version of the batch.
 
     Returns:
-        As :func:`limber.batch.stage_task.run_task`.
+        As for :func:`limber.batch.stage_task.run_task`.
 
     Raises:
-        Cancelled: the batch was.
+        Cancelled: the batch was cancelled.
     """
     reason = unfit(version)
     if reason:
@@ -67,7 +67,7 @@ def run_line(line: list[str], place: str, folder: str, limits: Limits, version: 
 
 
 def stop_lines() -> None:
-    """End what this worker runs; the folders stay as they were before those stages."""
+    """End the running stages of this worker; the folders stay as they were before them."""
     global _pool
     with _guard:
         pool, _pool = _pool, None
@@ -81,15 +81,15 @@ def _workers_pool() -> Pool:
 
     with _guard:
         if _pool is None:
-            # Dask has its workers give memory back at once; stages would fetch theirs anew from
-            # the system all the time, which took a sixth of their time.
+            # Dask makes its workers return memory at once. Stages would then allocate it again all
+            # the time, which took a sixth of their time.
             os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)
             _pool = Pool(get_worker().state.nthreads, name="a stage of the batch")
         return _pool
 
 
 def _run(line: list[str], place: str, folder: str, progress: Progress) -> dict[str, Any]:
-    # Paths of the command line count from where the batch was started, on every machine.
+    # Paths of the command line are relative to the start folder of the batch, on every machine.
     os.chdir(place)
     task = task_of_line(line)
     end = time.monotonic() + _BUSY_SECONDS

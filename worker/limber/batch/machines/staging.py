@@ -1,8 +1,8 @@
 """Remote branches and inputs: fetched before the stages run, uploaded afterwards.
 
-The branch folder here is worked on as any other. At its address its files stand beside each other
-as here, the manifest last: whoever reads it there finds the branch before a batch or after it, or
-a checksum that tells of a transfer that was cut off and that the next run ends.
+The local branch folder is processed as any other. At its address its files have the same layout,
+with the manifest last. A remote reader therefore finds the branch before or after a batch, or a
+wrong checksum that reveals an interrupted transfer, which the next run completes.
 """
 
 import hashlib
@@ -30,11 +30,11 @@ from limber.store.folder_state import settled_manifest
 from limber.store.manifest import MANIFEST, Manifest, checked_name, read_manifest
 
 AT_ONCE = 2
-"""Transfers side by side."""
+"""Number of parallel transfers."""
 
 
 class Staging:
-    """Moves what branches need and what they give, in threads; use it in a ``with``."""
+    """Transfers inputs and results of branches, in threads; use it in a ``with``."""
 
     def __init__(self, jobs: JobFile):
         self._jobs = jobs
@@ -46,7 +46,7 @@ class Staging:
         return self._threads.submit(bring_in, branch, self._stop)
 
     def put(self, branch: BranchJob) -> Future:
-        """Put a branch's files to its address."""
+        """Upload a branch's files to its address."""
         return self._threads.submit(put_out, self._jobs, branch)
 
     def __enter__(self) -> "Staging":
@@ -75,7 +75,7 @@ def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
     if theirs is None or _is_ours(branch, theirs):
         return
     if (branch.folder / MANIFEST).is_file():
-        # Nothing is here that was not put there before it was changed there.
+        # All local content was uploaded before the remote content was changed.
         old = branch.folder.with_name(owned_name(branch.folder.name))
         branch.folder.rename(old)
         remove(old)
@@ -103,15 +103,15 @@ def put_summary(jobs: JobFile) -> None:
 
 
 def _is_ours(branch: BranchJob, theirs: bytes) -> bool:
-    """Whether the branch here is the one at its address, or newer.
+    """Whether the local branch is the one at its address, or newer.
 
     Raises:
-        BranchFolderError: each has what the other has not.
+        BranchFolderError: each has content that the other lacks.
     """
     path = branch.folder / MANIFEST
     if not path.is_file():
         return False
-    # What a killed program left comes first: it is this branch.
+    # Files of a killed program come first: they are this branch.
     settled_manifest(branch.folder)
     there, known = hashlib.sha256(theirs).hexdigest(), _known(branch)
     here = file_digest(path)
@@ -179,7 +179,7 @@ def _files(manifest: bytes | None) -> dict[str, str]:
 
 
 def _beside(jobs: JobFile, branch: BranchJob) -> Iterator[Path]:
-    """Files that stages wrote into the results' folder, not into the branch's."""
+    """Files that stages wrote into the results' folder, outside the branch's."""
     out, own = jobs.out.resolve(), branch.folder.resolve()
     fetched = {path.resolve() for _, path in branch.fetched}
     for task in branch.tasks:
@@ -197,11 +197,11 @@ def _mark(branch: BranchJob) -> Path:
 
 
 def _known(branch: BranchJob) -> str:
-    """The manifest's checksum when the branch here and that at its address were last the same."""
+    """The manifest's checksum when the local and the remote branch were last the same."""
     try:
         told = read_json(_mark(branch), "a record of the fetched files")
     except InputError:
-        # There is none, or it is damaged: then nothing is known.
+        # There is none, or it is damaged: then its state is unknown.
         return ""
     is_of_it = isinstance(told, dict) and told.get("address") == branch.home
     return str(told.get("manifest", "")) if is_of_it else ""

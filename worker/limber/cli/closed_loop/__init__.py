@@ -1,1 +1,1 @@
-"""The whole loop against a virtual robot that holds a branch: what `limber demo --robot` runs."""
+"""The whole loop against a virtual robot that holds a branch, run by `limber demo --robot`."""

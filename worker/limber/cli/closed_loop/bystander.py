@@ -1,4 +1,4 @@
-"""The virtual robot as seen from beside it, while another process drives it."""
+"""The virtual robot as observed from outside, while another process controls it."""
 
 import threading
 import time
@@ -18,11 +18,11 @@ _EVERY_SECONDS, _CLOSELY_SECONDS = 0.05, 0.004
 
 @dataclass(frozen=True)
 class Overload:
-    """What a provoked overload led to.
+    """Effects of a provoked overload.
 
     Attributes:
-        standstill: From the overload until the arm stood still [s].
-        way: What the gripper still moved [m].
+        standstill: Time from the overload until the arm stood still [s].
+        way: Distance that the gripper still moved [m].
     """
 
     standstill: float
@@ -31,15 +31,15 @@ class Overload:
 
 @dataclass
 class Watch:
-    """Notes what the robot and its branch do, in a thread; a context manager.
+    """Records the robot and its branch in a thread; a context manager.
 
     Args:
-        robot: Nobody else may ask it meanwhile.
-        overload: Wrench on the sensor from when the branch is led [N, N m], shape [6], or None.
+        robot: No other code may query it meanwhile.
+        overload: Wrench on the sensor from when the branch is driven [N, N m], shape [6], or None.
 
     Attributes:
-        states: As :attr:`VirtualRobot.state` told them.
-        overloaded: What the overload led to; None where it never came to one.
+        states: As returned by :attr:`VirtualRobot.state`.
+        overloaded: Effects of the overload; None if there was none.
     """
 
     robot: VirtualRobot
@@ -61,13 +61,13 @@ class Watch:
 
     @property
     def extrapolation_error(self) -> float:
-        """By how much the virtual branch's own force was off, at most [N]."""
+        """Largest error of the virtual branch's own force [N]."""
         return max((state.get("extrapolation_error_n", 0.0) for state in self.states), default=0.0)
 
     def at_the_end(self) -> np.ndarray | None:
-        """Return where the branch's seen points were at the end of the way [m], shape [n, 3].
+        """Return positions of the branch's visible points at the end of the path [m], shape [n, 3].
 
-        That is where it was held still, farthest from where it was taken hold of.
+        That is where it was held still, farthest from where it was grasped.
         """
         held = [state for state in self.states if state["branch"] == "held"]
         still = [state for state in held if _speed(state) < STILL_M_S]

@@ -1,4 +1,4 @@
-"""Where things stand in the loop's cell: the robot, its gripper at the branch, touched marks."""
+"""Positions in the loop's cell: the robot, its gripper at the branch, touched marks."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from limber.robot.motion.joint_path import JointPath, follow
 from limber.robot.motion.trajectory import densely
 
 GRASP_FRACTION = 0.85
-"""Where on its main path the branch is held."""
+"""Position of the grasp on the branch's main path."""
 _AROUND_M = 0.06  # that the gripper is to reach about the grasp
 _RIM_M = 0.12  # radius of the pot's rim, which has marks to touch
 _MARKS = 6
@@ -25,10 +25,10 @@ _SINGULARITY = 0.08
 def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: float) -> float:
     """Return the modulus [Pa] with which ``force`` [N] across a branch moves it by ``travel`` [m].
 
-    By the theory of slender beams, of the straight branch: the force's virtual work on itself.
+    By slender beam theory of the straight branch: the virtual work of the force.
 
     Args:
-        fraction: Of the main path, where the force acts.
+        fraction: Fraction of the main path at which the force acts.
     """
     path = skeleton.main_path()
     along, radius = skeleton.arc_length[path], skeleton.radius[path]
@@ -39,15 +39,15 @@ def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: f
 
 
 def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return where an upright arm reaches a branch best: its base's pose [6], branch frame.
+    """Return the base pose [6] from which an upright arm best reaches a branch, branch frame.
 
     Args:
-        tool: Frame of the grasp in the flange's, shape [4, 4].
-        point: Of the grasp [m], shape [3].
-        axis: Of the branch there, shape [3].
+        tool: Frame of the grasp in the flange's frame, shape [4, 4].
+        point: Position of the grasp [m], shape [3].
+        axis: Axis of the branch there, shape [3].
 
     Raises:
-        NoPathError: from nowhere around.
+        NoPathError: there is no such pose around it.
     """
     best: tuple[float, np.ndarray] | None = None
     for turn in np.arange(6) * np.pi / 3:
@@ -66,10 +66,10 @@ def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray)
 
 
 def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return joints [rad, 6] and the gripper's rotation [rad, 3] with it on the branch.
+    """Return joints [rad, 6] and the gripper's rotation [rad, 3] with the gripper on the branch.
 
     Raises:
-        NoPathError: it does not reach about there.
+        NoPathError: it does not reach the surroundings of that point.
     """
     found = _held(cell.arm, np.array(cell.base.pose), matrices(np.array(cell.tool.grasp_pose)),
                   point, axis)
@@ -80,7 +80,7 @@ def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray) -> tuple[np.ndar
 
 def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis: np.ndarray,
           ) -> tuple[JointPath, np.ndarray] | None:
-    """The way of reaching a bit farther about a grasp that stays farthest from singularities."""
+    """The arm motion slightly around a grasp that stays farthest from singularities."""
     best: tuple[JointPath, np.ndarray] | None = None
     for rotation in across(axis):
         grasp = matrices(np.r_[point, rotation])
@@ -101,13 +101,13 @@ def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis:
 
 def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: np.ndarray,
                   sigma: float, rng: np.random.Generator) -> None:
-    """Write points as `limber robot calibrate` takes them: on the branch, and as it touched them.
+    """Write points for `limber robot calibrate`: on the branch, and as touched by the robot.
 
     Args:
         base: The robot's true base in the scan's frame [m, rad], shape [6].
         moved: Added to the scan's coordinates to get the branch's [m], shape [3].
         axis_points: Points of the branch that are touched, the scan's frame [m], shape [n, 3].
-        sigma: Standard deviation of what touching errs by, each axis [m].
+        sigma: Standard deviation of the touching error, per axis [m].
     """
     turn = np.arange(_MARKS) * 2 * np.pi / _MARKS
     rim = _RIM_M * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
@@ -125,7 +125,7 @@ def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: 
 
 def grasp_of(skeleton: Skeleton, fraction: float = GRASP_FRACTION,
              ) -> tuple[np.ndarray, np.ndarray]:
-    """A place on the main path [m] and the branch's axis there, shape [3] each."""
+    """A position on the main path [m] and the branch's axis there, shape [3] each."""
     point = skeleton.point_at(fraction)
     axis = point - skeleton.point_at(fraction - 0.05)
     return point, axis / np.linalg.norm(axis)

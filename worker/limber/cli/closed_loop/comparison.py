@@ -1,4 +1,4 @@
-"""Both sides of a closed loop: what it found, and what only the virtual branch knows."""
+"""Both sides of a closed loop: its findings, and the truth of the virtual branch."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +11,12 @@ from limber.core.json_values import plain
 from limber.estimation.simulated_pull import TrueBranch
 
 GOAL_TOLERANCE_M = 0.01
-"""So near its goal the flower is in it."""
+"""Distance from the goal at which the flower is in it."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What pulls have told so far, and what was planned with it."""
+    """Results of the pulls so far, and the plan made with them."""
 
     estimated: dict[str, Any]
     goal: np.ndarray
@@ -27,14 +27,14 @@ class Told:
 
     @property
     def open_factor(self) -> float:
-        """The widest interval of a modulus: its end over its beginning."""
+        """The widest interval of a modulus: ratio of its ends."""
         low, high = np.array(self.estimated["young_interval_pa"], float).T
         return float((high / low).max())
 
 
 def compared(truth: TrueBranch, moved: np.ndarray, told: Told, executed: dict[str, Any],
              watch: Watch, stopped: tuple[str, Watch], soft_force: float) -> dict[str, Any]:
-    """Return recovered against true E, force along the path, the flower, the overload."""
+    """Return estimated against true E, force along the path, the flower, the overload."""
     estimated, goal = told.estimated, told.goal
     seen = watch.at_the_end()
     flower = None if seen is None else seen[-1] + moved
@@ -65,7 +65,7 @@ def compared(truth: TrueBranch, moved: np.ndarray, told: Told, executed: dict[st
 
 
 def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """Return titles and tables of what a loop found, for a terminal."""
+    """Return titles and tables of a loop's findings, for a terminal."""
     from limber.results.report.report_tables import modulus_rows
 
     force = [["force along the path", ""],

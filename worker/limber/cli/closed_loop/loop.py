@@ -1,8 +1,8 @@
 """Scan, reconstruct, record, estimate, plan, execute: each a process, over loopback.
 
-A branch is generated and stands, on a mesh of its own and with moduli that only it knows, beside a
-virtual robot. Everything after that uses what a user has: the camera's pictures, touched points,
-the robot's ports and Limber's own commands. At the end both sides are compared.
+A branch is generated and mounted beside a virtual robot. It has its own mesh, and moduli unknown to
+the rest. All later steps use only what a user has: the camera's pictures, touched points, the
+robot's ports and Limber's own commands. At the end both sides are compared.
 """
 
 import json
@@ -47,13 +47,14 @@ from limber.store.loading import load_skeleton
 
 FLOWER, PLAN = "flower", "to-light"
 PLANNED_TOLERANCE_M = 0.006
-"""So near it is planned: a path ends where the region begins, and the model is off by something."""
+"""Tolerance for planning: a path ends where the region begins, and the model has an error."""
 
 _LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
 OPEN_FACTOR = 4.0
-"""Between the ends of a modulus' interval: where it is more, `limber suggest-pull` is asked whether
-another pull is worth it for the plan."""
+"""Ratio of the ends of a modulus's interval above which `limber suggest-pull` decides whether
+another pull is worthwhile for the plan.
+"""
 _MOST_PULLS = 3
 _MORE_SAMPLES = 450  # about twice the usual
 _FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
@@ -72,17 +73,17 @@ _DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16,
 
 @dataclass
 class ClosedLoop:
-    """One turn of the loop on a branch of its own.
+    """One run of the loop on a branch of its own.
 
     Args:
-        folder: Where everything goes.
-        seed: Of the branch, the sensors' noise and the touching.
+        folder: Parent folder of all results.
+        seed: Seed of the branch, the sensors' noise and the touching.
         address: Loopback address of the virtual robot.
-        model: Its arm.
-        say: Gets a line for each part.
+        model: Model of its arm.
+        say: Gets one line per part.
 
     Attributes:
-        seconds: What each part took.
+        seconds: Duration of each part.
     """
 
     folder: Path
@@ -104,13 +105,13 @@ class ClosedLoop:
         return self.folder / "cell.toml"
 
     def run(self) -> dict[str, Any]:
-        """Go once around.
+        """Run the loop once.
 
         Returns:
-            What :func:`.comparison.compared` tells, and the seconds of each part.
+            The result of :func:`.comparison.compared`, and the seconds of each part.
 
         Raises:
-            LimberError: a part failed; the robot is gone then, what was made stays.
+            LimberError: a part failed; the robot is then stopped, files made so far are kept.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.branch.exists():
@@ -131,7 +132,7 @@ class ClosedLoop:
                 executed, watch = self._executed(robot)
                 stopped = self._overloaded(robot, executed)
             except SafetyStop:
-                # A real controller is never held up: what this one lost may be what stopped it.
+                # A real controller is never delayed; a delay of this one may have caused the stop.
                 if robot.process.poll() is None:
                     held_up = 1000 * robot.state["lost_seconds"]
                     self.progress.warn("stopped; until then the virtual robot itself was delayed "
@@ -155,7 +156,7 @@ class ClosedLoop:
                            fractions=tuple(known["fractions"]))
 
     def _setting(self, truth: TrueBranch, cell: Cell) -> BranchSetting:
-        """Return the branch as it is: unlike what a fit is told, by as much as it allows for."""
+        """Return the true branch: it deviates from the fit's assumptions within their limits."""
         rng, told = np.random.default_rng([self.seed, 8]), VirtualPullSettings()
         poisson = float(np.clip(rng.normal(told.poisson, _POISSON_SIGMA), 0.2, 0.47))
         return BranchSetting.of_truth(
@@ -164,7 +165,7 @@ class ClosedLoop:
             wave=_WAVE_SIGMA * float(rng.standard_normal()))
 
     def _cell(self, truth: TrueBranch) -> Cell:
-        """Put the robot beside the branch; returns its true cell in the scan's frame."""
+        """Place the robot beside the branch; return its true cell in the scan's frame."""
         point, axis = grasp_of(truth.skeleton)
         arm = arm_named(self.model)
         base = base_beside(arm, matrices(np.array(_GRASP_POSE)), point, axis)
@@ -176,8 +177,9 @@ class ClosedLoop:
             limits={"soft_force_n": 20.0, "hard_force_n": 30.0, "hard_torque_nm": 6.0})
 
     def _reconstructed(self, truth: TrueBranch, cell: Cell) -> np.ndarray:
-        """Scan, reconstruct, calibrate, name the flower; returns what takes the scan's frame to
-        the branch's [m], shape [3]."""
+        """Scan, reconstruct, calibrate, name the flower; return the shift from the scan's frame to
+        the branch's [m], shape [3].
+        """
         nodes = truth.mesh.nodes
         middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
         scan = self.folder / "scan.ply"
@@ -189,7 +191,7 @@ class ClosedLoop:
         alignment = Branch.open(self.branch).manifest.alignment
         moved = alignment.apply(np.zeros((1, 3)))[0]
         assert np.allclose(np.array(alignment.rotation), np.eye(3)), "the scan is upright"
-        # Somebody has measured roughly where the base stands; touching tells it.
+        # The base's position is roughly known; touching determines it.
         base = np.array(cell.base.pose) + np.r_[moved, 0, 0, 0]
         write_cell(self.cell_file, cell.model_copy(update={
             "base": cell.base.model_copy(update={"pose": tuple(map(float, base))})}))
@@ -205,7 +207,7 @@ class ClosedLoop:
         return moved
 
     def _told(self, robot: VirtualRobot) -> Told:
-        """Pull, estimate and plan, and pull again as long as that is worth it for the plan."""
+        """Pull, estimate and plan; repeat the pull as long as that is worthwhile for the plan."""
         branch = Branch.open(self.branch)
         point, axis = grasp_of(load_skeleton(branch))
         self._pulled(robot, 1, point, axis, "--direction", *sideways(point)[0], "--distance",
@@ -229,7 +231,7 @@ class ClosedLoop:
         return replace(told, reason=f"{_MOST_PULLS} pulls were made")
 
     def _reaches(self, fraction: float) -> bool:
-        """Whether the arm reaches about a place of the main path."""
+        """Whether the arm reaches the surroundings of a position on the main path."""
         place = grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
         try:
             gripper_at(read_cell(self.cell_file), *place)
@@ -248,13 +250,14 @@ class ClosedLoop:
                    *way, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
 
     def _planned(self, goal: np.ndarray | None = None) -> Told:
-        """Estimate, sample the energy field and plan the flower's way to a place [3], or to one
-        that suits the branch."""
+        """Estimate, sample the energy field and plan the flower's path to a position [3], or to one
+        that suits the branch.
+        """
         estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
                                self.branch)
         branch = Branch.open(self.branch)
         place, _axis = grasp_of(load_skeleton(branch))
-        # A place that somebody wishes the flower at: where a pull to the other side takes it.
+        # A target position for the flower: where a pull to the other side takes it.
         wish = wish_for(branch, sideways(place)[1], _TRAVEL_M)
         write_cell(self.cell_file, wish.limited(read_cell(self.cell_file)))
         goal = wish.place if goal is None else goal
@@ -264,8 +267,8 @@ class ClosedLoop:
         except WorkError as error:
             if UNPROVEN not in str(error):
                 raise
-            # What it advises then, once: where a branch may stand in two shapes, few poses tell
-            # its force coarsely.
+            # Follow the advice of the error once: with two stable shapes, few poses describe the
+            # force of a branch only coarsely.
             self.progress.warn(f"plan: {error} Planning is repeated with {_MORE_SAMPLES} poses.")
             self._sampled(wish, "--samples", _MORE_SAMPLES)
             plan = self._ways(wish, goal)
@@ -291,7 +294,7 @@ class ClosedLoop:
         return dry | result, watch
 
     def _overloaded(self, robot: VirtualRobot, executed: dict[str, Any]) -> tuple[str, Watch]:
-        """Follow the path again and overload the sensor on the way; returns what stopped it."""
+        """Follow the path again and overload the sensor meanwhile; return what stopped it."""
         robot.ask("stand", joints=executed["start_joints_rad"])
         limit = read_cell(self.cell_file).limits.hard_force_n
         overload = np.array([0.0, 0.0, limit + _OVERLOAD_N, 0.0, 0.0, 0.0])
@@ -309,7 +312,7 @@ class ClosedLoop:
                             "moved.", "See the robot's log.")
         told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
         if told["stop_reason"] is None:
-            # Something else stopped it before it moved; what is told is of the way before.
+            # It was stopped by something else before it moved; the report is of the earlier path.
             raise stopped
         return told["stop_reason"], watch
 

@@ -1,4 +1,4 @@
-"""What somebody wants of the branch, in measures that suit the branch as it is estimated."""
+"""A task for the branch, in sizes that suit the estimated branch."""
 
 from dataclasses import dataclass
 
@@ -11,22 +11,23 @@ from limber.store import Branch
 from limber.store.loading import load_grasp_model
 
 _FORCE_MARGIN = 2.0
-"""So many times the force that holds the flower in its goal a path may need on the way."""
+"""Ratio of the largest force of a path to the force that holds the flower at its goal."""
 _SOFT_MARGIN, _HARD_MARGIN = 1.3, 1.5
-"""The guard pauses at the first times a path's force, and stops at the second times that: what is
-felt of a stiff branch differs from what is predicted."""
+"""Ratio of the guard's pause force to a path's force, and of its stop force to the pause force: the
+measured force of a stiff branch differs from its prediction.
+"""
 _BEYOND = 1.5
-"""So many times as far as the goal the energy field is sampled."""
+"""Reach of the sampled energy field as a multiple of the distance to the goal."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """A place for the flower, and what it takes to hold it there by the branch's model.
+    """A goal for the flower, and the effort to hold it there by the branch's model.
 
     Attributes:
-        place: Of the flower, branch frame [m], shape [3].
+        place: Position of the flower, branch frame [m], shape [3].
         holding_force: [N] of the gripper.
-        deflection: How far the grasp goes, as a share of the branch's length up to it.
+        deflection: Displacement of the grasp, as a fraction of the branch's length up to it.
     """
 
     place: np.ndarray
@@ -35,12 +36,12 @@ class Wish:
 
     @property
     def max_force(self) -> float:
-        """What a path to it may need [N]."""
+        """Largest force of a path to it [N]."""
         return _FORCE_MARGIN * self.holding_force
 
     @property
     def sampled_deflection(self) -> float:
-        """How far the energy field has to reach, as a share of the length up to the grasp."""
+        """Required reach of the energy field, as a fraction of the length up to the grasp."""
         return min(_BEYOND * self.deflection, 1.0)
 
     def limited(self, cell: Cell) -> Cell:
@@ -52,10 +53,10 @@ class Wish:
 
 
 def wish_for(branch: Branch, way: np.ndarray, travel: float) -> Wish:
-    """Return a place for the branch's first target that the branch can be held in.
+    """Return a position for the branch's first target in which the branch can be held.
 
-    It is where a force along ``way`` [3] takes it that moves the grasp by ``travel`` [m]: there
-    the branch is bent, and neither stretched nor pushed together.
+    A force along ``way`` [3] that moves the grasp by ``travel`` [m] takes the target there; the
+    branch is then bent, and neither stretched nor compressed.
 
     Raises:
         WorkError: no such force moves it so far.

@@ -1,1 +1,1 @@
-"""One module a command: it turns options into settings and calls one function of the core."""
+"""One module per command: it turns options into settings and calls one function of the core."""

@@ -26,7 +26,7 @@ from limber.cli.main import Run, stage_command
     "queue: number of jobs."))
 def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: str | None,
             cluster: str | None, scheduler: str | None, workers: int | None) -> dict[str, Any]:
-    """Run stages on many branches, side by side.
+    """Run stages on many branches in parallel.
 
     \b
     out = "results"                     # where all goes; default: the file's name
@@ -47,13 +47,13 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     [job.sweep]                         # a branch for each combination
     "reconstruct.mesh_spacing" = [2.0, 3.0]
 
-    Scans, folders, inputs and out may be addresses that fsspec knows (s3://bucket/scans/*.ply):
-    fetched before a branch is begun, its results put there after it; work = "/scratch" says where
-    they are worked on.
+    Scans, folders, inputs and out may be addresses that fsspec knows (s3://bucket/scans/*.ply).
+    They are fetched before a branch is started, and its results are uploaded after it; work =
+    "/scratch" sets the local folder.
 
     A number may have its unit: grasp_radius = "8 mm". The whole file is checked before anything
-    runs. Run it again after a stop, or after inputs have changed: what is up to date is kept.
-    The results stand in OUT/JOBS.csv, one row a branch, and OUT/JOBS.html.
+    runs. Run it again after a stop, or after inputs have changed: results that are up to date are
+    kept. The results are in OUT/JOBS.csv, one row per branch, and OUT/JOBS.html.
     """
     from limber.batch.batch_summary import counts, failures, write_page, write_table
     from limber.batch.jobs.job_file import read_jobs
@@ -86,7 +86,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
         run_jobs(jobs, records, retry_failed=retry_failed, workers=workers,
                  cluster=cluster, scheduler=scheduler, progress=run.progress)
     except BaseException:
-        # What it came to is told as far as it can be: the error is what counts.
+        # Results so far are written if possible; the original error is what counts.
         try:
             if jobs.out.is_dir():
                 write_table(jobs, records)

@@ -20,10 +20,10 @@ from limber.cli.main import Run, stage_command
     "results are included."))
 @click.option("--note", default="", help="What you did, and what happened instead.")
 def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict[str, Any]:
-    """Pack what is installed, and what is known of a branch folder or of a scan, into a ZIP.
+    """Pack a list of what is installed, and data on a branch folder or a scan, into a ZIP.
 
-    Of a folder its manifest and what is wrong with its files; a scan that no branch came of is
-    named itself. Look into the ZIP before you send it: the manifest names your files.
+    For a folder these are its manifest and the faults of its files; give a scan itself if no branch
+    could be made of it. Check the ZIP before you send it: the manifest names your files.
     """
     from limber.cli.commands.doctor import report
     from limber.core.errors import InputError
@@ -39,7 +39,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     told: dict[str, Any] = {"note": note, "doctor": plain(report()), "damages": [], "opens": True}
     if source.is_dir():
         told |= _of_folder(source)
-        # A link may lead to a file that is none of the branch's.
+        # A link may lead to a file outside the branch.
         files = sorted(Path(place, name) for place, _, names in os.walk(source) for name in names
                        if Path(place, name).is_file() and not is_link(Path(place, name)))
         names = {path: path.relative_to(source).as_posix() for path in files}
@@ -47,7 +47,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
         files, names = [source], {source: source.name}
     told["files"] = {names[path]: {"bytes": path.stat().st_size, "sha256": _digest(path)}
                      for path in files}
-    # Neither may what has a second name elsewhere be one of the branch's.
+    # A file with a second name elsewhere may not belong to the branch either.
     kept = {path for path in files if source.is_dir() and has_other_names(path)}
     told["not_packed"] = sorted(names[path] for path in kept)
     count = 0
@@ -79,7 +79,7 @@ def _of_folder(folder: Path) -> dict[str, Any]:
         return {"damages": [vars(damage) for damage in branch.damages()],
                 "is_unfinished": branch.is_unfinished}
     except BranchFolderError as error:
-        # A folder that cannot be opened is the more worth a report.
+        # A folder that cannot be opened is all the more worth reporting.
         return {"opens": False, "error": str(error)}
 
 

@@ -12,9 +12,9 @@ from limber.cli.main import Run, stage_command
     "Remove the least recently used entries until the total is at most this size: 500 MB, 2 GB."))
 @click.option("--clear", is_flag=True, help="Remove everything. It is computed again when needed.")
 def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
-    """Show what is kept beside branch folders (meshes, reduced models, compiled code), or trim it.
+    """Show what is cached (meshes, reduced models, compiled code), or trim it.
 
-    Nothing of it is a result: branch folders do not need it.
+    No result is among it: branch folders do not need it.
     """
     from limber.core.errors import InputError
     from limber.core.files.caches import cache_folder, known_caches, trim

@@ -13,8 +13,8 @@ def command(shell: str) -> None:
     zsh   limber completion zsh > ~/.zfunc/_limber     # with ~/.zfunc in $fpath
     fish  limber completion fish > ~/.config/fish/completions/limber.fish
 
-    It takes effect in the next shell. The script asks `limber` itself, so that it knows the
-    commands and options of the version that is installed, also those of other packages.
+    It takes effect in the next shell. The script queries `limber` itself, so that it knows the
+    commands and options of the installed version, including those of other packages.
     """
     from click.shell_completion import get_completion_class
 

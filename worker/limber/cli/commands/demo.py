@@ -30,18 +30,18 @@ from limber.store import Branch
 from limber.store.manifest import MANIFEST, Manifest
 from limber.version import VERSION
 
-# Assumed Young's modulus [Pa] at the control points for the simulated pull on a scan that comes
-# without a recording: green wood that softens towards the tip.
+# Assumed Young's modulus [Pa] at the control points for the simulated pull on a scan without a
+# recording: green wood that softens towards the tip.
 DEMO_YOUNG = (2.0e9, 1.6e9, 1.2e9, 0.8e9)
 
-# Share of the whole time by which each stage ends, for the bar; measured once, need not be exact.
+# Fraction of the whole time at which each stage ends, for the bar; measured once, only approximate.
 _ENDS = {"generate": 0.01, "reconstruct": 0.15, "virtual-pull": 0.3, "estimate": 0.5,
          "simulate": 0.55, "energy": 0.8, "plan": 0.92, "scene": 0.97, "report": 1.0}
 
 
 @dataclass
 class _Demo:
-    """A demo in progress: its folder and what its stages returned, by command."""
+    """A demo in progress: its folder and the results of its stages, by command."""
 
     folder: Path
     branch: Path
@@ -51,11 +51,11 @@ class _Demo:
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     kept: set[str] = field(default_factory=set)
-    """Stages whose results were there from an earlier demo."""
+    """Stages with results from an earlier demo."""
     done: float = 0.0
 
     def stage(self, title: str, *arguments: object) -> None:
-        """Run one stage as a process; show its progress and its time; keep its result."""
+        """Run one stage as a process; show its progress and duration; keep its result."""
         name = str(arguments[0])
         started = time.perf_counter()
         progress = self.run.progress.part(self.done, _ENDS[name])
@@ -76,7 +76,7 @@ class _Demo:
                 self.run.progress.warn(f"{name}: {told}")
 
     def scene(self, scene: Path, picture: Path) -> None:
-        """Make scene and picture, unless they are there and show the branch as it is."""
+        """Make scene and picture, unless they exist and show the current branch."""
         title, note = "a Blender scene and its picture", self.folder / "demo.json"
         shown = {"branch": self._digest(), "limber": VERSION}
         if scene.is_file() and picture.is_file() and _read_note(note) == shown:
@@ -106,7 +106,7 @@ class _Demo:
         return Branch.read(self.branch).manifest if there else None
 
     def _in_own_words(self, name: str, error: LimberError) -> LimberError:
-        """Return a stage's error without advice to use options that only the stage has."""
+        """Return a stage's error without advice on options that only the stage has."""
         seen, why, fix = (without_foreign_options(part, self.own)
                           for part in (error.seen, error.why, error.fix))
         if (seen, why, fix) == (error.seen, error.why, error.fix):
@@ -149,7 +149,7 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     if cloud is not None and not cloud.is_file():
         raise InputError(f"There is no file {cloud}.", "The demo needs the scan of one branch.",
                          "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
-    # Before minutes of work, not after them.
+    # Checked before minutes of work, not after them.
     require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     name = cloud.stem if cloud else "generated"
     folder = output or Path("out") / name
@@ -205,10 +205,10 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
 
 def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
                 wishes: Mapping[str, Any]) -> LimberError | None:
-    """Run all stages; what fails between mesh and scene ends in a report all the same.
+    """Run all stages; a failure between mesh and scene still ends in a report.
 
     Returns:
-        What failed.
+        The stages that failed.
     """
     branch = demo.branch
     truth: list[str] = []
@@ -241,7 +241,7 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
 
 
 def _scan_options(wishes: Mapping[str, Any]) -> list[object]:
-    """What is known of the scan, as options of `limber reconstruct`."""
+    """Known properties of the scan, as options of `limber reconstruct`."""
     scan = wishes["scan"]
     if wishes["crop"]:
         scan = scan.model_copy(update={"crop_low": wishes["crop"][:3],
@@ -273,7 +273,7 @@ def _show_tables(demo: _Demo) -> None:
 
 
 def _found(demo: _Demo) -> list[str]:
-    """What the demo found, in the sentences of its stages."""
+    """The demo's findings, in the sentences of its stages."""
     from limber.results.findings import beyond_sentence, certificate_sentence, path_sentence
 
     plan = demo.results["plan"]
@@ -295,14 +295,14 @@ def _loop_sentence(result: Mapping[str, Any]) -> str:
 
 
 def _files(report: object, scene: Path, picture: Path) -> list[str]:
-    """Say where what there is to look at lies."""
+    """Print where the results are."""
     shown = [(name, path) for name, path in (("scene", scene), ("picture", picture))
              if path.is_file()]
     return [f"{name:<8}{path}" for name, path in (("report", report), *shown)]
 
 
 def _read_note(path: Path) -> Any:
-    """Return what an earlier demo noted; None where there is none, or it is damaged."""
+    """Return the record of an earlier demo; None if there is none, or it is damaged."""
     try:
         return read_json(path, "a demo's note")
     except InputError:

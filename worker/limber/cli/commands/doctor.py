@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _LEAST_FREE_BYTES = 200e6
 
-# Module, distribution, what does not work without it. None: nothing works without it.
+# Module, distribution, and what does not work without it. None: nothing works without it.
 PARTS = [
     ("numpy", "numpy", None),
     ("scipy", "scipy", None),
@@ -49,7 +49,7 @@ PARTS = [
 @stage_command("doctor")
 @click.option("--warm", is_flag=True, help="Compile the solver's kernels now, not at first use.")
 def command(run: Run, warm: bool) -> dict[str, Any]:
-    """What is installed, what is missing and what then does not work."""
+    """Installed and missing packages, and what does not work without them."""
     result = report()
     if warm:
         from limber.geometry.warm_up import warm_up as warm_geometry
@@ -90,7 +90,7 @@ def report() -> dict[str, Any]:
 
 
 def _told_cache(cache: "Cache") -> str:
-    """Size of a cache and what is wrong with it; `--warm` reads what it holds, too."""
+    """Size of a cache and its faults; `--warm` also reads its content."""
     told = [f"{cache.file_count} files, {cache.byte_count / 1e6:.0f} MB"]
     if not os.access(cache.folder, os.W_OK):
         told.append(f"{cache.folder} cannot be written: nothing is kept, every run computes it")

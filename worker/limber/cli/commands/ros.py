@@ -71,7 +71,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     """Follow one leg of a plan by the joint trajectory controller, under the guard.
 
     A stop cancels the goal and publishes True on /limber/stop. A websocket is no safety channel:
-    run the node of scripts/examples/ros2 beside the controller, which also acts on silence.
+    run the node of scripts/examples/ros2 beside the controller; it also acts on silence.
     """
     from limber.core.errors import InputError, SafetyStop
     from limber.stages.paths.execute import ExecuteSettings, planned_motion
@@ -101,7 +101,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
 
 def _followed(run: Run, cell: Cell, trajectory: Trajectory, url: str, *, is_held: bool,
               ) -> dict[str, Any]:
-    """Tare, or with the branch held recall the tare, and follow; returns how that ended."""
+    """Tare, or with the branch held recall the tare, and follow; return how that ended."""
     from limber.core.errors import SafetyStop
     from limber.robot.driver.real_time import claim_real_time
     from limber.robot.ros.bridge import Bridge

@@ -15,9 +15,9 @@ from limber.stages.command_line import settings_options
 def command(branch_folder: Path, settings: SessionSettings) -> None:
     """A branch held in a process that other programs bend.
 
-    Commands are JSON lines on standard input, events JSON lines on standard output, frames are in
-    a memory-mapped file: `python -m limber.session.worker --help` lists them. It ends with the end
-    of its input.
+    Commands are JSON lines on standard input, events are JSON lines on standard output, and frames
+    are in a memory-mapped file: `python -m limber.session.worker --help` lists them. The session
+    ends at the end of its input.
     """
     from limber.session.worker import run_session
 

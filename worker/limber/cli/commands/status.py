@@ -12,7 +12,7 @@ from limber.cli.main import Run, stage_command
 @stage_command("status")
 @click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
 def command(run: Run, job_file: Path) -> dict[str, Any]:
-    """Say how far the batch of a job file is, also while it runs; each failure with its reason."""
+    """Show the progress of a job file's batch, also while it runs; each failure with its reason."""
     from limber.batch.batch_summary import counts, failures
     from limber.batch.jobs.job_file import read_jobs
     from limber.batch.records import RUNNING, Records

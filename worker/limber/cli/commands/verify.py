@@ -17,8 +17,8 @@ from limber.store import Branch, damage_error, unlisted
 def command(run: Run, branch_folder: Path, finish: bool) -> dict[str, Any]:
     """Compare every file of a branch folder with its checksum; exit code 2 if one is damaged.
 
-    Files that no stage wrote, and recordings that were cut off, are named too; they are no
-    damage. Nothing in the folder is changed, unless --finish is given.
+    Files that no stage wrote and truncated recordings are listed too; they do not count as damage.
+    The folder is not changed unless --finish is given.
     """
     branch = (Branch.open(branch_folder) if finish
               else Branch.read(branch_folder, unfinished=True))

@@ -29,8 +29,8 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
     """Serve a UR controller on the ports that the real client library uses, loopback only.
 
     With a branch folder the gripper can hold that branch: its true modulus is --young, its mesh
-    another one than the folder's. Force mode, freedrive and contact detection are not there: a
-    command that it does not know ends the program and is logged.
+    differs from the folder's. Force mode, freedrive and contact detection are not supported: an
+    unknown command ends the program and is logged.
     """
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time

@@ -1,1 +1,1 @@
-"""The commands of `limber robot`, one a module."""
+"""The commands of `limber robot`, one per module."""

@@ -60,11 +60,11 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
               **printed: Any) -> dict[str, Any]:
     """Write the robot's base in the branch's frame into the cell file, from points or views.
 
-    Points are touched with the middle of the gripper, the robot guided by hand; the controller's
-    own pose is read when Enter is pressed. Four or more points that lie in no plane are needed:
-    others fit a mirrored frame as well. Views are of a board or marker, found in the camera's
-    pictures by another program (OpenCV's solvePnP gives such poses): the branch's scan is in the
-    frame of that camera, so nothing need be touched.
+    Points are touched with the middle of the gripper while the robot is guided by hand; the
+    controller's own pose is read when Enter is pressed. Four or more points that are not in one
+    plane are needed: others fit a mirrored frame as well. Views are of a board or marker, found in
+    the camera's pictures by another program (OpenCV's solvePnP gives such poses). The branch's scan
+    is in the frame of that camera, so no points need to be touched.
     """
     from limber.core.errors import InputError
     from limber.robot.cell.cell import read_cell
@@ -190,7 +190,7 @@ def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file:
     from limber.robot.cell.base_calibration import fit_base, require_frame
 
     names, on_branch, touched = _points(points_file)
-    # Before anybody touches them.
+    # Before the user touches any points.
     require_frame(on_branch, names, "on the branch", largest_residual)
     version = cell.robot.version
     if touched is None:
@@ -221,7 +221,7 @@ def _close(run: Run, cell_file: Path, residual: float, sigma: float) -> None:
 
 def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
                 rotation_sigma: float, residual: float) -> None:
-    """Write a cell whose base is calibrated for a branch, by its identity."""
+    """Write a cell whose base is calibrated for a branch, with the branch's identity."""
     from limber.robot.cell.cell import BaseEntry, write_cell
 
     base = BaseEntry(pose=tuple(map(float, pose)), position_sigma_m=max(position_sigma, 1e-4),
@@ -263,7 +263,8 @@ def _is_number(text: str) -> bool:
 
 
 def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
-    """Read the tool's position at each point; the arm is guided by hand, nothing is sent to it."""
+    """Read the tool's position at each point; the arm is guided by hand, no command is sent to it.
+    """
     from limber.core.errors import WorkError
     from limber.robot.cell.base_calibration import touched_place
     from limber.robot.ur.samples import SampleStream

@@ -15,9 +15,9 @@ _SECONDS = 1.0
 def check(run: Run, cell_file: Path) -> dict[str, Any]:
     """Read model, version, settings, mode and force, and compare them with the cell.
 
-    Nothing moves, and nothing is written to the controller. Each difference is stated with both
-    values; `limber record` and `limber execute` set tool and payload by themselves, after they
-    have shown them, and put them back.
+    The robot does not move, and nothing is written to the controller. Each difference is stated
+    with both values. `limber record` and `limber execute` set tool and payload themselves after
+    showing them, and restore them.
     """
     from limber.robot.cell.cell import read_cell
     from limber.robot.observed import observe
@@ -49,7 +49,7 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
 
 
 def _computer(run: Run) -> dict[str, bool]:
-    """What this computer grants the loop that moves a robot."""
+    """Real-time privileges of the loop that moves a robot."""
     from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 
     told = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),

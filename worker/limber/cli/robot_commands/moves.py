@@ -1,6 +1,6 @@
-"""Motions of the arm by itself: `limber robot home`, `goto-start`, `retreat`, `release`, `open`.
+"""Motions of the arm alone: `limber robot home`, `goto-start`, `retreat`, `release`, `open`.
 
-Each is planned from where the arm stands, and moves nothing without --arm.
+Each is planned from the arm's current position, and moves nothing without --arm.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _TARE_SECONDS = 0.5
 
 
 def move_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
-    """Make a command ``function(run, cell_file, armed, **options)`` of an arm's own motion."""
+    """Make a command ``function(run, cell_file, armed, **options)`` for a motion of the arm alone.
+    """
     def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
         function = click.option(
             "--arm", "armed", is_flag=True, help="Move the robot. Default: a dry run.")(function)
@@ -74,10 +75,10 @@ def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, bran
 
 @move_command("retreat")
 def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
-    """Go back along the way that was followed last, while the force falls; else open the gripper.
+    """Go back along the last path while the force falls; else open the gripper.
 
-    The way is on disk, so this works after a crash of the program that went it. Exit code 4 where
-    a force over the soft limit is left.
+    The path is on disk, so this works after a crash of the program that followed it. Exit code 4 if
+    a force over the soft limit remains.
     """
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
@@ -117,7 +118,7 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
 
 @move_command("release")
 def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
-    """Open the gripper, and back away from the branch the way the gripper came to it."""
+    """Open the gripper, and retreat from the branch opposite to the approach."""
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import grip, require_confirmation
@@ -138,7 +139,7 @@ def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
 
 @move_command("open")
 def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
-    """Open the gripper where the arm stands; the arm does not move.
+    """Open the gripper where the arm is; the arm does not move.
 
     It works while the robot is stopped: no program is needed on the controller.
     """
@@ -168,7 +169,7 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
 
 def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.ndarray, word: str,
         armed: bool, confirm: str | None) -> dict[str, Any]:
-    """Plan the way of the empty arm to joint angles ``goal`` [n], and go it with ``armed``."""
+    """Plan the path of the empty arm to joint angles ``goal`` [n], and follow it if ``armed``."""
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import require_confirmation
     from limber.stages.paths.arm_moves import to_joints
@@ -218,7 +219,7 @@ def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Tra
 
 
 def stands(cell: Cell) -> tuple[Sample, np.ndarray]:
-    """Where the arm stands: a sample, and the pose of the gripper's middle [6]."""
+    """Current position of the arm: a sample, and the pose of the gripper's middle [6]."""
     from limber.robot.cell.base_calibration import gripper_pose
     from limber.robot.observed import observe
 
@@ -233,7 +234,7 @@ def _with_pose(sample: Sample, pose: np.ndarray) -> Sample:
 
 
 def require_empty(cell: Cell, run: Run) -> None:
-    """Refuse a way of the arm alone while the gripper holds the branch, as far as that is known."""
+    """Refuse a motion of the arm alone if the gripper is known to hold the branch."""
     from limber.core.errors import SafetyStop
     from limber.robot.motion.way_file import read_way
 

@@ -24,8 +24,8 @@ _ASKED = {"model": ("Model of the robot (ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16
 def new_cell(run: Run, cell_file: Path, **given: Any) -> dict[str, Any]:
     """Write a commented cell file with every section, to be filled in.
 
-    What no option gives is asked for at a terminal; without one the usual values are taken. An
-    existing file is not overwritten.
+    Values that no option gives are asked for at a terminal; without one the usual values are used.
+    An existing file is not overwritten.
     """
     from limber.core.errors import InputError
     from limber.core.files.atomic import write_atomically
@@ -53,7 +53,7 @@ def new_cell(run: Run, cell_file: Path, **given: Any) -> dict[str, Any]:
 
 
 def _answer(name: str, given: Any) -> Any:
-    """What was given, else what is typed at a terminal, else the usual value."""
+    """The given value, else the one typed at a terminal, else the usual one."""
     if given is not None:
         return given
     text, usual = _ASKED[name]

@@ -25,7 +25,7 @@ def scan(run: Run, address: str, output: Path, middle: tuple[float, float, float
          distance: float, views: int) -> dict[str, Any]:
     """Scan the branch of `limber virtual-robot` with its depth camera, from all around.
 
-    Real cameras are not driven from here: record a cloud with their own program.
+    Real cameras are not controlled from here: record a cloud with their own program.
     """
     from limber.geometry.cloud.cloud import Cloud
     from limber.robot.virtual.depth_camera import scanned, views_around

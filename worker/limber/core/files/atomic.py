@@ -13,9 +13,9 @@ from limber.core.files.temporary_names import owned_name
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a part.
+    """Write a file so that a reader sees the old or the new content, never a partial one.
 
-    The content is on the disk, and so is its name, when this returns.
+    When this returns, content and name are on the disk.
     """
     with replacing(path) as stream:
         stream.write(content.encode("utf-8") if isinstance(content, str) else content)
@@ -23,12 +23,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a stream whose content becomes a file when the block ends well, as a whole.
+    """Open a stream whose content replaces a file as a whole if the block succeeds.
 
-    Otherwise nothing changes.
+    Otherwise the file is unchanged.
 
     Raises:
-        InputError: a device or a pipe is there; it would be replaced by a file.
+        InputError: the path is a device or a pipe, which a file would replace.
     """
     require_no_pipe(path)
     path = Path(path)
@@ -46,12 +46,12 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
-    """Write a text file whose lines end alike on every system."""
+    """Write a text file with the same line ends on every system."""
     Path(path).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8", newline="\n")
 
 
 def flush_folder(folder: Path) -> None:
-    """Bring the names in ``folder`` to the disk; Windows does that by itself."""
+    """Flush the names in ``folder`` to the disk; Windows does this automatically."""
     if os.name == "nt":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -62,10 +62,10 @@ def flush_folder(folder: Path) -> None:
 
 
 def flush_tree(folder: Path) -> None:
-    """Bring all files below ``folder``, and their names, to the disk."""
+    """Flush all files below ``folder``, and their names, to the disk."""
     for place, _folders, files in os.walk(folder):
         for name in files:
-            # Windows flushes only what is open for writing.
+            # Windows flushes only files that are open for writing.
             with open(Path(place, name), "rb+" if os.name == "nt" else "rb") as stream:
                 os.fsync(stream.fileno())
         flush_folder(Path(place))
@@ -83,15 +83,15 @@ def file_digest(path: str | os.PathLike) -> str:
 
 
 def require_no_pipe(path: str | os.PathLike) -> None:
-    """Refuse a pipe, a socket or a device. A path without anything passes.
+    """Refuse a pipe, a socket or a device. A path that does not exist passes.
 
     Raises:
-        InputError: it is one. It may never end, and it cannot be read twice.
+        InputError: it is one of these. It may never end, and cannot be read twice.
     """
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
-        # Whoever opens it says so in terms of what was expected there.
+        # The caller that opens it reports this and names what it expected.
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise InputError(f"{path} is a pipe or a device, not a file.",

@@ -1,4 +1,4 @@
-"""What Limber keeps beside branch folders to be quicker the next time; any of it may go."""
+"""Files that Limber keeps outside branch folders to save time; any may be removed."""
 
 import contextlib
 import os
@@ -8,12 +8,12 @@ from pathlib import Path
 import platformdirs
 
 TETRAHEDRA_BYTES = 1 << 30
-"""How much fTetWild's meshes may take."""
+"""Size limit of fTetWild's cached meshes."""
 
 
 @dataclass(frozen=True)
 class Cache:
-    """One folder of the cache: what it holds, how many files, of those empty, how many bytes."""
+    """One folder of the cache: content, number of files, number of empty files, bytes."""
 
     name: str
     folder: Path
@@ -28,7 +28,7 @@ def cache_folder() -> Path:
 
 
 def known_caches() -> list[Cache]:
-    """Return the caches there are, by name."""
+    """Return the existing caches by name."""
     folder = cache_folder()
     if not folder.is_dir():
         return []
@@ -40,11 +40,10 @@ def known_caches() -> list[Cache]:
 
 
 def trim(folder: Path, most_bytes: float) -> int:
-    """Remove the files used longest ago until those of ``folder`` take ``most_bytes`` at most.
+    """Remove the least recently used files until those of ``folder`` take ``most_bytes`` or less.
 
     Returns:
-        Bytes that were set free. What another program holds open or removes meanwhile is passed
-        over.
+        Bytes freed. Files that another program holds open or removes meanwhile are skipped.
     """
     files = _files(folder)
     total, freed = sum(size for _, size, _ in files), 0
@@ -58,10 +57,10 @@ def trim(folder: Path, most_bytes: float) -> int:
 
 
 def clear(folder: Path) -> int:
-    """Remove every file below ``folder``, and the folders inside its own that are empty then.
+    """Remove every file below ``folder``, and subfolders that are then empty.
 
     Returns:
-        Bytes that were set free. What another program holds open is passed over.
+        Bytes freed. Files that another program holds open are skipped.
     """
     freed = 0
     for _, size, path in _files(folder):
@@ -69,7 +68,7 @@ def clear(folder: Path) -> int:
             path.unlink()
             freed += size
     for place, _folders, _names in os.walk(folder, topdown=False):
-        # The folder of each cache stays: a program that is running may be about to write there.
+        # The folder of each cache is kept: a running program may be about to write to it.
         if len(Path(place).relative_to(folder).parts) > 1:
             with contextlib.suppress(OSError):
                 os.rmdir(place)
@@ -77,7 +76,7 @@ def clear(folder: Path) -> int:
 
 
 def _files(folder: Path) -> list[tuple[float, int, Path]]:
-    """Time of last use, size and path of each file; locks, which are empty, are left alone."""
+    """Time of last use, size and path of each file; locks, which are empty, are skipped."""
     found = []
     for place, _folders, names in os.walk(folder):
         for name in names:

@@ -1,7 +1,7 @@
-"""What the header of a cloud file announces, held against the file's size before it is read.
+"""Comparison of a cloud file's declared size with its actual one, before it is read.
 
-The packages that read PLY, PCD and LAS take memory for the points that a header speaks of; a
-mangled one speaks of billions.
+The packages that read PLY, PCD and LAS allocate memory for the points that a header declares; a
+corrupt header may declare billions.
 """
 
 import os
@@ -17,15 +17,15 @@ _PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort"
               "double": 8, "float64": 8}
 _LONGEST_HEADER = 1 << 20
 _LZF_EXPANSION = 90.0
-"""A byte of LZF stands for at most 264 / 3 bytes."""
+"""A byte of LZF expands to at most 264 / 3 bytes."""
 _LAZ_EXPANSION = 1000.0
 
 
 def check_ply(path: Path) -> None:
-    """Refuse a PLY file that holds fewer elements than its header announces.
+    """Refuse a PLY file that holds fewer elements than its header declares.
 
     Raises:
-        InputError: it does.
+        InputError: it holds fewer.
     """
     lines, body = _text_header(path, b"end_header")
     is_text, announced, count, width = False, 0.0, 0, 0
@@ -37,18 +37,18 @@ def check_ply(path: Path) -> None:
             count, width = _count(path, words[2] if len(words) > 2 else ""), 0
         elif words[:1] == ["property"] and len(words) > 2:
             kind = words[2] if words[1] == "list" else words[1]
-            # As text a value takes a digit and what parts it from the next.
+            # As text a value takes at least one digit and a separator.
             width += 2 if is_text else _PLY_BYTES.get(kind, 1)
     held = path.stat().st_size - body
-    # A text's last value needs nothing behind it.
+    # The last value of a text needs no separator.
     require_size(path, announced, held + is_text, "its elements")
 
 
 def check_pcd(path: Path) -> None:
-    """Refuse a PCD file that holds fewer points than its header announces.
+    """Refuse a PCD file that holds fewer points than its header declares.
 
     Raises:
-        InputError: it does.
+        InputError: it holds fewer.
     """
     lines, body = _text_header(path, b"\nDATA")
     said = {words[0]: words[1:] for line in lines if (words := line.split())}
@@ -76,10 +76,10 @@ def check_pcd(path: Path) -> None:
 
 
 def check_las(path: Path) -> None:
-    """Refuse a LAS or LAZ file that holds fewer points than its header announces.
+    """Refuse a LAS or LAZ file that holds fewer points than its header declares.
 
     Raises:
-        InputError: it does, or it is not such a file.
+        InputError: it holds fewer, or it is not such a file.
     """
     size = path.stat().st_size
     with open(path, "rb") as stream:
@@ -104,13 +104,13 @@ def check_las(path: Path) -> None:
 
 
 def _text_header(path: Path, end: bytes) -> tuple[list[str], int]:
-    """Return the lines of a header that ends with the line of ``end``, and where that ends."""
+    """Return the lines of a header up to the line of ``end``, and its end position."""
     head, stop = header_bytes(path, end)
     return re.split(r"[\r\n]+", head.decode("latin-1").rstrip("\r\n")), stop
 
 
 def header_bytes(path: Path, end: bytes) -> tuple[bytes, int]:
-    """Return a header up to the line of ``end``, with it, and where that ends.
+    """Return a header up to and including the line of ``end``, and its end position.
 
     Raises:
         InputError: there is no such line.

@@ -1,8 +1,8 @@
-"""The door through which files of others, and of branch folders, come in: JSON, TOML, CSV, arrays.
+"""Checked reading of files of other programs and of branch folders: JSON, TOML, CSV, arrays.
 
-Whoever wrote them, they may be cut short, mangled or made to harm. So: numbers are finite, what a
-header announces is compared with the file's size before memory is taken, nothing is unpickled, and
-whatever is wrong is an :class:`~limber.core.errors.InputError` that names the file.
+Such files may be truncated, corrupt or malicious. Therefore numbers must be finite, declared sizes
+are compared with the file's size before memory is allocated, nothing is unpickled, and every fault
+is an :class:`~limber.core.errors.InputError` that names the file.
 """
 
 import contextlib
@@ -28,16 +28,17 @@ from limber.core.files.atomic import require_no_pipe
 Content = TypeVar("Content")
 
 LARGEST_EXPANSION = 100.0
-"""Array bytes for a byte of a compressed file, from which on ``HARMLESS_BYTES`` is the limit:
-real measurements compress ten times at best."""
+"""Ratio of array bytes to compressed bytes above which ``HARMLESS_BYTES`` is the limit. Real
+measurements compress tenfold at best.
+"""
 HARMLESS_BYTES = 256e6
 MOST_TOML_BYTES = 2 << 20
-"""People write TOML by hand; its parser takes two seconds for a megabyte of tables."""
+"""Largest hand-written TOML file; its parser takes two seconds per megabyte of tables."""
 MOST_JSON_BYTES = 512 << 20
 _MOST_KEY_PARTS = 32
 _LONG_KEY = re.compile(r"""(?<![\w.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+)"""
                        f"{{{_MOST_KEY_PARTS}}}")
-"""A dotted key; the parser's time and memory grow with the square of the number of its parts."""
+"""A dotted key with too many parts; the parser's time and memory grow with their number squared."""
 
 
 class FileContent(BaseModel):
@@ -47,7 +48,7 @@ class FileContent(BaseModel):
 
 
 def read_text(path: str | os.PathLike, what: str) -> str:
-    """Return a file's text (UTF-8, with or without a mark); ``what`` it should be, for errors.
+    """Return a file's text (UTF-8, with or without a BOM); ``what`` names it in errors.
 
     Raises:
         InputError: it cannot be read, or is not text.
@@ -86,25 +87,25 @@ def read_json_as(path: str | os.PathLike, kind: type[Content], what: str) -> Con
     """Return the content of a JSON file as ``kind``, any type that pydantic checks.
 
     Raises:
-        InputError: it is not JSON, or not of that kind; names the position.
+        InputError: it is not JSON, or not of that kind; the message names the position.
     """
     return checked_as(path, kind, read_json(path, what), what)
 
 
 def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what: str, *,
                strict: bool = False) -> Content:
-    """Return what was read from ``path`` as ``kind``.
+    """Return content read from ``path`` as ``kind``.
 
     Args:
-        strict: Whether a number must be one in the file as well, no text and no true or false.
-            For content that is used as it was read.
+        strict: Whether a number must be a number in the file as well, not text or a Boolean. For
+            content that is used unconverted.
 
     Raises:
-        InputError: it is not of that kind; names the position.
+        InputError: it is not of that kind; the message names the position.
     """
     adapter = TypeAdapter(kind)
     try:
-        # Only JSON's own strictness takes a list for a tuple.
+        # Only pydantic's strict JSON mode accepts a list for a tuple.
         return (adapter.validate_json(json.dumps(content), strict=True) if strict
                 else adapter.validate_python(content))
     except ValidationError as error:
@@ -120,7 +121,7 @@ def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dic
     """Return the content of a TOML file; all its numbers are finite.
 
     Args:
-        finite: False where the caller refuses what is not finite itself, by its name and line.
+        finite: False if the caller itself refuses values that are not finite, by name and line.
 
     Raises:
         InputError: it is not TOML (the line is named), or a number in it is not finite.
@@ -131,7 +132,7 @@ def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dic
 
 def toml_content(text: str, path: str | os.PathLike, what: str, *, finite: bool = True,
                  ) -> dict[str, Any]:
-    """Return the content of a TOML text that was read from ``path``, as :func:`read_toml` does.
+    """Return the content of a TOML text read from ``path``, as :func:`read_toml` does.
 
     Raises:
         InputError: as :func:`read_toml`; or a key is nested too deeply.
@@ -151,7 +152,7 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
     """Return the arrays of an NPZ file, or the one of an NPY file as ``arr_0``.
 
     Raises:
-        InputError: it is damaged, holds objects, or announces more than it can hold.
+        InputError: it is damaged, contains objects, or declares more than it can hold.
     """
     require_no_pipe(path)
     try:
@@ -176,7 +177,7 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
 
 
 def csv_rows(path: str | os.PathLike, what: str) -> list[list[str]]:
-    """Return the fields of each line of a CSV file, also of empty lines.
+    """Return the fields of each line of a CSV file, including empty lines.
 
     Raises:
         InputError: it cannot be read, or a field has more than 131,072 characters.
@@ -188,12 +189,12 @@ def csv_rows(path: str | os.PathLike, what: str) -> list[list[str]]:
 
 
 def csv_records(path: str | os.PathLike, what: str, comment: str = "") -> list[dict[str, Any]]:
-    """Return the fields of each line of a CSV file by the titles in its first line.
+    """Return the fields of each line of a CSV file, keyed by the titles in its first line.
 
-    A field that its line lacks is None; those beyond the titles are listed under None.
+    A missing field is None; fields beyond the titles are listed under None.
 
     Args:
-        comment: Lines that begin with it are omitted.
+        comment: Lines that begin with this are skipped.
 
     Raises:
         InputError: as :func:`csv_rows`.
@@ -208,7 +209,7 @@ def csv_records(path: str | os.PathLike, what: str, comment: str = "") -> list[d
 
 def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
                  ) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV file with a header that hold finite numbers throughout.
+    """Return the columns of a CSV file with a header that contain only finite numbers.
 
     Raises:
         InputError: it cannot be read, has no rows, or one of ``needed`` is not among them.
@@ -229,10 +230,10 @@ def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
 
 
 def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], what: str) -> None:
-    """Refuse arrays with numbers that are not finite.
+    """Refuse arrays that contain numbers that are not finite.
 
     Raises:
-        InputError: there is one; the message names the array.
+        InputError: there is such an array; the message names it.
     """
     for name, values in arrays.items():
         if values.dtype.kind in "fc" and not np.isfinite(values).all():
@@ -243,13 +244,13 @@ def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], wh
 
 def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
                    shapes: Mapping[str, tuple[int | str, ...]], what: str) -> None:
-    """Refuse arrays that are missing, no finite numbers, or of another shape.
+    """Refuse arrays that are missing, not finite numbers, or of another shape.
 
     Args:
-        shapes: Name to shape; a letter means the same length everywhere.
+        shapes: Name to shape; the same letter means the same length everywhere.
 
     Raises:
-        InputError: names the first that does not fit.
+        InputError: an array does not fit; the message names the first.
     """
     lengths: dict[int | str, int] = {}
     for name, shape in shapes.items():
@@ -269,14 +270,14 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
 
 
 def require_size(path: str | os.PathLike, announced: float, held: float, what: str) -> None:
-    """Refuse a file whose header announces more bytes than it holds, before memory is taken.
+    """Refuse a file whose header declares more bytes than it holds, before memory is allocated.
 
     Args:
-        announced: Least number of bytes that this many ``what`` take.
-        held: Bytes that are there.
+        announced: Fewest bytes that the declared number of ``what`` take.
+        held: Available bytes.
 
     Raises:
-        InputError: it does.
+        InputError: it holds fewer.
     """
     if announced > held:
         raise InputError(f"{path} announces {what}: at least {announced:.3g} bytes. It contains "
@@ -285,7 +286,7 @@ def require_size(path: str | os.PathLike, announced: float, held: float, what: s
 
 
 def _array(stream: IO[bytes], size: int) -> np.ndarray:
-    """Read one array whose header has been compared with the bytes that there are."""
+    """Read one array after comparing its header with the available bytes."""
     version = np.lib.format.read_magic(stream)
     reader = {(1, 0): np.lib.format.read_array_header_1_0,
               (2, 0): np.lib.format.read_array_header_2_0}.get(version)

@@ -1,8 +1,8 @@
-"""Names that files contain and that become paths: they may not lead out of their folder.
+"""Names in files that are used as paths: they must not lead out of their folder.
 
-A branch folder or a recording may come from anybody. Each name in it that is used as a path goes
-through :func:`inside`, and a folder with links is refused before anything in it is written. A user
-who made the links says so (``limber --follow-links``); names must stay inside all the same.
+A branch folder or a recording may come from an untrusted source. Each name in it that is used as a
+path goes through :func:`inside`, and a folder with links is refused before it is written to. A user
+who made the links allows them with ``limber --follow-links``; names must stay inside even then.
 """
 
 import os
@@ -14,19 +14,19 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from limber.core.errors import InputError
 
 _PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_. +-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_. +-]*)*")
-"""Names that need no closer look: manifests list thousands of them."""
+"""Names that need no further check: manifests list thousands of them."""
 _MOST_LEVELS = 32
 FOLLOW_LINKS = "LIMBER_FOLLOW_LINKS"
-"""Set to 1 where links may be followed; processes that a command starts inherit it."""
+"""Set to 1 if links may be followed; child processes of a command inherit it."""
 
 
 def relative_name(name: str) -> str:
     """Return ``name``, relative and with ``/``, in its shortest form.
 
-    The rule is the same on every system, so that a folder that is valid here is valid anywhere.
+    The rule is the same on every system, so that a folder valid on one is valid on all.
 
     Raises:
-        InputError: it is absolute, leads upwards, names a drive, or no file can have it.
+        InputError: it is absolute, leads upwards, names a drive, or is no valid file name.
     """
     if _PLAIN.fullmatch(name):
         return name
@@ -47,7 +47,7 @@ def relative_name(name: str) -> str:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Return the path of ``name`` in ``folder``, whether it exists or not.
+    """Return the path of ``name`` in ``folder``, whether or not it exists.
 
     Raises:
         InputError: the name points outside the folder, or its path contains a link.
@@ -61,10 +61,10 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a folder with a link anywhere in it; ``folder`` itself may be one.
+    """Refuse a folder that contains a link; ``folder`` itself may be one.
 
     Raises:
-        InputError: there is a link, or a folder that is nested too deeply to look for links in it;
+        InputError: the folder contains a link, or is nested too deeply to be checked; the message
             names it.
     """
     top = len(Path(folder).parts)
@@ -83,7 +83,7 @@ def _may_follow() -> bool:
 
 
 def is_link(path: Path) -> bool:
-    """Whether ``path`` is a symbolic link, or a junction of Windows; False if there is nothing."""
+    """Whether ``path`` is a symbolic link, or a junction of Windows; False if it does not exist."""
     try:
         about = os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -96,8 +96,8 @@ def is_link(path: Path) -> bool:
 def has_other_names(path: Path) -> bool:
     """Whether a file has a second name (a hard link), which may be outside its folder.
 
-    What replaces a file leaves the other name alone; what changes it in place, or gives it away,
-    must ask first.
+    Replacing a file does not affect its other name. Code that changes a file in place or passes it
+    on must check first.
     """
     about = os.lstat(path)
     return stat.S_ISREG(about.st_mode) and about.st_nlink > 1

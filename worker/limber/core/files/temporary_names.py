@@ -1,7 +1,7 @@
-"""Names of temporary files. They identify their process, so that those of a dead one are removed.
+"""Names of temporary files. They identify their process, so that orphans are removed.
 
-A name carries host, process id and the second in which that process started: the system
-reuses a process id.
+A name contains host, process id and the second in which the process started, since the system
+reuses process ids.
 """
 
 import functools
@@ -18,22 +18,23 @@ from pathlib import Path
 
 _OWNED = re.compile(r"^\..+\.([0-9a-f]{6})-([0-9]+)-([0-9]+)-[0-9a-f]{8}$")
 _CLOCK_SECONDS = 2.0
-"""By how much two readings of one process's start may differ: the clock is set meanwhile."""
+"""Largest difference of two readings of a process's start: the clock may be set in between."""
 _FOREIGN_DAYS = 7.0
-"""A process on another machine cannot be looked up: its files go when they have not changed for
-so long."""
+"""Age without a change after which files of another machine's process are removed, since that
+process cannot be looked up.
+"""
 
 
 def owned_name(name: str) -> str:
-    """Return a new hidden name for an unfinished ``name`` of this process."""
+    """Return a new hidden name of this process for an unfinished ``name``."""
     return f".{name}.{_host()}-{os.getpid()}-{_start_second(os.getpid())}-{secrets.token_hex(4)}"
 
 
 def sweep(folder: Path) -> list[str]:
-    """Remove unfinished files and folders of dead processes below ``folder``.
+    """Remove unfinished files and folders of ended processes below ``folder``.
 
     Returns:
-        The names of what was removed, relative to ``folder``, sorted.
+        The names of the removed files and folders, relative to ``folder``, sorted.
     """
     removed = []
     for path in _abandoned(folder):
@@ -43,19 +44,19 @@ def sweep(folder: Path) -> list[str]:
 
 
 def sweep_beside(path: Path) -> None:
-    """Remove unfinished versions of ``path`` that dead processes left beside it."""
+    """Remove unfinished versions of ``path`` left behind by ended processes."""
     for unfinished in path.parent.glob(f".{glob.escape(path.name)}.*"):
         if is_owned_name(unfinished.name) and _is_abandoned(unfinished):
             _remove(unfinished)
 
 
 def is_owned_name(name: str) -> bool:
-    """Whether ``name`` is one that :func:`owned_name` made, here or elsewhere."""
+    """Whether :func:`owned_name` made ``name``, on this machine or another."""
     return _OWNED.match(name) is not None
 
 
 def is_alive(process_id: int, start_second: int) -> bool:
-    """Whether the process of this machine that started then is running."""
+    """Whether the process on this machine with that start time is running."""
     import psutil
 
     try:
@@ -71,7 +72,7 @@ def is_alive(process_id: int, start_second: int) -> bool:
 def _abandoned(folder: Path) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         owned = [name for name in folders + files if is_owned_name(name)]
-        # What is being written there is its owner's alone.
+        # Unfinished folders belong to their owners and are not searched.
         folders[:] = [name for name in folders if name not in owned]
         for name in owned:
             path = Path(place, name)

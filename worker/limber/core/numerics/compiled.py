@@ -1,8 +1,9 @@
-"""How the kernels are compiled: once, into the user's cache folder.
+"""Compilation of the kernels: once, into the user's cache folder.
 
-numba keeps compiled code beside the source by default. An installed Limber may be read-only, and
-Blender's and the user's Python differ, so it goes to the user's cache folder instead; an explicit
-NUMBA_CACHE_DIR wins. Where no folder can be written the kernels are compiled for the process.
+By default numba stores compiled code beside the source. An installed Limber may be read-only, and
+Blender's Python differs from the user's, so the user's cache folder is used instead; an explicit
+NUMBA_CACHE_DIR takes precedence. If no folder is writable, the kernels are compiled for the
+process.
 """
 
 import contextlib
@@ -26,14 +27,14 @@ from limber.core.errors import DamagedCacheWarning
 
 
 def cache_folder() -> Path | None:
-    """Return the folder for compiled kernels, or None if it cannot be written to."""
+    """Return the folder for compiled kernels, or None if it is not writable."""
     return _writable(Path(os.environ.get("NUMBA_CACHE_DIR")
                           or platformdirs.user_cache_path("limber") / "numba" / _layout()))
 
 
 @functools.cache
 def _writable(folder: Path) -> Path | None:
-    """Make a folder; None where nothing can be written to it. Asked once: kernels are many."""
+    """Make a folder; None if it is not writable. Checked once, as there are many kernels."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -44,20 +45,19 @@ def _writable(folder: Path) -> Path | None:
 
 @functools.cache
 def _layout() -> str:
-    """Digest of how kernels are compiled.
+    """Digest of the compilation options.
 
-    numba finds by itself that a kernel's source has changed; one that was compiled otherwise would
-    be used.
+    numba itself detects a changed source, but would use a kernel compiled with other options.
     """
     return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
 
 
 def compiled(function: Callable) -> Callable:
-    """Compile ``function`` with numba; the result is kept in :func:`cache_folder`."""
+    """Compile ``function`` with numba; the result is stored in :func:`cache_folder`."""
     folder = cache_folder()
-    # Inlined always: a kernel that another calls would otherwise be there twice, optimised in two
-    # ways, and which one runs (and so the last digits) would depend on whether it was compiled
-    # in this process or loaded.
+    # Always inlined: otherwise a kernel that another calls would exist twice, optimised in two
+    # ways. Which one runs (and thus the last digits) would depend on whether it was compiled in
+    # this process or loaded.
     options = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"},
                "forceinline": True}
     if folder is None:
@@ -71,12 +71,12 @@ def compiled(function: Callable) -> Callable:
 
 
 def when_compiling(tell: Callable[[], None]) -> None:
-    """Call ``tell`` once, when the first kernel has to be compiled and is not just read again."""
+    """Call ``tell`` once, when the first kernel is compiled rather than loaded."""
     register("numba:compile", _FirstStart(tell))
 
 
 class _FirstStart(Listener):
-    """Calls a function at the first start that it hears of."""
+    """Calls a function at the first start of a compilation."""
 
     def __init__(self, tell: Callable[[], None]):
         self._tell: Callable[[], None] | None = tell
@@ -87,14 +87,14 @@ class _FirstStart(Listener):
             tell()
 
     def on_end(self, event: Event) -> None:
-        """Who was told of the start knows enough."""
+        """The end of a compilation is not reported."""
 
 
 class _CheckedFile(IndexDataCacheFile):
-    """numba's files of one kernel, each with a checksum behind what numba wrote.
+    """numba's files of one kernel, each with a checksum appended to numba's content.
 
-    numba unpickles what it finds, and hands it to the linker: a file that a full disk or a lost
-    computer cut off would end every command, or the process. Here such a file counts as missing.
+    numba unpickles these files and passes them to the linker. A file truncated by a full disk or a
+    crash would end every command, or the process. Here such a file counts as missing.
     """
 
     def _load_index(self) -> dict:
@@ -103,7 +103,7 @@ class _CheckedFile(IndexDataCacheFile):
     def _load_data(self, name: str) -> Any:
         path = self._data_path(name)
         if not self._is_whole(path):
-            # numba compiles anew where a file is missing.
+            # numba compiles again if a file is missing.
             raise FileNotFoundError(path)
         return super()._load_data(name)
 
@@ -115,7 +115,7 @@ class _CheckedFile(IndexDataCacheFile):
             stream.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
 
     def _is_whole(self, path: str) -> bool:
-        """Whether a file is as it was written, or is not there; one that is damaged is removed."""
+        """Whether a file is undamaged or missing; a damaged one is removed."""
         try:
             content = Path(path).read_bytes()
             if content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest():
@@ -123,7 +123,7 @@ class _CheckedFile(IndexDataCacheFile):
             os.unlink(path)
             _tell_damage(f"The compiled code stored in {path} is damaged. It is compiled again.")
         except FileNotFoundError:
-            # Nothing is kept; or another process has just removed it, and said so.
+            # The file is missing; or another process has just removed it and has warned.
             return True
         except OSError as error:
             _tell_damage(f"The compiled code stored in {path} cannot be read or replaced "
@@ -139,17 +139,17 @@ _damage_told: list[str] = []
 
 
 def _tell_damage(message: str) -> None:
-    """Warn, once in a process: where one file is damaged, others mostly are too."""
+    """Warn once per process: if one file is damaged, others usually are too."""
     if not _damage_told:
         _damage_told.append(message)
         warnings.warn(message, DamagedCacheWarning, stacklevel=2)
 
 
 def _forgiving(kernel: Any) -> Any:
-    """Let a kernel be compiled anew where what is kept of it cannot be used, or nothing be kept.
+    """Compile a kernel again if its cached form is unusable, or do not cache it.
 
-    Types of arguments are kept by module and name. After an update that moves one, numba reads
-    the old entry before it sees that the source has changed, and fails.
+    Argument types are cached by module and name. After an update that moves one, numba reads the
+    old entry before it notices the changed source, and fails.
     """
     cache = getattr(kernel, "_cache", None)  # there is none where numba is told not to compile
     if cache is None:
@@ -169,7 +169,7 @@ def _forgiving(kernel: Any) -> Any:
         try:
             save(signature, data)
         except OSError as error:
-            # The kernel is compiled: that it is not kept costs time, no result.
+            # The kernel is compiled; without caching it only costs time.
             _tell_damage(f"Compiled code cannot be stored in {cache.cache_path} "
                          f"({error.strerror}). Every run compiles it again.")
     cache.load_overload, cache.save_overload = load_or_forget, save_or_tell
@@ -177,5 +177,5 @@ def _forgiving(kernel: Any) -> Any:
 
 
 def for_kernels(array: np.ndarray) -> np.ndarray:
-    """Return floats in C order that may be written to: kernels are compiled for no other kind."""
+    """Return writable floats in C order: kernels are compiled for no other kind."""
     return np.require(array, float, "CW")

@@ -1,8 +1,8 @@
 """Rigid transforms of arrays: rotations, poses, their interpolation, the rigid motion that fits.
 
 A rotation is a vector [3] in rad or a matrix [3, 3]; a pose [6] is a position in m and a rotation
-vector; a frame [4, 4] is its homogeneous matrix. The loops at a controller's rate use
-:mod:`limber.core.numerics.rigid_kernels`, which take one at a time.
+vector; a frame [4, 4] is its homogeneous matrix. Loops at a controller's rate use
+:mod:`limber.core.numerics.rigid_kernels`, which takes one at a time.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import scipy
 
 
 def _rotations(vectors: np.ndarray) -> "scipy.spatial.transform.Rotation":
-    # A copy: scipy takes no array that must not be written to.
+    # A copy: scipy does not accept read-only arrays.
     return scipy.spatial.transform.Rotation.from_rotvec(np.array(vectors, float))
 
 
@@ -35,12 +35,12 @@ def rotated(vectors: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def composed(second: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors [rad] of ``first`` and then ``second``, in fixed axes."""
+    """Return the rotation vectors [rad] of ``first`` followed by ``second``, in fixed axes."""
     return (_rotations(second) * _rotations(first)).as_rotvec()
 
 
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors [rad] that lead from some rotation vectors to others."""
+    """Return the relative rotation vectors [rad] from some rotation vectors to others."""
     return (_rotations(second) * _rotations(first).inv()).as_rotvec()
 
 
@@ -50,11 +50,11 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def pose_between(first: np.ndarray, second: np.ndarray, part: float | np.ndarray) -> np.ndarray:
-    """Return poses at the fraction ``part`` of a straight line and the shortest rotation.
+    """Return poses at fraction ``part`` of a straight line and the shortest rotation.
 
     Args:
         first, second: Poses, shape [6] or [n, 6].
-        part: One number, or one for each pose that is returned, shape [n].
+        part: One number, or one per returned pose, shape [n].
     """
     part = np.asarray(part)[..., None]
     turns = part * turn_between(first[..., 3:], second[..., 3:])
@@ -67,8 +67,8 @@ def rotations_at(times: np.ndarray, vectors: np.ndarray, wanted: np.ndarray) -> 
 
     Args:
         times: Ascending, shape [n], n > 1.
-        vectors: Of those times, shape [n, 3].
-        wanted: Within them, shape [m].
+        vectors: Rotation vectors at those times, shape [n, 3].
+        wanted: Times within that range, shape [m].
     """
     return scipy.spatial.transform.Slerp(times, _rotations(vectors))(wanted).as_rotvec()
 
@@ -109,22 +109,22 @@ def inverted(frames: np.ndarray) -> np.ndarray:
 
 
 def closest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a matrix [3, 3]; never a mirror image."""
+    """Return the rotation nearest to a matrix [3, 3]; never a reflection."""
     left, _, right = np.linalg.svd(matrix)
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
 def rigid_fit(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] that take ``points`` onto ``target`` (Kabsch), [n, 3]."""
+    """Rotation [3, 3] and translation [3] that map ``points`` onto ``target`` (Kabsch), [n, 3]."""
     centre, goal = points.mean(axis=0), target.mean(axis=0)
     turn = closest_rotation((target - goal).T @ (points - centre))
     return turn, goal - turn @ centre
 
 
 def principal_axes(points: np.ndarray) -> np.ndarray:
-    """Return unit vectors along which points [n, d] spread about their mean, the widest first.
+    """Return unit vectors of the principal axes of points [n, d], the largest spread first.
 
-    They are rows. Their signs are open.
+    They are rows. Their signs are arbitrary.
     """
     return np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
 

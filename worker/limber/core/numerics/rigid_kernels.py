@@ -1,6 +1,6 @@
-"""Rigid transforms one at a time, compiled: what the loops at the controller's rate use.
+"""Rigid transforms one at a time, compiled, for loops at the controller's rate.
 
-Arrays of poses go through :mod:`limber.core.numerics.rigid`; here a call takes about a microsecond.
+Arrays of poses use :mod:`limber.core.numerics.rigid`; here a call takes about a microsecond.
 """
 
 import math
@@ -14,7 +14,7 @@ from limber.core.numerics.compiled import compiled
 @compiled
 def rotation_vector(frame: np.ndarray) -> np.ndarray:
     """Return the rotation vector [rad] of a frame [4, 4] or rotation matrix [3, 3]."""
-    # Through the quaternion with the largest component, which loses no digits at half a turn.
+    # Through the quaternion with the largest component, which loses no digits near half a turn.
     m00, m11, m22 = frame[0, 0], frame[1, 1], frame[2, 2]
     squares = np.array([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22,
                         1 - m00 - m11 + m22])
@@ -84,13 +84,13 @@ def inverse_of(frame: np.ndarray) -> np.ndarray:
 
 @compiled
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the rotation vector that leads from one pose's rotation to another's [rad]."""
+    """Return the relative rotation vector from one pose's rotation to another's [rad]."""
     return rotation_vector(frame_of(second) @ inverse_of(frame_of(first)))
 
 
 @compiled
 def pose_between(first: np.ndarray, second: np.ndarray, part: float) -> np.ndarray:
-    """Return the pose at the fraction ``part`` of a straight line and the shortest rotation."""
+    """Return the pose at fraction ``part`` of a straight line and the shortest rotation."""
     turn = np.zeros(6)
     turn[3:] = part * turn_between(first, second)
     turned = frame_of(turn) @ frame_of(first)
@@ -119,12 +119,12 @@ def crossed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 @compiled
 def weight_wrench(mass: float, centre: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Return what a mass at the flange pulls with, flange frame, shape [6] in N and N m.
+    """Return the wrench of gravity on a mass at the flange, flange frame, shape [6] in N and N m.
 
     Args:
         mass: [kg].
-        centre: Of mass, flange frame [m], shape [3].
-        rotation: Of the flange in a frame whose z points up, shape [3, 3].
+        centre: Centre of mass, flange frame [m], shape [3].
+        rotation: Rotation of the flange in a frame with z up, shape [3, 3].
     """
     wrench = np.empty(6)
     for k in range(3):

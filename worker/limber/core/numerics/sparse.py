@@ -1,7 +1,7 @@
-"""Solvers for sparse symmetric matrices: which library, called how.
+"""Solvers for sparse symmetric matrices: choice of library and common interface.
 
-CHOLMOD (through cvxopt) where it is installed, else SuperLU from scipy. Limber's own factor, for
-branches, is :mod:`limber.mechanics.linear.supernodal`.
+CHOLMOD (through cvxopt) if installed, else SuperLU from scipy. Limber's own factorisation for
+branches is :mod:`limber.mechanics.linear.supernodal`.
 """
 
 from typing import TYPE_CHECKING
@@ -20,13 +20,12 @@ class NotPositiveDefiniteError(ArithmeticError):
 
 
 class CholmodFactor:
-    """Supernodal Cholesky factor of a matrix whose pattern stays; the symbolic part is made once.
+    """Supernodal Cholesky factor of a matrix with a fixed pattern, analysed once.
 
     Args:
         rows, columns: Entries of the lower triangle by columns, sorted, shape [nnz].
         size: Rows of the matrix.
-        is_ordered: Whether rows are in a good order of elimination already; else CHOLMOD finds
-            one.
+        is_ordered: Whether rows are already in a good elimination order; else CHOLMOD finds one.
     """
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int, *,
@@ -35,7 +34,7 @@ class CholmodFactor:
 
         self._matrix = spmatrix(1.0, matrix(rows.astype(np.int64)),
                                 matrix(columns.astype(np.int64)), (size, size))
-        # A numpy view on cvxopt's own memory: one copy less for each factorisation.
+        # A numpy view of cvxopt's memory saves a copy per factorisation.
         self._values = matrix(0.0, (len(rows), 1))
         self._view = np.asarray(self._values)[:, 0]
         self._rows, self._columns, self._size = rows, columns, size
@@ -65,7 +64,7 @@ class CholmodFactor:
             raise NotPositiveDefiniteError("a pivot is not positive") from error
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return the solution for right sides of shape [size] or [size, k]."""
+        """Return the solution for right-hand sides of shape [size] or [size, k]."""
         from cvxopt import cholmod, matrix
 
         work = matrix(np.asfortranarray(right.reshape(self._size, -1)))
@@ -74,7 +73,7 @@ class CholmodFactor:
 
 
 class SuperLuFactor:
-    """The same from scipy, about five times slower and without a reused symbolic part."""
+    """The scipy equivalent, about five times slower and without a reused symbolic part."""
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int, *,
                  is_ordered: bool = True):
@@ -110,7 +109,7 @@ class SuperLuFactor:
 
 def general_factor(rows: np.ndarray, columns: np.ndarray, size: int, *,
                    is_ordered: bool = True) -> CholmodFactor | SuperLuFactor:
-    """Return a factor of the faster library that is installed; arguments as for CholmodFactor."""
+    """Return a factor of the fastest installed library; arguments as for CholmodFactor."""
     kind = CholmodFactor if has_cholmod() else SuperLuFactor
     return kind(rows, columns, size, is_ordered=is_ordered)
 

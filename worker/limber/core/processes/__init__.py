@@ -1,4 +1,4 @@
-"""Processes: a pool for parts of a computation, stages as processes of their own, their end.
+"""Processes: a pool for parallel computation, stages as separate processes, their termination.
 
 It depends only on errors and progress, so that every package may use it.
 """

@@ -1,8 +1,8 @@
-"""How many processes may compute side by side: cores and memory, shared out to who is below.
+"""Number of parallel processes: cores and memory, divided among child processes.
 
-A process that starts others hands each a share of its own cores in the environment variable
-``LIMBER_CORES``; what runs there shares out no more than that, however deep. A user may set it
-to leave cores to other programs.
+A process that starts others passes each a part of its own cores in the environment variable
+``LIMBER_CORES``. A child process divides no more than that among its own children. A user may set
+the variable to reserve cores for other programs.
 """
 
 import os
@@ -12,7 +12,7 @@ from limber.core.errors import InputError
 
 CORES = "LIMBER_CORES"
 _SPARED_MEMORY = 0.15
-"""Share of the free memory that is left alone: estimates of a task's need are rough."""
+"""Fraction of the free memory that is left unused: estimates of a task's need are rough."""
 
 
 def core_budget() -> int:
@@ -40,9 +40,10 @@ def worker_count(task_count: int, *, wanted: int | None = None,
     """Return how many processes to start for ``task_count`` tasks, at least 1.
 
     Args:
-        task_count: More processes than tasks would idle.
-        wanted: What the user asked for; the budget holds all the same.
-        memory_mb_each: What a task may need; as many run as the free memory has room for.
+        task_count: Number of tasks; more processes would idle.
+        wanted: Number requested by the user; the budget still applies.
+        memory_mb_each: Estimated memory per task; only as many processes run as fit into the free
+        memory.
     """
     count = min(core_budget(), max(task_count, 1), wanted or task_count or 1)
     if memory_mb_each > 0:
@@ -52,7 +53,7 @@ def worker_count(task_count: int, *, wanted: int | None = None,
 
 
 def free_memory_mb() -> float:
-    """Return the memory [MB] that may still be used, also where a container has less."""
+    """Return the memory [MB] still available, also within a container's limit."""
     import psutil
 
     free = psutil.virtual_memory().available
@@ -64,7 +65,7 @@ def free_memory_mb() -> float:
 
 
 def _machine_cores() -> int:
-    """Cores that the system lets this process use: affinity, and a container's quota."""
+    """Cores that the system allows this process: affinity, and a container's quota."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
         os.cpu_count() or 1)
     try:
@@ -72,7 +73,7 @@ def _machine_cores() -> int:
         if quota != "max":
             cores = min(cores, max(int(int(quota) / int(period)), 1))
     except (OSError, ValueError):
-        # No container, or of another kind.
+        # No container, or one of another kind.
         return cores or 1
     return cores or 1
 
@@ -81,5 +82,5 @@ def _number(path: Path) -> int | None:
     try:
         return int(path.read_text(encoding="ascii"))
     except (OSError, ValueError):
-        # Not there, or "max".
+        # Missing, or "max".
         return None

@@ -1,4 +1,4 @@
-"""A module of ours as a process, for compiled code that may crash, hang or flood the memory."""
+"""A Limber module as a process, for compiled code that may crash, hang or exhaust the memory."""
 
 import os
 import subprocess
@@ -19,17 +19,18 @@ def run_module(module: str, arguments: list[str], name: str, limits: Limits, *,
 
     Args:
         module: Its full name.
-        arguments: Before the process id of this process.
-        name: What it does, for messages.
-        limits: What it may take.
-        folder: Where it runs, if not here.
-        waiting: Called while it runs with the seconds so far; what it raises ends the process.
+        arguments: Arguments before this process's id.
+        name: Description of the task, for messages.
+        limits: Limits of the process.
+        folder: Its working directory, if not the current one.
+        waiting: Called while it runs with the elapsed seconds; an exception from it ends the
+        process.
 
     Returns:
-        The exit code, and the last line on standard error (empty without one).
+        The exit code, and the last line on standard error (empty if there is none).
 
     Raises:
-        WorkError: it went over its limits.
+        WorkError: it exceeded its limits.
     """
     command = [sys.executable, "-m", module, *arguments, str(os.getpid())]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -1,7 +1,7 @@
-"""Processes end with the one that started them, however that one ended.
+"""Processes end with their parent, however that ended.
 
-Everywhere a pipe to the parent closes when it ends, and a thread waits for that. On Linux the
-kernel ends the process too, also while native code keeps that thread from running.
+On every system a pipe to the parent closes when the parent ends, and a thread waits for that. On
+Linux the kernel also ends the process, even while native code blocks that thread.
 """
 
 import _thread
@@ -14,30 +14,30 @@ import threading
 from collections.abc import Callable
 
 PARENT_PIPE = "LIMBER_PARENT_PIPE"
-"""Set to ``stdin`` by a parent that keeps our standard input open as long as it lives."""
+"""Set to ``stdin`` by a parent that keeps the child's standard input open as long as it lives."""
 _PR_SET_PDEATHSIG = 1
 
 
 def end_by_kernel(parent_id: int) -> None:
-    """On Linux: let the kernel kill this process when the thread that started it ends."""
+    """On Linux: have the kernel kill this process when the thread that started it ends."""
     if sys.platform != "linux":
         return
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_id:
-        # It ended before we asked.
+        # The parent ended before the request.
         os._exit(1)
 
 
 def end_with_parent_pipe(grace_seconds: float = 10.0) -> None:
-    """If the parent holds our standard input open: when that closes, cancel, and then end.
+    """If the parent holds this standard input open: when it closes, cancel, and then exit.
 
-    The main thread gets a KeyboardInterrupt, so that work in progress is cleared away; after
-    ``grace_seconds`` the process ends whatever it does.
+    The main thread gets a KeyboardInterrupt, so that it can clean up. After ``grace_seconds`` the
+    process exits in any case.
     """
     if os.environ.pop(PARENT_PIPE, None) != "stdin":
         return
 
-    # Nobody else shall wait for input there, nor hold it open.
+    # No other code may wait for input there or hold it open.
     handle = os.dup(0)
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
@@ -58,7 +58,7 @@ def _when_closed(handle: int, then: Callable[[], None]) -> None:
             while os.read(handle, 1024):
                 continue
         except OSError:
-            # A pipe that broke has closed too.
+            # A broken pipe counts as closed.
             pass
         then()
 
@@ -66,12 +66,12 @@ def _when_closed(handle: int, then: Callable[[], None]) -> None:
 
 
 def end_by_closing(process: subprocess.Popen, seconds: float = 5.0) -> None:
-    """Close a child's standard input, which makes it end; kill it if it does not end in time."""
+    """Close a child's standard input, which makes it exit; kill it if it does not exit in time."""
     if process.stdin is not None and not process.stdin.closed:
         try:
             process.stdin.close()
         except OSError:
-            # It ended with a line on the way.
+            # It exited while a line was being written.
             process.kill()
     try:
         process.wait(seconds)

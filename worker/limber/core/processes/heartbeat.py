@@ -1,9 +1,9 @@
-"""A heartbeat beside the progress: it distinguishes a worker that hangs from one that works.
+"""A heartbeat beside the progress: it distinguishes a hanging worker from a busy one.
 
-Work may be silent for long (one factorisation, a process that meshes). A thread says every few
-seconds ``{"alive": seconds, "cpu_s": seconds}``: how long the command runs, and how much its
-processes have computed. Where the second stands still nothing is computed; where no line comes the
-process is stopped, or native code keeps every thread of it from running.
+Work may be silent for long (one factorisation, a meshing process). Every few seconds a thread
+writes ``{"alive": seconds, "cpu_s": seconds}``: the running time of the command, and the processor
+time of its processes. If the second number is constant, nothing is computed. If no line comes, the
+process is stopped, or native code blocks all its threads.
 """
 
 import os
@@ -18,11 +18,11 @@ INTERVAL_SECONDS = 2.0
 
 
 class Heartbeat:
-    """Reports this process to ``say`` while the ``with`` block runs.
+    """Reports this process to ``say`` during the ``with`` block.
 
     Args:
         say: Receives the numbers, from another thread.
-        interval_seconds: Between one and the next.
+        interval_seconds: Interval between reports.
     """
 
     def __init__(self, say: Callable[[dict[str, Any]], None],
@@ -38,7 +38,7 @@ class Heartbeat:
 
     def __exit__(self, *_exception: object) -> None:
         self._ended.set()
-        # What comes last on the stream is the result.
+        # The last line of the stream is the result.
         self._thread.join()
 
     def _beat(self) -> None:

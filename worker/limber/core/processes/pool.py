@@ -1,9 +1,9 @@
-"""One pool of processes for all that is computed side by side.
+"""A process pool for all parallel computation.
 
-Python's own pool is broken as a whole by one process that is killed, and others let their
-processes share a pipe, which one killed in the middle of a message spoils for all. Here each
-process has a pipe of its own, over which tasks, progress, cancelling and results go: a process
-may be killed at any moment, for its time, its memory or a crash, and only its task fails.
+Python's own pool breaks as a whole when one process is killed. In other pools the processes share a
+pipe, and a process killed in the middle of a message corrupts it for all. Here each process has its
+own pipe for tasks, progress, cancelling and results. A process may be killed at any moment, because
+of time, memory or a crash, and only its task fails.
 """
 
 import atexit
@@ -33,17 +33,17 @@ from limber.core.progress import SILENT, Progress
 
 _TICK_SECONDS = 0.1
 _GRACE_SECONDS = 3.0
-"""How long a cancelled task has to come to its next report before its process is killed."""
+"""Time until a cancelled task must make its next report before its process is killed."""
 
 
 class Pool:
-    """Processes that compute what they are given; close it, or use it in a ``with``.
+    """Processes that compute tasks; close the pool, or use it in a ``with``.
 
     Args:
-        workers: How many processes; by default the core budget, which they divide among them.
+        workers: Number of processes; by default the core budget, which is divided among them.
         begin: Called in each process before its first task.
-        begin_arguments: For it.
-        name: What is computed, for messages.
+        begin_arguments: Arguments of ``begin``.
+        name: Description of the computation, for messages.
     """
 
     def __init__(self, workers: int | None = None, *, begin: Callable[..., None] | None = None,
@@ -65,10 +65,10 @@ class Pool:
 
     def submit(self, function: Callable, *arguments: Any, limits: Limits = UNLIMITED,
                progress: Progress = SILENT) -> Future:
-        """Have ``function(*arguments)`` computed, both picklable; returns its future at once.
+        """Submit ``function(*arguments)``, both picklable; returns its future at once.
 
-        A function that takes ``progress`` gets one whose reports come to the ``progress`` given
-        here, from another thread.
+        A function that takes ``progress`` gets one whose reports are passed to the ``progress``
+        given here, from another thread.
         """
         job = Job(Task(function, arguments), limits, progress)
         with self._guard:
@@ -80,18 +80,18 @@ class Pool:
 
     def map(self, function: Callable, tasks: Sequence[tuple], *, limits: Limits = UNLIMITED,
             progress: Progress = SILENT, message: str = "") -> list:
-        """Return ``[function(*task) for task in tasks]``, in this order, computed side by side.
+        """Return ``[function(*task) for task in tasks]``, in this order, computed in parallel.
 
         Args:
             function: May take ``progress``.
-            tasks: Its arguments, once for each call.
-            limits: Of each call.
-            progress: Gets the mean of the calls' fractions, ``message``, how many are done, and
-                ``remaining_s`` once that is known. Cancelling it stops all.
-            message: What is being done.
+            tasks: Its arguments, once per call.
+            limits: Limits of each call.
+            progress: Gets the mean of the calls' fractions, ``message``, the number of finished
+                calls, and ``remaining_s`` once known. Cancelling it stops all.
+            message: Description of the work.
 
         Raises:
-            WorkError: a process crashed or went over its limits.
+            WorkError: a process crashed or exceeded its limits.
             Exception: the first error of a call; the other calls are stopped.
         """
         course = _Course(len(tasks), progress, message)
@@ -122,7 +122,7 @@ class Pool:
             wait([job.future for job in jobs], _GRACE_SECONDS + 5)
 
     def close(self) -> None:
-        """End the processes at once; what has not been computed is cancelled."""
+        """End the processes at once; unfinished tasks are cancelled."""
         atexit.unregister(self.close)
         self._closing.set()
         self._ring()
@@ -138,7 +138,7 @@ class Pool:
         try:
             self._bell_button.send_bytes(b"!")
         except OSError:
-            # Closed: nobody listens any more.
+            # The pool is closed: there is no receiver any more.
             return
 
     def _manage(self) -> None:
@@ -149,7 +149,7 @@ class Pool:
                 self._listen()
                 self._enforce()
         except Exception as error:
-            # No process could be started, for one: nobody shall wait for ever.
+            # For example no process could be started: no caller may wait for ever.
             reason = error
         finally:
             self._closing.set()
@@ -163,7 +163,7 @@ class Pool:
             self._bell_button.close()
 
     def _fill(self) -> None:
-        """Give waiting tasks to idle processes; start processes that are needed."""
+        """Assign waiting tasks to idle processes; start processes as needed."""
         with self._guard:
             if self._broken is not None:
                 waiting, self._waiting = list(self._waiting), deque()
@@ -193,7 +193,7 @@ class Pool:
             self._hear(worker)
 
     def _hear(self, worker: Worker) -> None:
-        """Take in all that a process has said; it may have ended after it."""
+        """Receive all messages of a process; it may have ended after sending them."""
         try:
             while worker.pipe.poll():
                 self._take(worker, worker.pipe.recv())
@@ -202,7 +202,7 @@ class Pool:
             worker.process.join(_GRACE_SECONDS)
             has_ended = True
         except Exception as error:
-            # What it sent cannot be unpickled here.
+            # The message cannot be unpickled here.
             self._end(worker, WorkError(f"The result of {self.name} could not be read: {error!r}."))
             return
         if has_ended:
@@ -227,7 +227,7 @@ class Pool:
                 self._broken = said.error
 
     def _enforce(self) -> None:
-        """Stop what was cancelled or has gone over its limits."""
+        """Stop tasks that were cancelled or have exceeded their limits."""
         now = time.monotonic()
         for worker in list(self._workers):
             job = worker.job
@@ -247,12 +247,12 @@ class Pool:
         if worker.job is not None:
             worker.take_job().fail(error)
         elif not worker.has_begun and not self._closing.is_set():
-            # The next one would end in the same way.
+            # The next process would fail in the same way.
             self._broken = self._broken or error
 
 
 class _Course:
-    """How far many calls are together."""
+    """Overall progress of several calls."""
 
     def __init__(self, count: int, progress: Progress, message: str):
         self._fractions = [0.0] * count
@@ -260,7 +260,7 @@ class _Course:
         self._started = time.monotonic()
 
     def part(self, number: int, *, is_here: bool = False) -> Progress:
-        """Progress of a call; in this process it is passed on at once: a cancel reaches it so."""
+        """Progress of a call; passed on at once in this process, so that it can be cancelled."""
         def hear(fraction: float, _message: str, _numbers: dict[str, Any]) -> None:
             self._fractions[number] = fraction
             if is_here:
@@ -280,17 +280,17 @@ class _Course:
 
 def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None = None,
               progress: Progress = SILENT, message: str = "") -> list:
-    """Return ``[function(*task) for task in tasks]``: side by side where cores allow.
+    """Return ``[function(*task) for task in tasks]``, in parallel if cores allow.
 
-    Where they do not, or there is one task, it is computed here, without a process: the results
-    are the same. See :meth:`Pool.map`.
+    Otherwise, or with a single task, it is computed in this process; the results are the same. See
+    :meth:`Pool.map`.
 
     Args:
         function: May take ``progress``.
-        tasks: Its arguments, once for each call.
-        workers: Largest number of processes; by default the core budget.
-        progress: Of all together.
-        message: What is being done.
+        tasks: Its arguments, once per call.
+        workers: Most processes; by default the core budget.
+        progress: Overall progress.
+        message: Description of the work.
     """
     count = worker_count(len(tasks), wanted=workers)
     if count > 1:

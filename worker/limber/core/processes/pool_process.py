@@ -1,4 +1,4 @@
-"""What runs in a process of the pool: it takes tasks from its pipe until that closes."""
+"""Main loop of a pool process: it takes tasks from its pipe until the pipe closes."""
 
 import inspect
 import os
@@ -52,7 +52,7 @@ class Reported:
 
 @dataclass(frozen=True)
 class CacheDamaged:
-    """A warning about a damaged cache, from whatever the process does."""
+    """A warning about a damaged cache, from any code in the process."""
 
     message: str
 
@@ -66,20 +66,20 @@ class Returned:
 
 @dataclass(frozen=True)
 class Failed:
-    """A task's error; before any task: that of the pool's beginning."""
+    """A task's error; before any task, the error of the pool's ``begin``."""
 
     error: BaseException
 
 
 def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) -> None:
-    """Do the tasks that come over ``pipe``; ends when it closes, with the parent or the pool.
+    """Execute the tasks that come over ``pipe``; ends when it closes, with the parent or the pool.
 
     Args:
-        pipe: Tasks come in, and None to cancel the one at work; progress and results go out.
-        begin: What to call first, and its arguments.
+        pipe: Receives tasks, and None to cancel the current one; sends progress and results.
+        begin: Function to call first, and its arguments.
         cores: This process's part of the core budget.
     """
-    # Ctrl-C reaches the whole group of processes; the parent ends this one in order.
+    # Ctrl-C reaches the whole process group; the parent ends this process in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ[CORES] = str(cores)
     parent = parent_process()
@@ -110,7 +110,7 @@ def _work(tasks: "queue.SimpleQueue[Task]", voice: "_Voice",
 
 
 class _Voice:
-    """Sends over the pipe; a task's progress goes through it and is cancelled by it."""
+    """Sends over the pipe; progress of a task goes through it, and it can cancel the task."""
 
     def __init__(self, pipe: Connection):
         self._pipe = pipe
@@ -127,7 +127,7 @@ class _Voice:
             with self._guard:
                 self._pipe.send(said)
         except OSError:
-            # Nobody listens any more.
+            # There is no receiver any more.
             os._exit(1)
 
     def _report(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
@@ -145,7 +145,7 @@ def _receive(pipe: Connection, tasks: "queue.SimpleQueue[Task]", voice: _Voice) 
         try:
             said = pipe.recv()
         except (EOFError, OSError):
-            # The parent ended, or wants no more of us: nothing here is worth finishing.
+            # The parent ended or closed the pool: no work here needs to be finished.
             os._exit(0)
         except Exception as error:
             # A task that cannot be unpickled here.
@@ -159,7 +159,7 @@ def _receive(pipe: Connection, tasks: "queue.SimpleQueue[Task]", voice: _Voice) 
 
 
 def _sendable(error: BaseException) -> BaseException:
-    """Return the error as it can be sent: with its trace as a note, if it is one of a bug."""
+    """Return the error in a form that can be sent; a bug has its traceback as a note."""
     import pickle
 
     if not isinstance(error, LimberError):

@@ -1,4 +1,4 @@
-"""A process of the pool as the pool sees it, and the tasks that are waited for."""
+"""A process of the pool as seen by the pool, and the pending tasks."""
 
 import time
 from concurrent.futures import Future
@@ -15,7 +15,7 @@ from limber.core.progress import Progress
 
 @dataclass
 class Job:
-    """A task, what it may take, and who waits for it."""
+    """A task, its limits, and its future."""
 
     task: Task
     limits: Limits
@@ -34,7 +34,7 @@ class Job:
 
     def cancel(self) -> None:
         if self.future.cancel():
-            # Nobody else will tell those who wait for it.
+            # No other code will notify the callers.
             self.future.set_running_or_notify_cancel()
         else:
             self._end_soon()
@@ -75,7 +75,7 @@ class Worker:
         try:
             self.pipe.send(job.task)
         except OSError:
-            # It has just died; that is seen, and told to the task, in the next round.
+            # It has just died; the next round notices this and fails the task.
             return
         except Exception as error:
             self.take_job().fail(error)
@@ -85,7 +85,7 @@ class Worker:
         return job
 
     def broken(self) -> WorkError | None:
-        """Return which limit the task has broken; None as long as it keeps them."""
+        """Return which limit the task has exceeded; None if none."""
         return self._watch.broken() if self._watch else None
 
     def cancel_once(self) -> None:

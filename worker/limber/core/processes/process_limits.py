@@ -1,4 +1,4 @@
-"""What a process may take, and whether it has taken more."""
+"""Limits of a process, and their check."""
 
 import time
 from dataclasses import dataclass
@@ -12,11 +12,12 @@ class Limits:
     """Limits of a task; its process is killed when it exceeds them.
 
     Attributes:
-        seconds: From its beginning, or None.
-        memory_mb: Of its process and all that it started, or None.
-        computed_seconds: Processor time of its process and all that it started, or None. A machine
-            that is busy with other work does not use it up.
-        idle_seconds: In a row without any processor time, or None: it waits for what never comes.
+        seconds: From its start, or None.
+        memory_mb: Memory of its process and all descendants, or None.
+        computed_seconds: Processor time of its process and all descendants, or None. Other load on
+            the machine does not count.
+        idle_seconds: Longest time without any processor time, or None; detects a process that waits
+        in vain.
     """
 
     seconds: float | None = None
@@ -29,13 +30,13 @@ UNLIMITED = Limits()
 
 
 class LimitWatch:
-    """Holds a process against limits, from now on.
+    """Checks a process against limits, from now on.
 
     Args:
-        name: What it does, for messages.
-        limits: What it may take.
-        process_id: Whose memory counts, with that of all that it started.
-        memory_interval: Between two looks at the memory and the processor time [s].
+        name: Description of the task, for messages.
+        limits: Limits of the process.
+        process_id: Process whose memory counts, including its descendants.
+        memory_interval: Time between two checks of memory and processor time [s].
     """
 
     def __init__(self, name: str, limits: Limits, process_id: int, memory_interval: float = 0.5):
@@ -46,11 +47,11 @@ class LimitWatch:
 
     @property
     def seconds(self) -> float:
-        """How long it has been watched."""
+        """Time since the start of the checks."""
         return time.monotonic() - self._began
 
     def broken(self) -> WorkError | None:
-        """Return which limit the process has broken; None as long as it keeps them."""
+        """Return which limit the process has exceeded; None if none."""
         seconds, memory_limit = self.seconds, self._limits.memory_mb
         if self._limits.seconds is not None and seconds > self._limits.seconds:
             return WorkError(f"{self._name} was stopped after {seconds:.0f} s.",

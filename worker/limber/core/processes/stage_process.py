@@ -1,4 +1,4 @@
-"""One stage as a process: its progress relayed, its result returned, ended with its parent."""
+"""One stage as a process: its progress is relayed, its result returned; it ends with its parent."""
 
 import math
 import os
@@ -24,17 +24,18 @@ _TICK_SECONDS = 0.1
 
 
 def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str, Any]:
-    """Run ``limber ARGUMENTS`` in a process of its own and return its JSON result.
+    """Run ``limber ARGUMENTS`` in a separate process and return its JSON result.
 
-    Memory and native crashes stay in that process. A cancel of ``progress``, or Ctrl-C, ends it.
+    Memory and native crashes are confined to that process. Cancelling ``progress``, or Ctrl-C, ends
+    it.
 
     Args:
         arguments: The stage and its options.
-        progress: Gets what it reports.
+        progress: Gets the reports of the stage.
 
     Raises:
         LimberError: the stage's own error, by its exit code; :class:`WorkError` if it crashed or
-            went over its limits.
+            exceeded its limits.
     """
     command = [sys.executable, "-m", "limber", *map(str, arguments),
                "--json", "--progress", "json"]
@@ -48,13 +49,13 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
     """Run a program that writes progress and result as stages do; returns its result.
 
     Args:
-        name: What it is called in an error.
-        command: The program and its arguments. It gets a standard input that closes when this
-            process ends, and ``LIMBER_PARENT_PIPE=stdin`` to tell it so.
-        progress: Gets what it reports.
-        limits: What it may take.
-        cores: How many of our cores it may use; all of them by default.
-        fix: What to do when it ends without a result.
+        name: Its name in error messages.
+        command: The program and its arguments. Its standard input closes when this process ends;
+            ``LIMBER_PARENT_PIPE=stdin`` informs it of that.
+        progress: Gets the reports of the stage.
+        limits: Limits of the process.
+        cores: Number of our cores it may use; all by default.
+        fix: What to do if it ends without a result.
 
     Raises:
         LimberError: as :func:`run_stage`.
@@ -81,7 +82,7 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
 
 def _followed(name: str, process: subprocess.Popen, progress: Progress,
               limits: Limits) -> dict[str, Any]:
-    """Relay what the process reports until it has ended; returns its result."""
+    """Relay the reports of the process until it has ended; return its result."""
     lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
     reader.start()
@@ -93,7 +94,7 @@ def _followed(name: str, process: subprocess.Popen, progress: Progress,
         except queue.Empty:
             line = ""
         if line is None or (not line and process.poll() is not None):
-            # A grandchild may keep the pipe open; what matters was said by then.
+            # A grandchild may keep the pipe open; the relevant lines have been read by then.
             process.wait()
             return result
         result = _taken(line, progress) or result
@@ -111,7 +112,7 @@ def _read(stream: TextIO, lines: "queue.SimpleQueue[str | None]") -> None:
 
 
 def _taken(line: str, progress: Progress) -> dict[str, Any]:
-    """Pass a line of progress on; returns what it holds if it is a result."""
+    """Pass a line of progress on; return its content if it is a result."""
     content = json_object(line)
     if content is None:
         return {}
@@ -137,7 +138,7 @@ def _failure(name: str, code: int, result: dict[str, Any], errors: TextIO,
              fix: str) -> LimberError:
     kind = _ERRORS.get(code, WorkError)
     if result.get("error"):
-        # What to do is kept apart: a command that runs others has other options.
+        # The fix is kept separate: a command that runs others has other options.
         advice = str(result.get("fix") or "")
         return kind(f"{name}: {str(result['error']).removesuffix(advice).rstrip()}", "", advice)
     errors.seek(0)

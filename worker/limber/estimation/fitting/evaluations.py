@@ -23,7 +23,7 @@ class EvaluationEntry:
 class EvaluationLog:
     """Appends one JSON line per evaluation, and reads those of an earlier run.
 
-    The first line names the problem by a digest: of another problem nothing is taken over.
+    The first line has a digest of the problem; evaluations of another problem are not reused.
     """
 
     def __init__(self, path: Path | None, problem: str):

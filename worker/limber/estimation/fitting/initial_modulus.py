@@ -12,31 +12,36 @@ from limber.estimation.forward.observed_path import ObservedPathForward, is_path
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 
 PARTS = (0.25, 0.45, 0.7)
-"""Of a fast pull's frames, how many are fitted before all of them are: over a quarter a branch
-cannot be a whole swing off. The parts between are chosen, not measured."""
+"""Fractions of a fast pull's frames that are fitted first: over a quarter the simulation cannot be
+a whole period off. The fractions between are chosen, not measured.
+"""
 ROUGH_KEYS = 5
-"""Simulated frames of a first fit by force alone: chosen, it only has to lead near."""
+"""Simulated frames of a first fit by force alone. Chosen: it only has to come near."""
 FEWEST_FRAMES = 6
-"""Fewer frames say nothing of a motion."""
+"""Fewest frames that describe a motion."""
 FALL = 0.9
-"""By which log E falls from one control point to the next of a start, as the paper's branches."""
+"""Decrease of log E between neighbouring control points of a start, as in the paper's branches."""
 RAN_OFF = 4.0
-"""Mean squared residual of a first fit by force alone above which it found nothing: of drawn
-branches those that led to the solution ended at 0.9 to 1.8, those that ran off at 11 to 16, with
-moduli up to fiftyfold off under which a branch folds up and each simulation takes long."""
+"""Mean squared residual of a first fit by force alone above which it has failed. Of drawn branches,
+fits that led to the solution ended at 0.9 to 1.8, diverged ones at 11 to 16, with moduli up to
+fiftyfold wrong, under which a branch folds up and each simulation takes long.
+"""
 WORSE = 2.0
-"""So many times as much is left under a force that was followed where its linearisation misled:
-20 times in the one fit seen, where a branch folded up; else less is left than before."""
+"""Increase of the objective by which following the force counts as misled by its linearisation: 20
+times in the one fit seen, where a branch folded up; otherwise it decreases.
+"""
 STIFFER = (1.6, 2.5, 4.0)
-"""What moduli without an equilibrium are raised by: a fit by a drifting force ended with the right
-course along the branch, its tip half as stiff as one that stands; chosen, not tuned."""
+"""Factors by which moduli without an equilibrium are raised. A fit by a drifting force ended with
+the right profile along the branch and a tip half as stiff as one with an equilibrium. Chosen, not
+tuned.
+"""
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:
     """Return ``values`` with all moduli scaled to the measurements.
 
-    How far a force moves a branch depends on force over modulus alone: a few solutions give the
-    scale. Where a force or gravity drives, a few decades are tried instead.
+    The displacement under a force depends on force over modulus alone, so a few solutions give the
+    scale. If a force or gravity drives, a few decades are tried instead.
     """
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
@@ -44,13 +49,13 @@ def scaled_start(objective: Objective, values: Values) -> Values:
 
 
 def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
-    """Fit pulls whose path is watched by their force alone first, without the path.
+    """Fit pulls with an observed path by their force alone first, without the path.
 
-    Far from the solution no force explains both the path and the points; a force as it was read
-    merely moves a branch of wrong moduli too far. Near it, force and path are settled together.
+    Far from the solution no force explains both the path and the points; the measured force merely
+    moves a branch of wrong moduli too far. Near the solution, force and path are fitted together.
 
     Returns:
-        The values, and whether they explain the pulls at all.
+        The values, and whether they explain the pulls.
     """
     observed = [forward for forward in objective.forwards if is_path_observed(forward)]
     if not observed:
@@ -83,7 +88,7 @@ def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
 def _followed(
     rough: Objective, found: Evaluation, observed: list[ObservedPathForward]
 ) -> Evaluation:
-    """Fit on where the force is as a first fit says that it was; there, unless that is worse."""
+    """Continue the fit at the forces from a first fit, unless that is worse."""
     rough.follow_forces(found)
     there = rough.evaluate(found.free, jacobian=True)
     if there is None or there.objective > WORSE * found.objective:
@@ -109,11 +114,11 @@ def _scaled(objective: Objective, values: Values) -> Values:
 
 
 def _step_by_step(objective: Objective, values: Values) -> Values:
-    """Fit the beginning of fast pulls first, then more and more of them.
+    """Fit the beginning of fast pulls first, then increasing parts of them.
 
-    A branch of wrong moduli swings at other frequencies: later in the motion it is anywhere, and
-    a fit to all frames at once ends beside the truth. Over a quarter of the frames it cannot be a
-    whole swing off; what is found there foretells the next part.
+    A branch with wrong moduli oscillates at other frequencies. Later in the motion its phase is
+    arbitrary, and a fit to all frames at once ends at a wrong solution. Over a quarter of the
+    frames it cannot be a whole period off; its result predicts the next part.
     """
     space = objective.space
     likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
@@ -136,10 +141,11 @@ def _force_ratio(forward: Forward, values: Values) -> float | None:
 
 
 def _from_the_stiff_side(objective: Objective, values: Values) -> Values:
-    """Scale the moduli by how far a known force moves the points: simulated over observed.
+    """Scale the moduli by the displacement under a known force: simulated over observed.
 
-    It starts where the branch hardly moves and displacements go with force over modulus; a branch
-    that is far too soft folds up, and its equilibrium takes minutes to be found, or is none.
+    It starts with small motions, where displacements are proportional to force over modulus. A
+    branch that is far too soft folds up, and its equilibrium takes minutes to find, or does not
+    exist.
     """
     young = values.young
     for _ in range(12):
@@ -155,7 +161,7 @@ def _from_the_stiff_side(objective: Objective, values: Values) -> Values:
             seen.append((forward.frames.positions - forward.rest_points)[known])
         ratio = float(np.linalg.norm(np.concatenate(moved))
                       / max(float(np.linalg.norm(np.concatenate(seen))), 1e-12))
-        # A small step to the soft side: a bent branch stiffens, so that the ratio overshoots.
+        # A small step to the soft side: a bent branch stiffens, so the ratio overshoots.
         young = young * np.clip(ratio, 0.2, 1e4)
         if abs(ratio - 1) < 0.05 or ratio <= 0:
             break
@@ -188,15 +194,15 @@ def _scanned(objective: Objective, values: Values) -> Values:
 
 def standing_start(objective: Objective, start: Values, uniform: Values, *, explains: bool = True,
                    ) -> tuple[Values, Evaluation] | None:
-    """Return the start, or one near it where there is an equilibrium, and what is found there.
+    """Return the start, or values near it that have an equilibrium, and their evaluation.
 
-    A fit by force alone can end at moduli that carry no force at all. Then the same ones stiffer
-    are tried; where they explain the pulls no better than others might, the uniform modulus as well
-    and one that falls outwards as of branches, softer or stiffer; the better of what both lead to.
-    None: none of them stands.
+    A fit by force alone can end at moduli that carry no force at all. Then stiffer ones are tried.
+    If they explain the pulls no better than others might, so are the uniform modulus and one that
+    decreases outwards, softer and stiffer; the better result is returned. None: none of them has an
+    equilibrium.
 
     Args:
-        explains: Whether the start explains the pulls at all; else the others come first.
+        explains: Whether the start explains the pulls; otherwise the other starts come first.
     """
     place = np.arange(len(uniform.young))
     falling = np.exp(FALL * (place.mean() - place))
@@ -214,13 +220,13 @@ def standing_start(objective: Objective, start: Values, uniform: Values, *, expl
     other = _first_standing(objective, likely)
     if stiffer is None or other is None or other[1].objective <= stiffer[1].objective:
         return other or stiffer
-    # The simulations go on from where they were last.
+    # Simulations continue from their last state.
     return _first_standing(objective, [stiffer[0]]) or other
 
 
 def _first_standing(objective: Objective, trials: list[Values],
                     ) -> tuple[Values, Evaluation] | None:
-    """Return the first that has an equilibrium; the force is taken as it was read."""
+    """Return the first that has an equilibrium; the force is the measured one."""
     for trial in trials:
         for forward in objective.forwards:
             if is_path_observed(forward):

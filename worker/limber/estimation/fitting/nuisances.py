@@ -1,11 +1,12 @@
 """Errors of cell and sensors as unknowns of a fit, and their effect on the measurements.
 
-Gripper frame, zero and gain of the force, camera frame, clock and slip of the grasp all stay
-through a recording; taken as exact, they end up in the moduli (1 mm of the gripper's pose: over
-60 %). To first order each changes the predicted measurements linearly, so that all of them are
-eliminated from the residuals together with what is known of them beforehand (variable projection,
-Golub and Pereyra 1973, with the prior as further rows). What is left depends on the moduli alone,
-and their covariance has the errors in it; so have the errors their own.
+Gripper frame, zero and gain of the force, camera frame, clock and slip of the grasp are constant
+during a recording. If they are taken as exact, their errors end up in the moduli (1 mm of the
+gripper's pose: over 60 %). To first order each changes the predicted measurements linearly. All of
+them are therefore eliminated from the residuals together with their priors (variable projection,
+Golub and Pereyra 1973, with the prior as further rows). The remaining residuals depend on the
+moduli alone. The covariance of the moduli includes the errors, and the errors have their own
+covariance.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,14 +23,16 @@ from limber.recordings.synchronisation import Frames
 
 AXES = "xyz"
 BEND_OF_DRIFT = 0.3
-"""A sensor's zero drifts as it warms: beside a straight course, a bend of so much of its size."""
+"""A sensor's zero drifts as it warms up: curvature of the drift, as a fraction of its linear part.
+"""
 NAMED = 3.0
-"""An error so many of its deviations from zero is told: without it the fit would be poor."""
+"""Deviations from zero above which an error is reported: without it the fit would be poor."""
 NAMED_SHARE = 0.3
-"""If it also is more than this part of what was expected beforehand."""
+"""It must also exceed this fraction of the prior deviation."""
 UNLIKELY = 10.0
-"""An error so many of its deviations beforehand gives no result: seen was a gain of force 35 off,
-at moduli that were five times too high with narrow intervals."""
+"""Prior deviations above which an error invalidates the result. Seen: a force gain 35 deviations
+off, with moduli five times too high and narrow intervals.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,10 +40,11 @@ class Nuisance:
     """One error that is constant during a recording.
 
     Attributes:
-        name: In words, such as "gripper position x".
+        name: As text, such as "gripper position x".
         unit: "m", "rad", "N", "N m", "s" or "" (relative).
         sigma: Its prior standard deviation, in that unit.
-        pull: The pull that has it. None: the cell has it in all pulls of one calibration.
+        pull: The pull that has it. None: it is an error of the cell in all pulls of one
+        calibration.
     """
 
     name: str
@@ -57,7 +61,7 @@ class ErrorSlopes:
         points: [m], shape [f, m, 3, k].
         forces: [N], shape [f, 3, k].
         torques: [N m], shape [f, 3, k].
-        grasps: Of the simulated less the recorded grasp point [m], shape [f, 3, k].
+        grasps: Simulated minus recorded grasp point [m], shape [f, 3, k].
     """
 
     points: np.ndarray
@@ -72,7 +76,7 @@ class Eliminated:
 
     Attributes:
         values: In units of their deviations, shape [k].
-        covariance: Of these for a fixed free vector, shape [k, k].
+        covariance: Covariance of these for a fixed free vector, shape [k, k].
         gain: Their derivative to the free vector, shape [k, p]; None without derivatives.
     """
 
@@ -93,8 +97,8 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
 
     Args:
         residual: Standardised, shape [r].
-        jacobian: To the free vector, shape [r, p], or None.
-        columns: To the errors, shape [r, k].
+        jacobian: Derivative to the free vector, shape [r, p], or None.
+        columns: Derivative to the errors, shape [r, k].
 
     Returns:
         Residual [r + k] and Jacobian [r + k, p] with the rows of the priors, and the errors.
@@ -116,7 +120,7 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
 
 @dataclass(frozen=True)
 class _Source:
-    """Errors that come together, and their slopes."""
+    """Errors that belong together, and their slopes."""
 
     names: tuple[str, ...]
     unit: str
@@ -127,7 +131,7 @@ class _Source:
 
 @dataclass(frozen=True)
 class _Pull:
-    """A pull as its errors see it."""
+    """The data of a pull that its errors depend on."""
 
     entry: PullEntry
     frames: Frames
@@ -152,7 +156,7 @@ class CellErrors:
     """The errors of all pulls of a fit.
 
     Args:
-        forwards: Of the pulls.
+        forwards: Forward simulations of the pulls.
     """
 
     def __init__(self, forwards: Sequence[Forward]):
@@ -238,12 +242,12 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
 
 
 def _alike(pull: _Pull, course: np.ndarray) -> np.ndarray:
-    """A course over time on each axis, shape [f, 3, 3]."""
+    """Basis of a course over time on each axis, shape [f, 3, 3]."""
     return course[:, None, None] * np.eye(3)
 
 
 def _rotations(arms: np.ndarray) -> np.ndarray:
-    """Change of arms [..., 3] by a small turn about each axis, shape [..., 3, 3]."""
+    """Change of arms [..., 3] by a small rotation about each axis, shape [..., 3, 3]."""
     return np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=-1)
 
 
@@ -258,7 +262,7 @@ def _turned(pull: _Pull) -> dict[str, np.ndarray]:
 
 def _late(pull: _Pull) -> dict[str, np.ndarray]:
     times = pull.frames.times
-    # Frames at one instant, as those of a settled load, have no speed.
+    # Frames at one instant, such as those of a settled load, have no speed.
     if np.any(np.diff(times) <= 0):
         return {"points": np.zeros((*pull.positions.shape, 1))}
     return {"points": np.gradient(pull.positions, times, axis=0)[..., None]}
@@ -269,7 +273,7 @@ def told(nuisances: Sequence[Nuisance], found: Eliminated, free: np.ndarray) -> 
 
     Args:
         nuisances: As eliminated.
-        found: At the fit's end.
+        found: Errors at the end of the fit.
         free: Covariance of the free vector, shape [p, p].
     """
     deviation = np.sqrt(np.diag(found.total_covariance(free)))

@@ -20,13 +20,15 @@ FAILED_OBJECTIVE = 1e12
 """Objective of parameters under which the simulation finds no equilibrium."""
 SETTLING_ROUNDS = 12
 LONGEST_MOVE = 0.05
-"""So far, over the branch's size, the gripper is moved at once by a change of its force: a branch
-that is led farther along its first answer overshoots."""
+"""Largest motion of the gripper per change of its force, as a fraction of the branch's size; a
+larger linear step overshoots.
+"""
 STILL_SETTLING = 0.6
-"""A change of the force that moves the gripper by more than this part of the last one did leads
-nowhere."""
+"""A change of the force diverges if it moves the gripper by more than this fraction of the last
+one.
+"""
 SETTLED_FORCE_M = 5e-4
-"""Change of the gripper's place by a change of its force at which the force stays."""
+"""Motion of the gripper by a change of its force below which the force has converged."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class Evaluation:
         free: Shape [p].
         residual: Differences over standard deviations, shape [r].
         jacobian: Its derivative to the free vector, shape [r, p], or None.
-        loss: The paper's J: sum of squared distances of all seen points [m^2].
-        pulls: The simulated pulls as cell and sensors would show them, their errors as fitted.
+        loss: The paper's J: sum of squared distances of all observed points [m^2].
+        pulls: The simulated pulls as cell and sensors would show them, with the fitted errors.
         unknown_count: Unknowns of measured input forces, and errors of cell and sensors, that
             were eliminated from it.
         errors: These errors; None: there are none.
@@ -59,7 +61,7 @@ class Evaluation:
 
     @property
     def mean_square(self) -> float:
-        """Mean squared residual: about 1 where the model fits and the noise is as stated."""
+        """Mean squared residual: about 1 if the model fits and the noise is as stated."""
         freedom = len(self.residual) - len(self.free) - self.unknown_count
         return 2 * self.objective / max(freedom, 1)
 
@@ -74,7 +76,7 @@ class Evaluation:
 
     @property
     def deviations(self) -> np.ndarray:
-        """Standard deviation that each free value has by these derivatives, shape [p]."""
+        """Standard deviation of each free value from these derivatives, shape [p]."""
         _, values, rows = np.linalg.svd(self.slopes, full_matrices=False)
         spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
         return np.sqrt(np.sum(spread**2, axis=1))
@@ -85,11 +87,11 @@ class RawSlopes:
     """Derivatives of a pull's r standardised residuals.
 
     Attributes:
-        free: To the free vector, shape [r, p].
-        errors: To the errors of cell and sensors, shape [r, k].
-        response: To the unknowns of its force, shape [r, L]; None: it has none.
-        residual: With the errors as fitted, shape [r].
-        kinds: What each residual is of, as a cause of uncertainty; length r.
+        free: Derivative to the free vector, shape [r, p].
+        errors: Derivative to the errors of cell and sensors, shape [r, k].
+        response: Derivative to the unknowns of its force, shape [r, L]; None: it has none.
+        residual: With the fitted errors, shape [r].
+        kinds: Measured quantity of each residual, as a cause of uncertainty; length r.
     """
 
     free: np.ndarray
@@ -122,34 +124,35 @@ class Objective:
         self.cell_errors = CellErrors(forwards)
 
     def with_space(self, space: ParameterSpace) -> "Objective":
-        """Return an objective on other parameters that goes on with the same log and count."""
+        """Return an objective on other parameters with the same log and count."""
         other = Objective(self.forwards, space, log=self.log, force_sigma=self.force_sigma,
                           progress=self._progress, expected_count=self._expected)
         other.forward_count = self.forward_count
         return other
 
     def with_forwards(self, forwards: list[Forward]) -> "Objective":
-        """Return an objective of other models of the same pulls; log and count go on."""
+        """Return an objective with other models of the same pulls and the same log and count."""
         other = Objective(forwards, self.space, log=self.log, force_sigma=self.force_sigma,
                           progress=self._progress, expected_count=self._expected)
         other.forward_count = self.forward_count
         return other
 
     def apart(self) -> "Objective":
-        """Return an objective on copies of the pulls with a log of its own: what is tried on it
-        leaves this one as it is."""
+        """Return an objective on copies of the pulls with its own log; evaluating it does not
+        change this one.
+        """
         return Objective([copy.copy(forward) for forward in self.forwards], self.space,
                          force_sigma=self.force_sigma)
 
     def forget(self) -> None:
-        """Evaluate anew what was evaluated last: a forward has changed."""
+        """Evaluate again at the last parameters, because a forward model has changed."""
         self._last = None
 
     def evaluate(self, free: np.ndarray, *, jacobian: bool = False) -> Evaluation | None:
         """Simulate all pulls. Return None if one has no equilibrium.
 
         Raises:
-            Stopped: by Ctrl-C or the progress' cancel.
+            Stopped: by Ctrl-C or by cancelling the progress.
         """
         free = np.array(free, float)
         last = self._last
@@ -160,7 +163,7 @@ class Objective:
         try:
             found = self._simulated(free, values, jacobian)
             if last is None or not np.array_equal(last.free, free):
-                # The derivative at a state that is known already is not another simulation.
+                # The derivative at a known state does not count as a simulation.
                 self.forward_count += 1
                 self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
                              found.loss if found else np.inf)
@@ -186,9 +189,9 @@ class Objective:
                 for points, forces in self.standardised(evaluation)]
 
     def follow_forces(self, evaluation: Evaluation) -> bool:
-        """Move measured input forces to where an evaluation says they were.
+        """Move measured input forces to their values in an evaluation.
 
-        Returns whether there are any; what was evaluated before is then of another linearisation.
+        Returns whether there are any; earlier evaluations then belong to another linearisation.
         """
         moved = False
         for index, forward in enumerate(self.forwards):
@@ -201,7 +204,7 @@ class Objective:
         return moved
 
     def _simulated(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
-        """Simulate all pulls; forces that are unknowns beside a recorded path are settled."""
+        """Simulate all pulls; unknown forces with a recorded path are iterated until settled."""
         settling = {index: forward for index, forward in enumerate(self.forwards)
                     if is_path_observed(forward)}
         if not settling:
@@ -214,7 +217,7 @@ class Objective:
             found = self._compared(free, values, False)
             if found is None:
                 break
-            # Linear in what is left of the way, the comparison has it already.
+            # The comparison already includes the linear effect of the remaining change.
             changes = [self._residuals[index].force_change(found.pulls[index])
                        for index in settling]
             moved = max(forward.moved_by(change)
@@ -229,18 +232,18 @@ class Objective:
             last, part = moved, min(1.0, longest / moved)
             for forward, change in zip(settling.values(), changes, strict=True):
                 forward.shift_force(part * change)
-        # Parameters under which the force finds no rest are too far off: no step there.
+        # Parameters for which the force does not converge are too far away: no step there.
         self.step_back()
         return None
 
     def keep_forces(self) -> None:
-        """Remember the forces of pulls that settle; :meth:`step_back` returns to them."""
+        """Store the forces of settling pulls; :meth:`step_back` returns to them."""
         for forward in self.forwards:
             if is_path_observed(forward):
                 forward.keep()
 
     def step_back(self) -> None:
-        """Return to the forces that were kept last."""
+        """Return to the last stored forces."""
         self._last = None
         for forward in self.forwards:
             if is_path_observed(forward):
@@ -284,7 +287,7 @@ class Objective:
         return Evaluation(free, residual, jacobian, loss, tuple(pulls), unknown_count, errors)
 
     def raw_slopes(self, evaluation: Evaluation) -> list[RawSlopes]:
-        """Derivatives of each pull's standardised residuals, nothing eliminated.
+        """Derivatives of each pull's standardised residuals before elimination.
 
         Args:
             evaluation: With derivatives.
@@ -303,13 +306,13 @@ class Objective:
 
     def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
                         ) -> np.ndarray:
-        """Change of an evaluation's residuals by S things that change its pulls, shape [r, S].
+        """Change of an evaluation's residuals by S changes of its pulls, shape [r, S].
 
-        Less what unknowns of a force and errors of cell and sensors would explain of it.
+        Without the part that unknowns of a force and errors of cell and sensors would explain.
 
         Args:
             evaluation: With derivatives.
-            changes: Of each pull's predicted measurements.
+            changes: Changes of each pull's predicted measurements.
         """
         rows, columns = [], []
         for compared, piece, simulated, change in zip(
@@ -326,7 +329,7 @@ class Objective:
         return np.vstack([found, np.zeros((self.space.own_row_count, found.shape[1]))])
 
     def _by_errors(self, index: int, simulated: Simulated) -> tuple[ErrorSlopes, np.ndarray]:
-        """What errors of cell and sensors do to a pull, and to its standardised residuals."""
+        """Effect of errors of cell and sensors on a pull and on its standardised residuals."""
         found = self.cell_errors.slopes(index, simulated.positions, simulated.forces)
         torques = None if simulated.torques is None else found.torques
         return found, self._residuals[index].slopes(found.points, found.forces, torques,
@@ -349,7 +352,7 @@ def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Sim
 
 
 def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, str]:
-    """By which factor each modulus may be wrong (95 %) if the fit ended here."""
+    """Factor by which each modulus may be wrong (95 %) if the fit ended here."""
     if found is None or found.jacobian is None:
         return {}
     deviations = found.deviations[list(space.groups)]
@@ -358,7 +361,7 @@ def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, 
 
 
 def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
-    """RMS distance [m] of points and RMS force error [N] of one pull that a fit did not see."""
+    """RMS distance [m] of points and RMS force error [N] of one pull that was not used in a fit."""
     forward = objective.forwards[index]
     simulated = forward.simulate(objective.space.unpack(free), (), False)
     if simulated is None:

@@ -10,34 +10,35 @@ from limber.core.errors import WorkError
 from limber.estimation.fitting.objective import FAILED_OBJECTIVE, Evaluation, Objective
 
 FIRST_STEP = 1.5
-"""Longest first step of Gauss-Newton in the space of log E: a factor of 4.5; chosen."""
+"""Longest first step of Gauss-Newton in log E: a factor of 4.5. Chosen, not measured."""
 OUTLYING = 3.0
-"""Residuals beyond so many standard deviations count linearly in a robust fit."""
+"""Standard deviations beyond which residuals count linearly in a robust fit."""
 SETTLED_ITERATIONS = 4
-"""So many iterations of Nelder-Mead for each corner of its simplex have to change nothing:
-chosen."""
+"""Iterations of Nelder-Mead without change, per corner of its simplex, after which it ends. Chosen.
+"""
 SETTLED_FALL = 0.01
-"""Fall of half the squared standardised residuals that is nothing: a seventh of a deviation."""
+"""Negligible decrease of half the squared standardised residuals: a seventh of a deviation."""
 SETTLED_STEP = 0.005
-"""Length, in standard deviations, of the step that is still wanted at which Gauss-Newton ends."""
+"""Length of the remaining step, in standard deviations, at which Gauss-Newton ends."""
 WANDERING_STEP = 0.1
-"""The same where forces are settled in every simulation: to half a millimetre of the gripper's
-place, which repeats no better, and an end that asks for more wanders. What it leaves adds half a
-percent to the deviation."""
+"""The same if forces are settled in every simulation: to half a millimetre of the gripper's
+position, whose repeatability is no better; a stricter end does not converge. The remainder adds
+half a percent to the deviation.
+"""
 SHORTEST_STEP = 3e-4
-"""Over the free vector's length, at which it ends where no step leads down."""
+"""Step relative to the free vector's length at which it ends if no step descends."""
 FORCE_ROUNDS = 6
-"""How often the course of a measured input force is linearised anew at most."""
+"""Most linearisations of a measured input force."""
 FORCE_SETTLED = 0.1
-"""Change of a fit, in standard deviations, below which the course is left where it is."""
+"""Change of a fit, in standard deviations, below which the course is no longer updated."""
 
 
 class FitStatus(StrEnum):
-    """How a fit ended; each is its own text.
+    """How a fit ended; the value is the text shown.
 
     converged: by the optimiser's own criterion.
     out_of_evaluations: no more simulations were allowed.
-    misfit: it settled, but farther from the measurements than was asked for.
+    misfit: it settled, but farther from the measurements than requested.
     unconfirmed: a reduced model's fit that the full model could not confirm.
     stopped: by the user.
     """
@@ -51,12 +52,12 @@ class FitStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Fit:
-    """Where an optimiser ended.
+    """End of an optimiser.
 
     Attributes:
         evaluation: The best one, with derivatives if they were requested.
-        status: How it ended.
-        reason: Why it ended, as text with numbers.
+        status: Status at the end.
+        reason: Reason for the end, as text with numbers.
     """
 
     evaluation: Evaluation
@@ -74,10 +75,10 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
 
     Args:
-        objective: Gives residuals and derivatives.
+        objective: Computes residuals and derivatives.
         start: Free vector.
         robust: Residuals beyond ``OUTLYING`` count linearly (``soft_l1``), so that an outlier
-            cannot pull the fit.
+            cannot dominate the fit.
         evaluation_limit: Largest number of forward simulations.
         tolerance: Relative change of the cost at which the fit ends.
         is_near: Whether the start is close to the solution.
@@ -86,7 +87,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     Raises:
         WorkError: the start has no equilibrium.
     """
-    # Far from the solution all residuals are large, and a robust loss would only slow the way.
+    # Far from the solution all residuals are large, and a robust loss would only slow convergence.
     phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
     if robust and is_near:
         phases = phases[1:]
@@ -96,7 +97,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         found = search.minimised(moved, *phase)
         moved = found.x
     for _ in range(force_rounds):
-        # Measured input forces are known better now, and so is what they do to the points.
+        # Measured input forces are now known better, and so is their effect on the points.
         if not objective.follow_forces(search.at(moved)):
             break
         before = search.at(moved)
@@ -110,8 +111,8 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
 
 
 class _Search:
-    """Searches by scipy from vectors that are moved: it takes the length of the first for the
-    first step's limit, a change of the moduli by about a factor of e in all, where log E itself
+    """Searches by scipy use shifted vectors: scipy limits the first step by the length of the first
+    vector. The shift allows a change of the moduli by about a factor of e in all; log E itself
     would allow any.
     """
 
@@ -152,10 +153,10 @@ class _Search:
                 "standard deviations.")
 
     def _residual(self, moved: np.ndarray) -> np.ndarray:
-        # Nearly every step is taken, and its derivative is cheapest right after the solve.
+        # Nearly every step is accepted, and its derivative is cheapest right after the solve.
         found = self._objective.evaluate(moved + self._shift, jacobian=True)
         if found is None:
-            # Farther off than anything: the trust region shrinks.
+            # Larger than any other: the trust region shrinks.
             return np.full(self._size, np.sqrt(FAILED_OBJECTIVE / self._size))
         return found.residual
 
@@ -184,9 +185,9 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
     """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
 
     It stops when the mean squared error of the points falls below ``delta_m2`` [m^2]; when the
-    error settles, that is no longer falls by what could matter beside the noise; or when the
-    simplex spans less than ``tolerance`` in every log E and in the objective. Settled above
-    ``delta_m2`` is not converged.
+    error settles, that is, no longer decreases by an amount that is relevant compared to the noise;
+    or when the simplex spans less than ``tolerance`` in every log E and in the objective. Settled
+    above ``delta_m2`` is not converged.
 
     Raises:
         WorkError: no candidate had an equilibrium.
@@ -194,7 +195,7 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
     lower, upper = objective.space.bounds()
     rule = _Settling(objective, delta_m2)
     if any(forward.drive == "force" for forward in objective.forwards):
-        # What its errors do to the points is found with the derivatives.
+        # The effect of its errors on the points is computed with the derivatives.
         _required(objective, start)
 
     def cost(free: np.ndarray) -> float:
@@ -220,7 +221,7 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
 
 
 class _Settling:
-    """The paper's end: the mean squared error of the points settles below a threshold."""
+    """The paper's termination: the mean squared error of the points settles below a threshold."""
 
     def __init__(self, objective: Objective, delta_m2: float | None):
         self._delta = delta_m2
@@ -250,7 +251,7 @@ class _Settling:
             raise StopIteration
 
     def verdict(self, is_small: bool, limit: int) -> tuple[FitStatus, str]:
-        """How it ended, and why."""
+        """Status and reason."""
         error = f"the mean squared distance of the points, {self._error:.3g} m2,"
         if self._delta is not None and self._error < self._delta:
             return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"

@@ -1,12 +1,13 @@
 """Fit with the reduced model, corrected so that it ends at the full model's solution.
 
-A basis made for any grasp and any Young's modulus is good nowhere in particular: moduli found with
-it were off by up to 14 %. Here it is made for one branch and grasp, from the first pull's own poses
-and others as far out in every direction, at moduli around a rough fit; later pulls of that grasp
-find it made. What it still gets wrong is measured: the full model at some frames gives the
-difference in positions, forces and their derivatives, which is added to the reduced model's answers
-(space mapping with first-order consistency; Alexandrov et al., "Approximation and model management
-in aerodynamic optimization with variable-fidelity models", 2001). Where the corrected fit no longer
+A basis made for any grasp and any Young's modulus is inaccurate everywhere: moduli found with it
+were off by up to 14 %. Here it is made for one branch and grasp, from the first pull's own poses
+and others equally far out in every direction, at moduli around a rough fit; later pulls of that
+grasp
+reuse it. Its remaining error is measured: the full model at some frames gives the difference in
+positions, forces and their derivatives, which is added to the reduced model's results (space
+mapping with first-order consistency; Alexandrov et al., "Approximation and model management in
+aerodynamic optimization with variable-fidelity models", 2001). Where the corrected fit no longer
 moves, its residuals and derivatives are the full model's.
 """
 
@@ -34,38 +35,39 @@ from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Trainer, TrainingSettings, sample_poses, sample_young
 
-# Sizes and limits are chosen; the model's error is measured by every fit and corrected, so that
-# they cost time, not truth.
+# Sizes and limits are chosen. The model's error is measured in every fit and corrected, so they
+# affect time, not accuracy.
 STATES_PER_PULL = 24
-"""Full solutions along each pull that the basis is made of."""
+"""Full solutions along each pull from which the basis is made."""
 STATES_AROUND = 24
-"""And so many in all directions, for pulls that are yet to come."""
+"""Further training poses in all directions, for later pulls."""
 SIZE, SIZE_PER_PULL = 56, 16
-"""Coordinates of a basis: so many, and so many more a pull; 90 at most."""
+"""Coordinates of a basis: a base number plus a number per pull; at most 90."""
 YOUNG_SPREAD = 1.5
 """Factor in Young's modulus within which they are sampled."""
 ROUGH_KEY_FRAMES = 4
-"""Of the full model's fit that the basis is made around."""
+"""Key frames of the full model's fit around which the basis is made."""
 ROUND_LIMIT = 5
-"""Corrections at most."""
+"""Most corrections."""
 REBUILD_LIMIT = 2
-"""Other bases at most, where the fit left what the first was made for."""
+"""Most further bases if the fit leaves the range of the first."""
 SETTLED = 1e-3
-"""Change of a log E by a new correction at which it is good enough."""
+"""Change of a log E by a new correction below which it is good enough."""
 SETTLED_DEVIATIONS = 0.05
 """Or: that change over the standard deviation of the log E."""
 
 Optimise = Callable[..., Fit]
-"""Takes an objective, a free vector to start from, and whether that is near the solution."""
+"""Takes an objective, a start vector, and whether it is near the solution."""
 
 
 class Reduction:
     """Reduced models of the pulls of an estimate.
 
     Args:
-        forwards: Of the full model; pulls of one grasp and one gravity share a basis.
+        forwards: Forward simulations of the full model; pulls of one grasp and one gravity share a
+        basis.
         cache: Folder in which bases are kept for the next estimate, or None.
-        digest: Of what else a basis depends on, beside branch and grasp.
+        digest: Digest of the other dependencies of a basis, besides branch and grasp.
 
     Raises:
         InputError: a pull is force-driven or dynamic.
@@ -87,7 +89,7 @@ class Reduction:
         return bool(self.bases)
 
     def around(self, values: Values) -> Values:
-        """Return ``values`` with the moduli that the bases were made around."""
+        """Return ``values`` with the moduli around which the bases were made."""
         return replace(values, young=self.bases[0].control_young)
 
     def build(self, values: Values, progress: Progress = SILENT) -> None:
@@ -104,7 +106,7 @@ class Reduction:
             forward.rest_points, density=values.density)) for forward in self.forwards])
 
     def keep(self) -> None:
-        """Write the bases into the cache; those of another mesh go, of other grasps stay."""
+        """Write the bases to the cache; bases of another mesh are removed, of other grasps kept."""
         kept = {path for path in self.paths if path is not None}
         for path in kept:
             own = path.name.rsplit("-", 1)[0]
@@ -121,15 +123,15 @@ class Reduction:
 def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rough: Optimise,
                 reduction: Reduction, progress: Progress = SILENT,
                 ) -> tuple[Fit, Objective]:
-    """Fit on reduced models of the pulls; returns the fit and the objective that it belongs to.
+    """Fit on reduced models of the pulls; return the fit and its objective.
 
-    Where a reduced model does not carry the pulls, the full one fits them, and a warning says so.
+    If the reduced model does not cover the pulls, the full model fits them, with a warning.
 
     Args:
         objective: On the full model.
         start: Free vector.
-        optimise: The fit wanted.
-        rough: A quick fit of the full model, around which bases are made that are not there yet.
+        optimise: The requested fit.
+        rough: A quick fit of the full model, around which missing bases are made.
         reduction: The reduced models.
     """
     free = start
@@ -157,14 +159,14 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
         away = float(np.exp(np.abs(np.log(values.young / basis.control_young)).max()))
         if away <= 1.05 * basis.young_spread or attempt == REBUILD_LIMIT:
             break
-        # The basis was made around moduli too far off: once more, around what came out.
+        # The basis was made around moduli too far from the result; make it again around the result.
         reduction.build(values, progress)
     reduction.keep()
     return fit, corrected
 
 
 def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progress: Progress) -> Fit:
-    """Fit, measure the reduced model's error there, fit again, until nothing moves."""
+    """Fit, measure the reduced model's error there, and fit again until the result settles."""
     fit = optimise(corrected, free)
     for _ in range(ROUND_LIMIT):
         values = corrected.space.unpack(fit.evaluation.free)
@@ -174,7 +176,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progres
                 "The full model finds no equilibrium at the solution of the reduced model. The "
                 "solution is therefore not confirmed. Use --forward full.")
             return replace(fit, status=FitStatus.unconfirmed)
-        # What was evaluated before belongs to another correction.
+        # Earlier evaluations belong to another correction.
         corrected.forget()
         again = optimise(corrected, fit.evaluation.free, is_near=True)
         moved = np.abs(again.evaluation.free - fit.evaluation.free)
@@ -235,7 +237,7 @@ def _poses_around(forward: QuasiStaticForward, poses: np.ndarray) -> np.ndarray:
 
 
 def _file_name(forward: QuasiStaticForward, digest: str) -> str:
-    """Of what a basis depends on: mesh, then grasp, weight and control points; no pull."""
+    """Digests of a basis' dependencies: mesh, then grasp, weight and control points; no pull."""
     model, grasp, entry = forward.model, forward.grasp, forward.entry
     joined = hashlib.sha256(
         f"{digest} {grasp.mode} {entry.gravity_m_s2} {entry.weightless} {model.gravity}"
@@ -251,7 +253,7 @@ def _read(path: Path | None, forward: QuasiStaticForward) -> ReducedModel | None
     try:
         found = read_model(path)
     except (InputError, KeyError):
-        # Cut short, or of an older version: it is made anew.
+        # Truncated, or of an older version: it is made again.
         return None
     same = (found.rest.shape == forward.mesh.nodes.shape
             and np.array_equal(found.grasp.nodes, forward.grasp.nodes))

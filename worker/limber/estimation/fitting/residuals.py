@@ -1,4 +1,4 @@
-"""One pull's differences of simulated and measured, each over its standard deviation."""
+"""One pull's differences of simulated and measured values, each over its standard deviation."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from limber.recordings.synchronisation import Frames
 
 
 class Residuals:
-    """Compares a pull with what was measured of it.
+    """Compares a simulated pull with its measurements.
 
     Args:
         forward: The pull.
@@ -26,7 +26,7 @@ class Residuals:
         self._span: tuple[Response, np.ndarray, np.ndarray] | None = None
 
     def points(self, simulated: Simulated) -> np.ndarray:
-        """Residuals of the points over their deviations, shape [f, m, 3]; NaN: not seen."""
+        """Residuals of the points over their deviations, shape [f, m, 3]; NaN: not observed."""
         off = simulated.positions - self._forward.frames.positions
         return np.einsum("fmij,fmj->fmi", self._whitening, off)
 
@@ -72,7 +72,7 @@ class Residuals:
         return np.vstack(rows)
 
     def kinds(self, simulated: Simulated) -> list[str]:
-        """What each residual is of, as a cause of uncertainty; length r."""
+        """Cause of uncertainty of each residual; length r."""
         seen, force, torque = self._known(simulated.torques is not None)
         kinds = ["noise of the points"] * (3 * int(seen.sum()))
         kinds += ["noise of the force"] * (3 * sum(
@@ -82,8 +82,9 @@ class Residuals:
         return kinds
 
     def span(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Orthonormal columns of all that the unknowns of the input force can change, and their
-        triangle; None where it has none."""
+        """Orthonormal columns of all changes that the unknowns of the input force can cause, and
+        their triangle; None if there are no unknowns.
+        """
         response = self._forward.response
         if response is None:
             return None
@@ -96,13 +97,12 @@ class Residuals:
         return self._span[1:]
 
     def beside(self, rows: np.ndarray) -> np.ndarray:
-        """What the unknowns of the input force leave of rows: another force says nothing of the
-        moduli."""
+        """Rows after elimination of the unknown input force."""
         span = self.span()
         return rows if span is None else rows - span[0] @ (span[0].T @ rows)
 
     def force_change(self, simulated: Simulated) -> np.ndarray:
-        """How the unknowns of the input force would have to change to explain the residuals."""
+        """Change of the unknown input force that explains the residuals."""
         columns, triangle = present(self.span(), "response of the pull to its force")
         return -np.linalg.lstsq(triangle, columns.T @ self.rows(simulated)[0], rcond=1e-9)[0]
 
@@ -120,5 +120,5 @@ class Residuals:
 
 
 def seen_in(frames: Frames) -> np.ndarray:
-    """Which points were seen, shape [f, m] of bool."""
+    """Which points were observed, shape [f, m] of bool."""
     return np.isfinite(frames.positions).all(axis=2)

@@ -13,7 +13,7 @@ from limber.estimation.parameters import Values
 
 @dataclass(frozen=True)
 class _Correction:
-    """Full model less reduced model at some values, at all frames."""
+    """Full model minus reduced model at some values, at all frames."""
 
     values: Values
     positions: np.ndarray
@@ -37,7 +37,7 @@ class CorrectedForward(Forward):
         rough = self.reduced.simulate(values, extra, True)
         if rough is None:
             return False
-        # Two Newton iterations from there instead of a way from elsewhere.
+        # Two Newton iterations from there instead of a path from another state.
         self._full.hint(self.reduced.displacements(self._full.keys))
         exact = self._full.simulate(values, extra, True)
         if exact is None:
@@ -87,7 +87,7 @@ class CorrectedForward(Forward):
 
 def _torques(found: Simulated, known: _Correction, step: np.ndarray,
              ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The corrected torques, and their derivatives where those of ``found`` are known."""
+    """The corrected torques, and their derivatives if those of ``found`` are known."""
     if found.torques is None or known.torques is None or known.d_torques is None:
         return None, None
     return (found.torques + known.torques + known.d_torques @ step,
@@ -95,7 +95,7 @@ def _torques(found: Simulated, known: _Correction, step: np.ndarray,
 
 
 def _coordinates(values: Values, extra: tuple[str, ...]) -> np.ndarray:
-    """The physical parameters that derivatives are taken to, as one vector."""
+    """The physical parameters of the derivatives, as one vector."""
     tail = {"poisson": values.poisson, "density": np.log(values.density), "alpha": 0.0,
             "beta": 0.0}
     return np.r_[np.log(values.young), [tail[name] for name in extra]]

@@ -53,7 +53,7 @@ class DynamicForward(Forward):
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._model = under_its_weight(model, entry).gripped(self.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
-        # Only the nodes that the observed points hang on need derivatives.
+        # Only the nodes that determine the observed points need derivatives.
         self._nodes = np.unique(self._operator.indices // 3)
         columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
         self._near = self._operator[:, columns]
@@ -97,7 +97,7 @@ class DynamicForward(Forward):
         return Simulated(positions, forces, d_positions * scale, d_forces * scale)
 
     def until(self, count: int) -> "DynamicForward":
-        """Return the first ``count`` frames, driven by force where that is known.
+        """Return the first ``count`` frames, driven by force if that is known.
 
         With a prescribed path, wrong moduli stretch the branch and give a thousandfold force. With
         a prescribed force, the branch merely moves too far.

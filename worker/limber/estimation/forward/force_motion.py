@@ -1,8 +1,8 @@
 """Effect of errors of a measured force on the motion that it drives.
 
-The change of a motion by a small change of its force is that of a linear system. Its slowest
-modes carry nearly all of it, the others follow as if there were no inertia. The modes are those
-of the undeformed branch: the change is small, and wanted as a weight, not as a result.
+A motion changes with a small change of its force like a linear system. The slowest modes carry
+nearly all of the change; the others follow quasi-statically. The modes are those of the undeformed
+branch, which suffices because the change is only used as a weight.
 """
 
 import numpy as np
@@ -12,10 +12,10 @@ from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.model import BranchModel
 
 MODES = 16
-"""That carry the change of a motion; the rest follows statically. Chosen, not measured."""
+"""Number of modes for the change of a motion; the remainder is static. Chosen, not measured."""
 SPARE = 8
 ITERATIONS = 8
-"""Subspace iteration: with this many vectors more than modes wanted, so often."""
+"""Subspace iteration: extra vectors, and number of iterations."""
 
 
 def motion_response(model: BranchModel, loads: np.ndarray, observed: object, times: np.ndarray,
@@ -26,7 +26,7 @@ def motion_response(model: BranchModel, loads: np.ndarray, observed: object, tim
         model: The branch, with its damping.
         loads: Nodal forces of each of the force's components, shape [c, node_count, 3].
         observed: Displacement of the points from the nodes', shape [3 m, 3 n]; sparse.
-        times: Of the frames [s], shape [f]; the force is linear between them.
+        times: Times of the frames [s], shape [f]; the force is linear between them.
 
     Returns:
         [m per N], shape [f, m, 3, f c]; the force's columns by frame, then component.
@@ -59,12 +59,13 @@ def _modes(model: BranchModel, loads: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Each mode's motion under a unit force at one frame, linear to nothing at those beside it.
+    """Each mode's motion under a unit force at one frame that falls linearly to zero at its
+    neighbours.
 
-    By Newmark's average acceleration with the steps of the simulation; it starts in equilibrium.
+    By Newmark's average acceleration with the steps of the simulation, starting in equilibrium.
 
     Returns:
-        Shape [modes, f, f]: at each frame, for the force of each.
+        Shape [modes, f, f]: at each frame, for the force at each frame.
     """
     count = len(times)
     k, d = squares[:, None], damping[:, None]

@@ -19,13 +19,13 @@ class Simulated:
 
     Attributes:
         positions: Observed points [m], shape [f, m, 3].
-        forces: Of the gripper on the branch [N], shape [f, 3].
+        forces: Forces of the gripper on the branch [N], shape [f, 3].
         d_positions: Shape [f, m, 3, P], or None; P parameters in the order log E_1..log E_K and
             the extra ones of the parameter space.
         d_forces: Shape [f, 3, P], or None.
         torques: About the grasp point [N m], shape [f, 3]; None: not known.
         d_torques: Shape [f, 3, P], or None.
-        grasps: The grasp point [m], shape [f, 3], where it is compared; else None.
+        grasps: The grasp point [m], shape [f, 3], if it is compared; else None.
         d_grasps: Shape [f, 3, P], or None.
     """
 
@@ -58,16 +58,16 @@ class Forward(ABC):
         entry: Its settings.
         frames: Its aligned frames.
         rest_points: Observed points at rest [m], shape [m, 3].
-        uses_force: Whether the force was measured in some frame, and is compared there.
-        response: How the pull answers to errors of the measured force that drives it, once
-            derivatives have been asked for; None: no such force, or not yet.
-        uses_torque: Whether the torque counts too.
-        grasp_tangent: Of the branch at the grasp, at all frames of the last simulation, shape
-            [f, 3]; where the gripper's path is an observation.
+        uses_force: Whether the force was measured in any frame, and is compared there.
+        response: Response of the pull to errors of the measured force that drives it, once
+            derivatives have been requested; None: no such force, or not yet.
+        uses_torque: Whether the torque is compared too.
+        grasp_tangent: Direction of the branch at the grasp, at all frames of the last simulation,
+            shape [f, 3], if the gripper's path is an observation.
     """
 
     is_dynamic = False
-    """Whether inertia acts; what happens in a frame then depends on all before it."""
+    """Whether inertia acts; a frame then depends on all earlier ones."""
 
     def __init__(self, name: str, entry: PullEntry, frames: Frames, rest_points: np.ndarray):
         self.name, self.entry, self.frames = name, entry, frames
@@ -84,13 +84,13 @@ class Forward(ABC):
 
         Args:
             values: The physical parameters.
-            extra: Parameters of the derivatives beside Young's modulus.
+            extra: Parameters of the derivatives in addition to Young's modulus.
             sensitivities: Whether to compute derivatives.
         """
 
     @property
     def drive(self) -> str:
-        """What is prescribed: ``pose`` or ``force``."""
+        """The prescribed quantity: ``pose`` or ``force``."""
         return self.entry.drive
 
     @property
@@ -125,16 +125,16 @@ class Forward(ABC):
 
     @property
     def reduction_error(self) -> tuple[float, float] | None:
-        """Largest error of a reduced model against the full one, in position [m] and in force
-        over the largest force; None where the full model is simulated itself.
+        """Largest error of the reduced model relative to the full one, in position [m] and in force
+        over the largest force; None if the full model itself is simulated.
         """
         return None
 
     def shift_force(self, change: np.ndarray) -> None:
-        """Change the force as a fit states, and linearise at the new force.
+        """Change the force by the fitted amount, and linearise at the new force.
 
         Args:
-            change: Of the unknowns, in the order of the response's columns, shape [L].
+            change: Change of the unknowns, in the order of the response's columns, shape [L].
         """
         raise NotImplementedError(f"{type(self).__name__} is not driven by a measured force.")
 
@@ -143,8 +143,8 @@ class Forward(ABC):
         return simulated
 
     def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the one that moves a branch of these ``values`` as far; None where
-        the pull does not determine it, or not with one solution.
+        """Measured force over the force that moves a branch of these ``values`` equally far; None
+        if the pull does not determine it, or not uniquely.
         """
         return None
 
@@ -153,18 +153,18 @@ class Forward(ABC):
         return 0.0
 
     def refine(self) -> None:
-        """Simulate twice as many frames from now on, where not all of them are simulated."""
+        """From now on simulate twice as many frames, if not all of them are simulated already."""
         return  # Here all of them are.
 
     def led_elsewhere(self, poses: np.ndarray) -> "Forward":
         """Return the same pull, on the full model, with other recorded poses [m, rad], [f, 6]; a
-        slow one at few key frames, enough to see a difference.
+        slow one at few key frames, enough to show a difference.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot be simulated with other recorded "
                                   "poses.")
 
     def until(self, count: int) -> "Forward":
-        """Return the part of a pull that the first of several fits uses: the first
-        ``count`` frames of a dynamic pull, all of a slow one.
+        """Return the part of a pull used by the first of several fits: the first ``count`` frames
+        of a dynamic pull, all of a slow one.
         """
         return self

@@ -1,14 +1,15 @@
 """Errors of the measured force that drives a simulation, as unknowns of the fit.
 
-Taken as exact, an error of the force becomes an error of all points of its frame at once, many
-times their own noise and all in one direction: a fit then bends the moduli to follow it. Here the
-true force is a smooth course through the key frames; its values there are unknowns beside the
-moduli, and each reading is an observation of the course. Points are linear enough in so small a
-change of force that the unknowns can be eliminated: residuals and their derivatives are projected
-across what a change of force could explain. That equals weighing the points by their noise plus
-the force's, carried through the compliance (the effective variance), with all correlations
-between the points of a frame. What the fit says of the force moves the course after each fit, and
-the compliance with it, until both stay (Fuller, Measurement Error Models, 1987, ch. 3).
+If it is taken as exact, an error of the force becomes an error of all points of its frame at once,
+many times their own noise and in one direction; a fit then distorts the moduli to follow it. Here
+the true force is a smooth course through the key frames. Its values there are unknowns in addition
+to the moduli, and each reading is an observation of the course. Points are nearly linear in so
+small a change of force, so the unknowns can be eliminated: residuals and their derivatives are
+projected onto the complement of what a change of force could explain. That equals weighting the
+points by their noise plus the force's, carried through the compliance (the effective variance),
+with all correlations between the points of a frame. After each fit, its estimate of the force
+updates the course, and the compliance with it, until both settle (Fuller, Measurement Error Models,
+1987, ch. 3).
 """
 
 from dataclasses import dataclass
@@ -24,10 +25,11 @@ from limber.recordings.recording import GraspEntry
 from limber.recordings.synchronisation import Frames
 
 COURSE_MISFIT = 1.5
-"""Mean squared deviation of readings from their course, over the stated, from which the course
-gets more key frames: chosen, not measured."""
+"""Mean squared deviation of readings from their course, over the stated one, above which the course
+gets more key frames. Chosen, not measured.
+"""
 CLIPPED = 4.0
-"""A reading farther off its course than so many deviations is an outlier, no bend of the course."""
+"""Deviations beyond which a reading is an outlier rather than curvature of the force."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +37,11 @@ class Response:
     """Response of a simulated pull to its L force unknowns, at the point of linearisation.
 
     Attributes:
-        points: Of the observed points [m per N], shape [f, m, 3, L].
-        wrenches: Of force, and torque where it acts too, at the frames, shape [f, c, L]; c is 3
-            or 6.
-        grasps: Of the gripper's place [m per N], shape [f, 3, L]; None where it is not watched.
+        points: Response of the observed points [m per N], shape [f, m, 3, L].
+        wrenches: Response of force, and of torque if it acts too, at the frames, shape [f, c, L]; c
+            is 3 or 6.
+        grasps: Response of the gripper's position [m per N], shape [f, 3, L]; None if it is not
+        observed.
     """
 
     points: np.ndarray
@@ -66,8 +69,8 @@ class Course:
 def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
     """Fit a smooth course to the readings of the force.
 
-    A noisy force is not a path; time orders the frames. Where ``count`` key frames cannot follow
-    the readings to within their noise, there are more.
+    A noisy force does not define a path, so the frames are ordered by time. If ``count`` key frames
+    cannot follow the readings to within their noise, there are more.
 
     Args:
         frames: Readings may be missing.
@@ -102,8 +105,8 @@ def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndar
     """Nodal forces of each component of the gripper's wrench, shape [c, node_count, 3].
 
     A force acts on the patch's weighted centre. A clamped gripper's torque, about the recorded
-    point, turns the patch by a couple of forces on its nodes, with the arms that they have at the
-    recorded rotation.
+    point, rotates the patch by couples of forces on its nodes, with their arms at the recorded
+    rotation.
 
     Args:
         pose: Recorded [m, rad], shape [6].
@@ -117,7 +120,7 @@ def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndar
     turn = rotation_matrix(pose[3:])
     middle = grasp.weights @ rest[grasp.nodes]
     arms = (rest[grasp.nodes] - middle) @ turn.T
-    # The force acts on the middle, the torque was taken about the recorded point.
+    # The force acts on the middle, but the torque was measured about the recorded point.
     offset = turn @ (np.array(entry.point_m) - middle)
     inertia = np.einsum("k,kij->ij", grasp.weights, np.einsum("ki,ki->k", arms, arms)[
         :, None, None] * np.eye(3) - arms[:, :, None] * arms[:, None, :])

@@ -1,19 +1,19 @@
 """Simulate a few frames of a slow pull and interpolate the others.
 
-Without inertia a branch's state depends on the gripper's pose (or force) alone, and smoothly so.
-A few states along the path and a cubic spline through them give the others, at a small part of
-the cost; every observed frame still counts in the fit, so no measurement is thrown away.
+Without inertia a branch's state is a smooth function of the gripper's pose (or force) alone. A few
+states along the path and a cubic spline through them give the others at a small fraction of the
+cost. Every observed frame still counts in the fit, so no measurement is discarded.
 """
 
 import numpy as np
 import scipy
 
 ROTATION_LENGTH_M = 0.1
-"""A turn of one radian counts as this much travel: chosen; the model checks the spline."""
+"""Travel equivalent to a rotation of one radian. Chosen; the model checks the spline."""
 
 
 def travel(poses: np.ndarray, step_m: float = 5e-4) -> np.ndarray:
-    """Return the path's length up to each pose, shape [n]; jitter below ``step_m`` is no travel."""
+    """Return the path's length up to each pose, shape [n], without jitter below ``step_m``."""
     scaled = poses * np.r_[np.ones(3), np.full(3, ROTATION_LENGTH_M)]
     length = np.zeros(len(poses))
     last = 0
@@ -33,7 +33,7 @@ def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Choose the frames to simulate, and the interpolation of all frames.
 
     Args:
-        along: A parameter that grows along the path, shape [n].
+        along: A parameter that increases along the path, shape [n].
         count: Largest number of frames to simulate.
 
     Returns:
@@ -54,7 +54,7 @@ def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(times: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return noisy measurements at some instants, each from a local quadratic fit.
+    """Return noisy measurements at given instants, each from a local quadratic fit.
 
     Args:
         times: [s], shape [n].

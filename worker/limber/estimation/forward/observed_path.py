@@ -1,12 +1,13 @@
 """A slow pull with an uncertain gripper path: the force is prescribed, the path is observed.
 
-Held at poses that are a millimetre off, a slender branch is stretched: its force is wrong by its
-stiffness along the axis, thousandfold that of bending, and the moduli with it. The same pull can
-be simulated by its force, an unknown course with its readings as observations (see
-:mod:`limber.estimation.forward.input_force`), and the recorded places of the gripper be
-observations as the points are: with what the calibration leaves open of the gripper's frame. A
-branch answers softly to an error of force, so that all stays well conditioned, and whichever of
-force and path tells more counts more.
+If the prescribed poses have an error of a millimetre, a slender branch is stretched. The error of
+its force follows from its axial stiffness, a thousand times that of bending, and the moduli are
+wrong with it. The same pull can be driven by its force, an unknown function of time with readings
+as observations (see :mod:`limber.estimation.forward.input_force`), and the recorded positions of
+the gripper are
+observations like the points, with the uncertainty of the gripper's frame. A branch responds softly
+to an error of force, so the problem is well conditioned, and the more informative of force and path
+has more weight.
 """
 
 from dataclasses import replace
@@ -22,25 +23,27 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward, equal_val
 from limber.estimation.parameters import Values
 
 AT_REST_M = 5e-3
-"""A first pose so near the grasp point is the branch at rest: what the sensor then reads is its
-zero."""
+"""Distance of a first pose from the grasp point below which the branch is at rest; the sensor's
+reading is then its zero.
+"""
 ROUGH_POSE_M = 5e-3
-"""Deviation of the recorded path in a first fit, where force and gripper frame are taken as they
-were read: without the path the branch beyond the last point might be anything."""
+"""Standard deviation of the recorded path in a first fit, where force and gripper frame are taken
+as recorded. Without the path, the branch beyond the last point would be undetermined.
+"""
 TANGENT_RADII = 4.0
 SAME_RESPONSE = 0.02
-"""After a smaller change over the branch's size it answers to its force as before."""
+"""Change over the branch's size below which the response to its force is unchanged."""
 
 
 class ObservedPathForward(QuasiStaticForward):
-    """Simulates one pose-recorded pull by its force; arguments as of its base class."""
+    """Simulates one pose-recorded pull by its force; arguments as for its base class."""
 
     is_watching = True
     """False for a first fit by force alone."""
     _drives_for: Values | None = None
-    """For which values the force was found last."""
+    """Values for which the force was last found."""
     _good: tuple | None = None
-    """Force, its values, states and response that were kept."""
+    """Stored force with its values, states and response."""
 
     @property
     def drive(self) -> str:
@@ -59,7 +62,7 @@ class ObservedPathForward(QuasiStaticForward):
         return super().pose_sigma if self.is_watching else ROUGH_POSE_M
 
     def set_key_count(self, count: int) -> None:
-        """As of the base class; a force that was kept is kept on the new key frames."""
+        """As in the base class; a stored force is kept on the new key frames."""
         known = None if self._good is None else self.spread @ np.array(self._good[0])
         super().set_key_count(count)
         first = self.entry.grasp.point_m - self.frames.poses[0, :3]
@@ -74,7 +77,7 @@ class ObservedPathForward(QuasiStaticForward):
                  ) -> Simulated | None:
         known = self._drives_for
         if self.is_watching and known is not None and not equal_values(known, values):
-            # At the same places the force goes with the stiffness.
+            # At the same positions the force is proportional to the stiffness.
             factor = np.exp(np.mean(np.log(values.young) - np.log(known.young)))
             self._drives = [drive * factor for drive in self._drives]
             self.response = None
@@ -82,24 +85,24 @@ class ObservedPathForward(QuasiStaticForward):
         return super().simulate(values, extra, sensitivities)
 
     def begin_at(self, other: QuasiStaticForward) -> None:
-        """As of the base class, and for the values that the force was found for."""
+        """As in the base class, and for the values for which the force was found."""
         super().begin_at(other)
         if isinstance(other, ObservedPathForward):
             self._drives_for = other._drives_for
 
     def keep(self) -> None:
-        """Remember force and states; :meth:`step_back` returns to them."""
+        """Store force and states; :meth:`step_back` returns to them."""
         self._good = (list(self._drives), self._drives_for, list(self._memory), self._values,
                       self.response)
 
     def step_back(self) -> None:
-        """Return to the force and states kept last, where there are any."""
+        """Return to the last stored force and states, if any."""
         if self._good is not None:
             drives, self._drives_for, memory, self._values, self.response = self._good
             self._drives, self._memory, self._hints = list(drives), list(memory), None
 
     def forget(self) -> None:
-        """Return to the force as measured, without a state."""
+        """Return to the measured force, without a state."""
         self._good = self._drives_for = None
         self._memory = [None] * len(self.keys)
         self.set_key_count(self.key_count)
@@ -144,7 +147,7 @@ class ObservedPathForward(QuasiStaticForward):
         return replace(found, grasps=grasps.reshape(*grasps.shape[:2], -1))
 
     def _tangent(self, displacement: np.ndarray) -> np.ndarray:
-        """Of the branch at the grasp, shape [3]: the longest extent of what is near."""
+        """Direction of the branch at the grasp, shape [3]: the longest extent of nearby nodes."""
         nodes = self.mesh.nodes
         away = np.linalg.norm(nodes - self.grasp.centre, axis=1)
         near = away < max(TANGENT_RADII * self.entry.grasp.radius_m, np.sort(away)[30])
@@ -155,6 +158,6 @@ class ObservedPathForward(QuasiStaticForward):
 
 
 def is_path_observed(forward: Forward) -> TypeGuard[ObservedPathForward]:
-    """Whether the force of a pull is an unknown at present, and its gripper's path an observation.
+    """Whether the force of a pull is currently an unknown, and its gripper's path an observation.
     """
     return isinstance(forward, ObservedPathForward) and forward.watches_pose

@@ -33,24 +33,28 @@ from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
 
 SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200, way_back=False)
-"""From the state before, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch of
-moduli far too soft, which a fit may try, folds up under its force: that is no step of the fit, and
-looking for where it comes to rest may take minutes."""
+"""From the previous state, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch
+with far too soft moduli, which a fit may try, folds up under its force. That is not a useful step
+of the fit, and finding its equilibrium may take minutes.
+"""
 ITERATIONS_A_KEY = 20
-"""So many for each simulated frame beside those that a single one may take: of branches that stood
-12 were the most until the force had settled, in one simulation 4. Under a force that folds a branch
-up nearly every frame asks for hundreds, from one start after the other."""
+"""Most iterations per simulated frame, in addition to those of a single solve. Branches that did
+not fold needed at most 12 until the force had settled, and 4 in one simulation. Under a force that
+folds a branch up, nearly every frame needs hundreds, from one start after the other.
+"""
 FEW_KEYS = 4
-"""Simulated frames where only the difference of two pulls is looked at, which varies slowly: with
-4, 6 and 12 what follows for the moduli came out within 1.5 % of each other."""
+"""Simulated frames if only the difference of two pulls is needed, which varies slowly: with 4, 6
+and 12 the resulting changes of the moduli agreed within 1.5 %.
+"""
 YOUNG_STEP_LIMIT = 0.7
-"""A state is carried over to parameters by its derivative up to this change of a log E: a factor
-of two, chosen; farther away the solve only starts worse."""
+"""Largest change of a log E for which a state is extrapolated by its derivative: a factor of two.
+Chosen, not measured; beyond it the solve only starts worse.
+"""
 
 
 @dataclass
 class _Memory:
-    """State of one key frame under the last parameters: where the next solve starts."""
+    """State of one key frame under the last parameters: the start of the next solve."""
 
     result: StaticResult
     slope: np.ndarray | None = None
@@ -63,18 +67,19 @@ class _Memory:
 class QuasiStaticForward(Forward):
     """Simulates one pull in equilibrium.
 
-    States of the key frames are kept from call to call: parameters change little from one
-    evaluation to the next, so that two Newton iterations a frame are enough.
+    States of the key frames are kept between calls: parameters change little from one evaluation to
+    the next, so two Newton iterations per frame are enough.
 
     Args:
         name: The pull's name.
         model: The branch; its Young's modulus is replaced.
-        weights: Young's modulus of the tetrahedra from the control points', [tet_count, K].
+        weights: Map Young's modulus from the control points to the tetrahedra, [tet_count, K].
         entry: The pull's settings.
         frames: Aligned frames.
         rest_points: Observed points at rest [m], shape [m, 3].
-        key_count: Frames that are simulated at most.
-        field: How Young's modulus runs between the control points; as ``weights`` without it.
+        key_count: Largest number of simulated frames.
+        field: Interpolation of Young's modulus between the control points; without it as
+        ``weights``.
     """
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
@@ -101,7 +106,7 @@ class QuasiStaticForward(Forward):
         self.set_key_count(key_count)
 
     def set_key_count(self, count: int) -> None:
-        """Simulate at most ``count`` frames from now on; more where the force asks for it."""
+        """Simulate at most ``count`` frames from now on; more if the force needs them."""
         frames, earlier = self.frames, self.spread
         states = [memory.displacement for memory in self._memory if memory is not None]
         self._course: Course | None = None
@@ -119,7 +124,7 @@ class QuasiStaticForward(Forward):
             self._loads = [self._loads_at(key) for key in self.keys]
         self._memory = [None] * len(self.keys)
         self._values: Values | None = None
-        # Between the states that are known lie those that are wanted.
+        # The requested states are between known ones.
         self._hints: list[np.ndarray] | None = list(np.tensordot(
             earlier[self.keys], states, axes=1)) if states else None
 
@@ -168,10 +173,10 @@ class QuasiStaticForward(Forward):
             if result is None:
                 return None
             before = result.displacement
-            # An old derivative still foretells most of a small change.
+            # An old derivative still predicts most of a small change.
             slope = None if memory is None else memory.slope
             self._enter(found, key, result)
-            # While the factor of this state is at hand.
+            # While the factorisation of this state is available.
             if is_asked:
                 compliances.append(compliance(model, before, self._loads[key]))
             if sensitivities:
@@ -203,13 +208,13 @@ class QuasiStaticForward(Forward):
         if found.torques is not None and self.drive == "force":
             found.torques[key] = drive[3:]
         elif found.torques is not None:
-            # About the recorded grasp point, which the patch's centre lies beside.
+            # About the recorded grasp point, which differs from the patch's centre.
             arm = drive[:3] - self.frames.poses[self.keys[key], :3]
             found.torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
 
     def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
                       extra: tuple[str, ...], result: StaticResult) -> np.ndarray:
-        """Enter the derivatives; returns that of the displacement [n, 3, p]."""
+        """Enter the derivatives; return that of the displacement [n, 3, p]."""
         points, forces = present(found.d_positions, "slopes"), present(found.d_forces, "slopes")
         slope, forces[key] = self._slopes(model, values, extra, result)
         for column in range(slope.shape[-1]):
@@ -220,7 +225,7 @@ class QuasiStaticForward(Forward):
         return slope
 
     def _held(self, _sensitivities: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """The grasp point at the key frames and its derivatives, where they are compared."""
+        """The grasp point at the key frames and its derivatives, if they are compared."""
         return None, None
 
     @property
@@ -267,10 +272,10 @@ class QuasiStaticForward(Forward):
         return drive if self.drive == "pose" else np.tensordot(drive, self._loads[key], axes=1)
 
     def aside(self, nodes: np.ndarray) -> "QuasiStaticForward":
-        """Return the same pull of the branch with its nodes a little elsewhere [m], [n, 3].
+        """Return the same pull of the branch with slightly moved nodes [m], [n, 3].
 
-        The gripper holds the same nodes where it did; each tetrahedron keeps its material, and a
-        branch that hung as it was scanned hangs so still.
+        The gripper holds the same nodes at the same positions. Each tetrahedron keeps its material,
+        and a branch that hung as scanned still does.
         """
         other = copy.copy(self)
         model = self._model.with_rest_nodes(nodes)
@@ -284,7 +289,7 @@ class QuasiStaticForward(Forward):
         return other
 
     def with_hung_mass(self, factor: float) -> "QuasiStaticForward":
-        """Return the same pull with all that hangs on the branch ``factor`` times as heavy."""
+        """Return the same pull with all added masses ``factor`` times as heavy."""
         other = copy.copy(self)
         other._model = self._model.with_hung_mass(factor)
         return other
@@ -318,8 +323,9 @@ class QuasiStaticForward(Forward):
         return made
 
     def begin_at(self, other: "QuasiStaticForward") -> None:
-        """Start from states and force that another simulation of the same pull, on as many nodes,
-        has found."""
+        """Start from states and force of another simulation of the same pull, with the same number
+        of nodes.
+        """
         if self.has_force_unknowns:
             self._drives = list((other.spread @ np.array(other._drives))[self.keys])
         states = other.displacements()
@@ -331,10 +337,10 @@ class QuasiStaticForward(Forward):
         self._hints = displacements
 
     def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the one that moves a branch of these ``values`` as far.
+        """Measured force over the force that moves a branch of these ``values`` equally far.
 
-        The force is let go where the branch wants: at the recorded poses a branch of other
-        ratios of E would be stretched, and a slender branch answers that with thousandfold force.
+        The grasp point is not prescribed: at the recorded poses a branch with other ratios of E
+        would be stretched, and a slender branch responds to that with a thousandfold force.
         """
         frames = self.frames
         known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
@@ -432,7 +438,7 @@ class QuasiStaticForward(Forward):
 
     def _torque_slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
                        result: StaticResult, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
-        """Derivative of the gripper's torque about a point that does not move, shape [3, p]."""
+        """Derivative of the gripper's torque about a fixed point, shape [3, p]."""
         wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
         held = self.grasp.nodes
         arm = model.mesh.nodes[held] + result.displacement[held] - about
@@ -446,15 +452,15 @@ class QuasiStaticForward(Forward):
 
 
 def uses_torque(entry: PullEntry, frames: Frames) -> bool:
-    """Whether the gripper's torque counts: a clamped grasp, and a sensor that says how well it
-    measures torque. Driven by pose it is an observation, driven by force it acts as well.
+    """Whether the gripper's torque counts: for a clamped grasp, and a sensor with a stated torque
+    noise. Driven by pose it is an observation; driven by force it acts as a load.
     """
     return (entry.grasp.mode == "clamped" and entry.sensor.torque_sigma_nm is not None
             and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
 
 
 def _require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
-    """A clamped gripper also turns the branch: its force alone is not what drives.
+    """A clamped gripper also rotates the branch: its force alone does not determine the motion.
 
     Raises:
         InputError: its torque was not measured.
@@ -478,9 +484,9 @@ def equal_values(one: Values | None, other: Values) -> bool:
 
 
 def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
-    """Return what :mod:`limber.mechanics.sensitivities` calls the parameters."""
+    """Return the parameters by their names in :mod:`limber.mechanics.sensitivities`."""
     names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
              "beta": "damping_stiffness"}
-    # What describes the form of the field comes with log E.
+    # Parameters of the field's form come with log E.
     return ("log_young", *(names[name] for name in extra if name in names))
 

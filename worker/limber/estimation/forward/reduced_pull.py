@@ -1,4 +1,4 @@
-"""A slow pull on the reduced model: a few milliseconds a frame."""
+"""A slow pull on the reduced model: a few milliseconds per frame."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.state import ReducedSensitivities, ReducedState
 
 STEPS = {"poisson": 2e-3, "density": 2e-2}
-"""Steps of the central differences for what the reduced model has no derivatives to."""
+"""Steps of the central differences for parameters without derivatives in the reduced model."""
 
 
 class ReducedForward(Forward):
@@ -32,8 +32,8 @@ class ReducedForward(Forward):
         entry: The pull's settings.
         frames: Aligned frames.
         rest_points: Observed points at rest [m], shape [m, 3].
-        density: Of the branch that the model was made from [kg/m^3].
-        key_count: Frames that are simulated at most; a spline gives the others.
+        density: Density of the branch of the reduced model [kg/m^3].
+        key_count: Largest number of simulated frames; a spline gives the others.
 
     Raises:
         InputError: the pull is driven by force; a reduced model is held at poses.
@@ -73,7 +73,7 @@ class ReducedForward(Forward):
                 return None
             self._states[index] = before = state
             positions[index] = self._seen(state)
-            # About the recorded grasp point, which the patch's centre lies beside.
+            # About the recorded grasp point, which differs from the patch's centre.
             arm = pose[:3] - self.frames.poses[self.keys[index], :3]
             forces[index] = _wrench(state, arm)
             if d_positions is None or d_forces is None:
@@ -100,7 +100,7 @@ class ReducedForward(Forward):
                          *(torques if self.uses_torque else (None, None)))
 
     def displacements(self, frames: np.ndarray) -> list[np.ndarray]:
-        """Nodal displacements [m] at the simulated frames nearest to ``frames``, as of the last
+        """Nodal displacements [m] at the simulated frames nearest to ``frames``, from the last
         simulation.
         """
         nearest = [int(np.argmin(np.abs(self.keys - frame))) for frame in frames]
@@ -116,7 +116,7 @@ class ReducedForward(Forward):
 
 
 def _wrench(of: ReducedState | ReducedSensitivities, arm: np.ndarray) -> np.ndarray:
-    """Force, and torque about a point that lies ``arm`` behind the pose's position."""
+    """Force, and torque about a point at the offset ``arm`` behind the pose's position."""
     torque = of.reaction_torque.T + np.cross(arm, of.reaction_force.T)
     return np.concatenate([of.reaction_force, torque.T])
 

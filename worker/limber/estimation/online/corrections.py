@@ -8,16 +8,16 @@ from limber.estimation.online.full_model import ExactFrame
 from limber.estimation.online.information import Kept, OnlineFrame
 
 UNCHECKED_ERROR = 0.3
-"""Error of the reduced model over the noise of a measurement, until it is measured."""
+"""Initial error of the reduced model over the noise of a measurement, before it is measured."""
 COVERED = 0.1
-"""Part of the way that lies between frames of the full model at the end."""
+"""Fraction of the path between the last frames of the full model."""
 STALE = 0.25
-"""Change of a log E after which a frame of the full model is solved again at the end."""
+"""Change of a log E above which a frame of the full model is solved again at the end."""
 
 
 @dataclass
 class _Correction:
-    """Full model less reduced model at one frame; rows of points, then of the force."""
+    """Full model minus reduced model at one frame; rows of points, then of the force."""
 
     frame: OnlineFrame
     centre: np.ndarray
@@ -32,7 +32,7 @@ class Corrections:
     """Measured at frames of the full model, interpolated between them.
 
     Args:
-        sigmas: Standard deviations of what a frame measures, shape [r].
+        sigmas: Standard deviations of a frame's measurements, shape [r].
     """
 
     def __init__(self, sigmas: np.ndarray):
@@ -42,7 +42,7 @@ class Corrections:
 
     @property
     def error(self) -> float:
-        """Error of the model over the noise of a measurement, as the last full frames found it."""
+        """Error of the model over the noise of a measurement, from the last full frames."""
         return float(np.sqrt(np.mean(np.square(self._surprises[-3:])))
                      ) if self._surprises else UNCHECKED_ERROR
 
@@ -56,7 +56,7 @@ class Corrections:
         self._known.clear()
 
     def at(self, frame: OnlineFrame, log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows [r] and slopes [r, K] to add at a frame: from the two nearest that are known."""
+        """Rows [r] and slopes [r, K] to add at a frame: from the two nearest known frames."""
         count = len(self._sigmas)
         if not self._known:
             return np.zeros(count), np.zeros((count, len(log_young)))
@@ -71,7 +71,7 @@ class Corrections:
 
     def add(self, frame: OnlineFrame, found: ExactFrame, rows: np.ndarray,
             slopes: np.ndarray) -> None:
-        """Take in a frame of the full model beside the reduced one's rows and slopes of it."""
+        """Add a frame of the full model, with the reduced model's rows and slopes for it."""
         exact = np.r_[found.moved.ravel(), found.force]
         d_exact = np.vstack([found.d_moved.reshape(-1, found.d_moved.shape[-1]), found.d_force])
         new = _Correction(frame, found.log_young, exact - rows, d_exact - slopes)

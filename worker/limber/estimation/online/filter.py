@@ -1,13 +1,13 @@
 """Young's modulus during a pull: recursive Gauss-Newton with the reduced model.
 
-Each frame adds its linearised residuals to what is known. A linearisation made while the moduli
-were still wrong would stay wrong for ever; so a number of frames spread over the pull are kept,
-and with every new one an old one is linearised again at the moduli of now.
+Each frame adds its linearised residuals to the information. A linearisation made while the moduli
+were still wrong would stay wrong forever. Therefore a number of frames spread over the pull are
+kept, and with every new one an old one is linearised again at the current moduli.
 
-What the reduced model gets wrong is measured beside (limber.estimation.online.full_model): the full
-model at a few of the kept frames, interpolated between them. How well a new one was foretold by
-those before widens the intervals: an error of the model is the same in all frames, and does not
-average out as noise does.
+The error of the reduced model is measured in parallel (:mod:`limber.estimation.online.full_model`):
+the full model at a few of the kept frames, interpolated between them. The error of the earlier
+frames' prediction of a new one widens the intervals: an error of the model is the same in all
+frames, and does not average out as noise does.
 """
 
 import time
@@ -32,23 +32,26 @@ from limber.reduced.state import ReducedState, ReducedStaticSettings
 STEP_LIMIT = 0.7
 """Largest change of a log E by one frame."""
 BUDGET_SECONDS = 0.028
-"""An old frame is linearised again only where that fits into a frame's 33 ms, which end with the
-intervals."""
+"""An old frame is linearised again only if that fits into a frame's 33 ms, which end with the
+intervals.
+"""
 ENOUGH_DEVIATION = 0.02
-"""Standard deviation of every log E at which another pull adds nothing that would matter: half a
-percent in a radius does as much."""
+"""Standard deviation of every log E below which another pull is not worthwhile: half a percent of
+the radius has the same effect.
+"""
 QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
-"""A pose that takes more is out of the basis' reach, and another basis is on its way."""
+"""A pose that takes more is outside the basis' range, and another basis is being made."""
 FRAME_ITERATIONS, NEAR_ITERATIONS = 12, 6
-"""Of Newton, while frames come: at most for a frame; at least for one whose state is known, at
-moduli a little different. Both take 4 as a rule; searches for a state that the training knows
-better took up to 41, longer than a frame."""
+"""Newton iterations while frames arrive: most for a frame; fewest for a frame with a known state,
+at slightly different moduli. Both usually take 4; searches for a state that the training knows
+better took up to 41, longer than a frame.
+"""
 FINAL_FRAMES = 300
-"""So many frames at most are linearised again when the pull is over."""
+"""Most frames that are linearised again after the pull."""
 IDLE_DEVIATION = 0.3
-"""Nothing is called idle before every log E is known to this: a pull begins slowly."""
+"""Deviation of every log E above which no pull is called idle: a pull begins slowly."""
 IDLE_GAIN = 0.01
-"""Part by which the last tenth of the frames narrows an interval, below which it is idle."""
+"""Narrowing of an interval by the last tenth of the frames, below which the pull is idle."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +62,12 @@ class OnlineState:
         time: [s].
         young: [Pa], shape [K].
         interval: 95 % [Pa], shape [K, 2].
-        residual: Root mean square of this frame's standardised residuals before the update; NaN
-            where the frame could not be used.
-        trusted: Whether the reduced model knows such states; False where the frame found none
-            (it is taken up again with another basis).
-        enough: Whether every modulus is known so well that another pull would add nothing.
-        idle: Whether going on like this would add nothing; another pull might.
+        residual: Root mean square of this frame's standardised residuals before the update; NaN if
+            the frame could not be used.
+        trusted: Whether the reduced model covers such states; False if the frame found none (it is
+            used again with another basis).
+        enough: Whether every modulus is known so well that another pull is not worthwhile.
+        idle: Whether continuing this pull adds nothing; another pull might.
     """
 
     time: float
@@ -80,16 +83,16 @@ class OnlineEstimator:
     """Takes frames one by one.
 
     Args:
-        reduced: Reduced model of the branch held at the recorded grasp; the moduli that it was
-            made around are the start.
+        reduced: Reduced model of the branch held at the recorded grasp; the moduli around which it
+            was made are the start.
         entry: The recorded grasp.
         mesh: The mesh of the reduced model.
         rest_points: Observed points at rest [m], shape [m, 3].
         position_sigma: Noise of points [m].
         force_sigma: Noise of the force [N].
         prior_deviation: Standard deviation of log E at the start.
-        kept_count: Frames that are linearised again and again.
-        exact: The full model; None: the reduced model is taken at its word.
+        kept_count: Number of frames that are linearised repeatedly.
+        exact: The full model; None: the reduced model is not corrected.
     """
 
     def __init__(self, reduced: ReducedModel, entry: GraspEntry, mesh: TetMesh,
@@ -106,7 +109,7 @@ class OnlineEstimator:
         self._widths: list[np.ndarray] = []
         self._turn = self.frame_count = self.refresh_count = 0
         self._last: ReducedState | None = None
-        # What is compiled at its first call is not to hold up the first frame.
+        # Compilation at the first call must not delay the first frame.
         reduced.solve_static(reduced.poses[0], settings=QUICK)
         self._exact = exact
         self._corrections = Corrections(self._sigmas)
@@ -123,12 +126,12 @@ class OnlineEstimator:
 
     @property
     def model_error(self) -> float:
-        """Error of the model over the noise of a measurement, as the last full frames found it."""
+        """Error of the model over the noise of a measurement, from the last full frames."""
         return 0.0 if self._exact is None else self._corrections.error
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of log E, shape [K, K]: of the noise, and of the model's error in all frames alike."""
+        """Covariance of log E, shape [K, K], of the noise and the model's common error."""
         widened = 1 + self.frame_count * self.model_error**2
         return widened * np.linalg.inv(self._information.normal_gradient(self.log_young)[0])
 
@@ -138,7 +141,7 @@ class OnlineEstimator:
         return np.exp(self.log_young)
 
     def update(self, frame: OnlineFrame) -> OnlineState:
-        """Take a frame in; one reduced solution, and a second where time allows."""
+        """Process a frame; one reduced solution, and a second if time allows."""
         began = time.perf_counter()
         self._collect()
         own_began = time.perf_counter()
@@ -147,7 +150,7 @@ class OnlineEstimator:
         self.frame_count += 1
         self._since_basis += 1
         if kept is None:
-            # Out of the basis' reach: a basis made again may know it.
+            # Outside the basis' range: a new basis may cover it.
             self._lost.append(frame)
             if self._information.kept:
                 self._ask()
@@ -158,7 +161,7 @@ class OnlineEstimator:
         self._information.add(kept)
         self._step()
         self._ask()
-        # A second one takes as long as this very frame's, but for the iterations.
+        # A second one takes as long as the one for this frame, except for the iterations.
         left = BUDGET_SECONDS - (time.perf_counter() - began) - (own - state.seconds)
         fitting = int(min(left / state.seconds * state.iterations, FRAME_ITERATIONS))
         if self._retry and fitting >= 2 * NEAR_ITERATIONS:
@@ -176,7 +179,7 @@ class OnlineEstimator:
             self._await()
             while self._retry:
                 self._try_again(QUICK)
-            # A basis that knows these moduli and poses first, then its corrections.
+            # First a basis that covers these moduli and poses, then its corrections.
             for _ in range(2):
                 if not (self._is_away() or self._lost or self._untrusted):
                     break
@@ -194,7 +197,7 @@ class OnlineEstimator:
                            present(last.state, "state of the last frame").trusted)
 
     def _try_again(self, settings: ReducedStaticSettings) -> None:
-        """Take up a frame that the basis before did not know."""
+        """Process a frame that the previous basis did not cover."""
         frame = self._retry.pop(0)
         found = self._linearised(frame, None, settings)
         if found is None:
@@ -204,7 +207,7 @@ class OnlineEstimator:
             self._step()
 
     def _linearise_all(self) -> None:
-        """Put in place of what was merged on the way the frames themselves, as seen from now."""
+        """Replace merged information by the stored frames, linearised at the current moduli."""
         states = {id(kept.frame): kept.state for kept in self._information.kept}
         known = self._information
         frames = sorted([*(kept.frame for kept in known.kept), *known.past, *self._lost],
@@ -227,7 +230,7 @@ class OnlineEstimator:
                 break
 
     def _is_strange(self) -> bool:
-        """Whether the pull has left what the basis was made from, and it is worth another one."""
+        """Whether the pull has left the range of the basis, and another one is worthwhile."""
         if self._since_basis < 10:
             return False
         return (self._is_away() or len(self._lost) > 2
@@ -244,7 +247,7 @@ class OnlineEstimator:
         self._collect()
 
     def _collect(self) -> None:
-        """Take what the full model has found meanwhile."""
+        """Process the results of the full model so far."""
         if self._making is not None and self._making.done():
             making, self._making = self._making, None
             if making.exception() is None:
@@ -252,7 +255,7 @@ class OnlineEstimator:
                 self.refresh_count += 1
                 self._corrections.forget()
                 self._last, self._untrusted, self._since_basis = None, 0, 0
-                # What is known stays known; its coordinates belong to the old basis.
+                # The information stays valid; its coordinates belong to the old basis.
                 for old in self._information.kept:
                     old.state = None
                 self._retry, self._lost = self._retry + self._lost, []
@@ -262,14 +265,16 @@ class OnlineEstimator:
         found = None if future.exception() is not None else future.result()
         if found is None:
             return
-        # Compared at the moduli that the full model was solved with.
+        # Compared at the moduli of the full model's solve.
         reduced = self._answer(kept.frame, kept.state, found.log_young, _within(FRAME_ITERATIONS))
         if reduced is None:
             return
         self._corrections.add(kept.frame, found, *reduced[1:])
 
     def _ask(self, whole: bool = False) -> bool:
-        """Have the kept frame solved that lies farthest from those that were; whether one was."""
+        """Solve the stored frame that is farthest from the solved ones; return whether there was
+        one.
+        """
         if self._exact is None or self._asked is not None or self._making is not None:
             return False
         if not whole and self._is_strange():
@@ -283,7 +288,7 @@ class OnlineEstimator:
         return True
 
     def _spread_poses(self) -> np.ndarray:
-        """Poses spread over what has been seen, the lost ones among them."""
+        """Poses spread over all those seen, including the lost ones."""
         frames = sorted([*(kept.frame for kept in self._information.kept), *self._lost],
                         key=lambda frame: frame.time)
         chosen = np.unique(np.linspace(0, len(frames) - 1, 24).round().astype(int))
@@ -313,7 +318,7 @@ class OnlineEstimator:
         seen = np.isfinite(measured)
         off = ((rows + more - measured) / self._sigmas)[seen]
         jacobian = ((slopes + steeper) / self._sigmas[:, None])[seen]
-        # A robust share: beyond 4 deviations a residual counts less, once the fit is near.
+        # A robust fraction: beyond 4 deviations a residual counts less, once the fit is near.
         typical = max(1.0, 1.4826 * float(np.median(np.abs(off))) if len(off) else 1.0)
         weight = 1.0 / np.maximum(np.abs(off) / (4.0 * typical), 1.0)
         scaled = jacobian.T * weight
@@ -337,13 +342,13 @@ class OnlineEstimator:
         deviation = np.sqrt(np.diag(self.covariance))
         width = scipy.special.ndtri(0.975) * deviation
         interval = np.exp(self.log_young[:, None] + np.column_stack([-width, width]))
-        # Nobody knows before the first frames of the full model how far off the reduced one is.
+        # The error of the reduced model is unknown before the first frames of the full one.
         checked = self._exact is None or self._corrections.is_checked
         enough = bool(checked and deviation.max() < ENOUGH_DEVIATION)
         return OnlineState(time, self.young, interval, residual, trusted, enough, self._idle())
 
     def _idle(self) -> bool:
-        """By the noise alone: what the full model says now and then is no frame's doing."""
+        """From the noise alone: occasional results of the full model are not due to a frame."""
         widths = self._widths
         widths.append(np.sqrt(np.diag(np.linalg.inv(self._information.normal_gradient(self.log_young)[0]))))
         unknown = self._lost or self._retry or self._is_strange()

@@ -1,4 +1,4 @@
-"""``limber estimate --follow``: read a pull while it is recorded, or replay one at its own pace."""
+"""``limber estimate --follow``: read a pull while it is recorded, or replay it at its own pace."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -36,13 +36,13 @@ SAID = {
     "idle": "continuing this pull adds nothing: the last tenth of the frames narrowed no interval "
     "by 1 %. Pull farther, at another point or in another direction."}
 QUIET_SECONDS = 3.0
-"""A recording that has not grown for so long has ended."""
+"""A recording that has not grown for this long has ended."""
 BLIND_DEVIATION = 1.5
-"""Of log E where nothing is known."""
+"""Deviation of log E if nothing is known."""
 MOVED = 0.03
-"""Travel over the branch's extent from which a recording can be fitted at all."""
+"""Smallest travel over the branch's extent at which a recording can be fitted."""
 PRIOR_DEVIATION = 0.4
-"""Of log E around what the reduced model was built for: it knows no more than twice or half."""
+"""Deviation of log E around the reduced model's training values; it covers a factor of two."""
 
 
 def follow(where: Callable[[], Path], name: str, subject: Subject, settings: EstimateSettings, *,
@@ -50,20 +50,20 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
            progress: Progress = SILENT) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Estimate frame by frame from a pull.
 
-    A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
-    replayed at ``pace`` times its own speed (0: as fast as it goes). The full model corrects the
-    reduced one from a second process; when the pull is over it is waited for.
+    A pull that is still being recorded is read as it grows, as fast as it arrives; a finished one
+    is replayed at ``pace`` times its own speed (0: as fast as possible). The full model corrects
+    the reduced one from a second process; after the pull, its results are awaited.
 
     Args:
-        where: Gives the pull's folder as it is now: when a recording ends, its files move.
-        name: What it is called in messages.
+        where: Returns the pull's current folder: when a recording ends, its files move.
+        name: Name in messages.
         axes: The table of cylinders that were fitted to the scan, or None.
 
     Returns:
         The result, and the estimate after every frame.
 
     Raises:
-        InputError: a pull without markers or without frames.
+        InputError: the pull has no markers or no frames.
     """
     size = _size(where())
     first = read_pull(where())
@@ -72,7 +72,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
                          "Follow a pull with markers, or run `limber estimate` afterwards.")
     begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count)
     if _size(where()) != size:
-        # It is being recorded now: what has been missed is caught up with.
+        # It is being recorded now: missed frames are caught up.
         pace = np.inf
     states: list[OnlineState] = []
     told: set[str] = set()
@@ -108,7 +108,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
 
 def _report(name: str, state: OnlineState, share: float, told: set[str],
             progress: Progress) -> None:
-    """Report how far a pull is known; ``told`` are the sentences that were said already."""
+    """Report how well a pull is known; ``told`` are the sentences already reported."""
     progress(0.5 + 0.45 * share, "following", time_s=state.time,
              young_mpa=" ".join(f"{young / 1e6:.4g}" for young in state.young),
              young_factor=" ".join(f"{np.sqrt(high / low):.3g}" for low, high in state.interval),
@@ -120,7 +120,7 @@ def _report(name: str, state: OnlineState, share: float, told: set[str],
 
 
 def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[str, Any]:
-    """The last interval together with what the scan's radii leave open, as an estimate's."""
+    """The last interval combined with the uncertainty of the scan's radii, as in an estimate."""
     if axes is None:
         return {}
     radii = geometry_error(axes, subject.mesh, subject.weights)
@@ -134,9 +134,9 @@ class Begun:
 
     Attributes:
         reduced: The reduced model.
-        branch: What the full model is made of.
-        pull: As far as it was recorded.
-        prior_deviation: Of log E.
+        branch: Data from which the full model is made.
+        pull: The recording so far.
+        prior_deviation: Standard deviation of log E.
     """
 
     reduced: ReducedModel
@@ -145,7 +145,7 @@ class Begun:
     prior_deviation: float
 
     def estimator(self, exact: Beside | Here | None) -> OnlineEstimator:
-        """Return the estimator that takes the frames."""
+        """Return the estimator that processes the frames."""
         sensor = self.pull.entry.sensor
         return OnlineEstimator(
             self.reduced, self.pull.entry.grasp, self.branch.mesh, self.branch.rest_points,
@@ -157,9 +157,9 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
           training_count: int) -> Begun:
     """Build the reduced model around an earlier estimate or a rough fit.
 
-    A basis knows moduli within its training's spread; around a uniform guess that spread would
-    have to be so wide that the basis is good nowhere. Where nothing has moved yet there is no
-    better; the basis is then made again on the way.
+    A basis is valid for moduli within its training's spread; around a uniform guess that spread
+    would be so wide that the basis is inaccurate everywhere. Without any motion yet there is no
+    better guess; the basis is then made again during the pull.
     """
     start, deviation, spread = subject.start, PRIOR_DEVIATION, 2.0
     field = subject.mesh.cell_data["young"]
@@ -190,7 +190,7 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
 
 
 def _rough(pull: Pull, subject: Subject, settings: EstimateSettings) -> Values | None:
-    """A quick fit of what there is; None where the branch has not moved yet."""
+    """A quick fit of the recording so far; None if the branch has not moved yet."""
     way = np.linalg.norm(pull.poses[:, :3] - pull.entry.grasp.point_m, axis=1)
     if way.max(initial=0.0) < MOVED * subject.model.extent:
         return None
@@ -208,7 +208,7 @@ def _size(folder: Path) -> int:
     try:
         return sum(path.stat().st_size for path in folder.glob("*.csv"))
     except FileNotFoundError:
-        # Moved between the two looks.
+        # Moved between the two checks.
         return -1
 
 
@@ -224,8 +224,7 @@ def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame,
             try:
                 frames = list(online_frames(clean(read_pull(folder))))
             except InputError:
-                # Caught in the middle of being written or moved, or too little yet: the next look
-                # tells.
+                # Being written or moved at this moment, or too short yet: try again later.
                 if pace == 0:
                     raise
         fresh = [frame for frame in frames if frame.time > sent]
@@ -244,7 +243,7 @@ def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame,
 
 
 def online_frames(pull: Pull) -> Iterator[OnlineFrame]:
-    """Return the aligned frames of what has been recorded so far."""
+    """Return the aligned frames of the recording so far."""
     seen = pull.observations
     frames = frames_of(pull if seen is None else replace(
         pull, observations=Observations(seen.times, seen.positions)))

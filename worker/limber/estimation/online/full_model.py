@@ -1,8 +1,8 @@
-"""The full model beside an online estimate: single frames, solved in another process.
+"""The full model for an online estimate: single frames, solved in another process.
 
-The reduced model answers within a frame's time, and is off by more than the sensors' noise where
-its training did not go. One frame of the full model takes longer than a frame, not than a pull:
-what it says of some frames corrects the reduced model's answers at all of them.
+The reduced model answers within a frame's time, but outside its training range its error exceeds
+the sensors' noise. The full model needs longer than a frame but not longer than a pull: its
+solutions at some frames correct the reduced model at all of them.
 """
 
 from concurrent.futures import Future
@@ -25,9 +25,9 @@ from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Trainer, sample_young
 
 REFRESH_STATES = 24
-"""Full solutions of a basis that is made while a pull goes on."""
+"""Full solutions of a basis that is made during a pull."""
 REFRESH_SPREAD = 1.5
-"""Factor in Young's modulus within which they are sampled; as for a fit, chosen."""
+"""Factor in Young's modulus within which they are sampled. Chosen, not measured, as for a fit."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ExactFrame:
     Attributes:
         log_young: At the control points, shape [K].
         moved: Displacement of the observed points [m], shape [m, 3].
-        force: Of the gripper on the branch [N], shape [3].
+        force: Force of the gripper on the branch [N], shape [3].
         d_moved, d_force: Derivatives to log E, shape [m, 3, K] and [3, K].
     """
 
@@ -50,15 +50,15 @@ class ExactFrame:
 
 @dataclass(frozen=True)
 class FullBranch:
-    """The full model of a branch held at a recorded grasp, made from what a process can be sent.
+    """The full model of a branch held at a recorded grasp, from data that a process can be sent.
 
     Attributes:
         mesh: With Poisson's ratio and density.
         weights: From control points to tetrahedra, shape [tet_count, K].
         entry: The recorded grasp.
         rest_points: Observed points at rest [m], shape [m, 3].
-        poisson, density, gravity, point_masses: Of the branch.
-        hangs: Whether its weight has bent it to the mesh's shape already.
+        poisson, density, gravity, point_masses: Those of the branch.
+        hangs: Whether the mesh's shape includes the bending by its weight.
     """
 
     mesh: TetMesh
@@ -120,7 +120,7 @@ class ExactSolver:
 
 
 class Beside:
-    """Runs an :class:`ExactSolver` in a process of its own; close it, or use it in a ``with``."""
+    """Runs an :class:`ExactSolver` in a separate process; close it, or use it in a ``with``."""
 
     def __init__(self, branch: FullBranch):
         self._pool = Pool(1, begin=_begin, begin_arguments=(branch,),
@@ -143,7 +143,7 @@ class Beside:
 
 
 class Here:
-    """The same in this process, at once: what is asked for is there when the call returns."""
+    """The same in this process: the result is available when the call returns."""
 
     def __init__(self, branch: FullBranch):
         self._solver = ExactSolver(branch)

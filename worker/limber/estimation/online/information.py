@@ -13,9 +13,9 @@ class OnlineFrame:
 
     Attributes:
         time: [s].
-        pose: Of the grasp point [m, rad], shape [6].
-        force: Gripper on branch [N], shape [3]; NaN where not measured.
-        positions: Observed points [m], shape [m, 3]; NaN where not seen.
+        pose: Pose of the grasp point [m, rad], shape [6].
+        force: Force of the gripper on the branch [N], shape [3]; NaN if not measured.
+        positions: Observed points [m], shape [m, 3]; NaN if not observed.
     """
 
     time: float
@@ -29,8 +29,9 @@ class Kept:
     """A frame as linearised at ``centre``, log E of shape [K].
 
     Attributes:
-        state: The reduced model's; None: it belongs to another basis.
-        normal, gradient: Of half its squared residuals, shapes [K, K] and [K].
+        state: State of the reduced model; None: it belongs to another basis.
+        normal, gradient: Normal matrix and gradient of half its squared residuals, shapes [K, K]
+        and [K].
         residual: Root mean square of the standardised residuals.
     """
 
@@ -43,7 +44,7 @@ class Kept:
 
 
 class Information:
-    """What is known of log E: a prior, frames that are kept, and what others said.
+    """The information on log E: a prior, kept frames, and merged frames.
 
     Args:
         centre: Mean of the prior, shape [K].
@@ -60,12 +61,13 @@ class Information:
         self._normal, self._gradient = np.zeros((count, count)), np.zeros(count)
 
     def add(self, new: Kept) -> None:
-        """Keep a frame; one that says little of its own is merged where they are too many."""
+        """Keep a frame; if there are too many, the least informative one is merged."""
         self.kept.append(new)
         self.kept.sort(key=lambda kept: kept.frame.time)
         if len(self.kept) <= self._kept_count:
             return
-        # The frame whose pose is nearest to its neighbours' says least of its own: it is merged.
+        # The frame whose pose is nearest to its neighbours' adds the least information: it is
+        # merged.
         poses = np.array([kept.frame.pose for kept in self.kept])
         steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
         gone = self.kept.pop(int(np.argmin(steps[:-1] + steps[1:])) + 1)
@@ -79,7 +81,7 @@ class Information:
         self._normal[:], self._gradient[:] = 0.0, 0.0
 
     def normal_gradient(self, log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of all that is known, at these moduli: shapes [K, K] and [K]."""
+        """Normal matrix and gradient of all information, at these moduli: shapes [K, K] and [K]."""
         centre, precision = self._prior
         normal = precision + self._normal
         gradient = precision @ (log_young - centre)

@@ -1,1 +1,1 @@
-"""How far an estimate can be believed: unknowns beside the moduli, intervals, causes."""
+"""Reliability of an estimate: unknowns in addition to the moduli, intervals, causes."""

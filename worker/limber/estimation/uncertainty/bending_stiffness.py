@@ -15,12 +15,12 @@ from limber.geometry.tets.tet_mesh import TetMesh
 
 @dataclass(frozen=True)
 class SectionMean:
-    """Takes the mean over a control point's part of the main path, by length.
+    """Computes the mean over a control point's section of the main path, by length.
 
     Attributes:
         low, high: Lower and upper node of the cylinder around each tetrahedron, shape [tet_count].
         fraction: Position of the tetrahedron between the two, shape [tet_count].
-        weights: Part of each tetrahedron in the mean of each control point, shape [K, tet_count].
+        weights: Weight of each tetrahedron in the mean of each control point, shape [K, tet_count].
     """
 
     low: np.ndarray
@@ -35,10 +35,10 @@ class SectionMean:
         Args:
             skeleton: The axes and radii of the mesh.
             mesh: The branch's tetrahedra.
-            weights: Part of each control point in each tetrahedron, shape [tet_count, K].
+            weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
         """
         low, high, fraction, _ = on_cylinders(skeleton, mesh.centroids)
-        # A twig's own bending has no part in that of the branch which carries it.
+        # A twig's own bending does not contribute to that of the branch which carries it.
         weights = weights * np.isin(high, skeleton.main_path())[:, None]
         radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
         # Volume over cross-section: each piece of the branch counts by its length.

@@ -1,4 +1,4 @@
-"""How sure an estimate is: covariance and intervals, and which measurements do not fit."""
+"""Uncertainty of an estimate: covariance and intervals, and measurements that do not fit."""
 
 from dataclasses import dataclass
 from typing import TypedDict
@@ -10,26 +10,26 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.recordings.cell_errors import calibration_of
 
 OUTLIER = 4.5
-"""Standardised residual (RMS over axes) from which a measurement is named an outlier: chosen,
-far beyond normal noise."""
+"""Standardised residual (RMS over axes) above which a measurement is reported as an outlier.
+Chosen, not measured: far beyond normal noise.
+"""
 OUTLIER_SHARE = 0.15
-"""Above this share of residuals far off, the others are not the truth about the noise: chosen."""
+"""Fraction of distant residuals above which the others do not give the true noise. Chosen."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the free vector and of the moduli.
+    """Uncertainty of the free vector and of the moduli.
 
     Attributes:
-        covariance: Of the free vector, shape [p, p].
+        covariance: Covariance of the free vector, shape [p, p].
         young_interval: 95 % intervals at the control points [Pa], shape [K, 2].
-        variance_factor: Mean squared residual over the one expected; 1 where the noise is as
-            stated.
-        correlation: Of the free vector, shape [p, p].
-        repetition: How many frames in a row say the same thing: 1 where their errors are
+        variance_factor: Mean squared residual over the expected one; 1 if the noise is as stated.
+        correlation: Correlation of the free vector, shape [p, p].
+        repetition: Number of successive frames with the same error: 1 if their errors are
             independent.
-        recording_spread: Standard deviation of log E, all alike, from recording to recording.
-        quantile: How many deviations the half width of a 95 % interval has (Student's t).
+        recording_spread: Standard deviation of log E between recordings, common to all moduli.
+        quantile: Number of deviations in the half width of a 95 % interval (Student's t).
     """
 
     covariance: np.ndarray
@@ -42,28 +42,28 @@ class Uncertainty:
 
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
-    """Gauss' approximation at the fit's end.
+    """Gauss' approximation at the end of the fit.
 
-    The stated noise is scaled by what the residuals show, each kind of residual weighing as in
-    the fit; a robust share of the residuals is used, so that outliers do not widen the interval.
-    Errors that last from frame to frame, as those of points found in depth images do, do not
-    average out: the covariance grows by how many frames repeat each other. What the mesh gets
-    wrong is not in it (:mod:`limber.estimation.uncertainty.model_error`).
+    The stated noise is scaled according to the residuals, each kind of residual weighted as in the
+    fit; a robust fraction of the residuals is used, so that outliers do not widen the interval.
+    Errors that persist from frame to frame, such as those of points found in depth images, do not
+    average out: the covariance is multiplied by the number of frames with the same error. The error
+    of the mesh is not included (:mod:`limber.estimation.uncertainty.model_error`).
     """
-    # Priors and links are no measurements: neither do they tell the noise, nor does its scale act
-    # on them.
+    # Priors and links are not measurements: they do not determine the noise, and its scale does not
+    # apply to them.
     count = len(evaluation.residual) - objective.space.own_row_count
     jacobian, residual = evaluation.slopes[:count], evaluation.residual[:count]
     freedom = max(len(residual) - jacobian.shape[1] - evaluation.unknown_count, 1)
-    # Huber's proposal: residuals beyond 3 deviations count as 3. Where they are many they are no
-    # outliers, but a model that does not fit.
+    # Huber's proposal: residuals beyond 3 deviations count as 3. If there are many, they are not
+    # outliers, but the model does not fit.
     limit = 3 * _scale(residual)
     stray = float(np.mean(np.abs(residual) > 1.5 * limit))
     clipped = np.clip(residual, -limit, limit) if stray < OUTLIER_SHARE else residual
     factor = float(clipped @ clipped / freedom)
     if _from_images(objective):
-        # Their stated error lasts from frame to frame: that residuals scatter less is no sign
-        # that it is smaller.
+        # Their stated error persists from frame to frame: a smaller scatter of the residuals does
+        # not show that it is smaller.
         factor = max(factor, 1.0)
     repetition = repeated(objective.standardised(evaluation))
     covariance = inverse_information(scaled_rows(evaluation.slopes, objective.space.own_row_count,
@@ -76,7 +76,7 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     quantile = float(scipy.special.stdtrit(freedom, 0.5 + level / 2))
     width = quantile * deviation
     space = objective.space
-    # Wider than 30 orders of magnitude says no more than that nothing is known.
+    # Wider than 30 orders of magnitude means unknown.
     width = np.minimum(width, 70.0)
     centre = evaluation.free
     low, high = space.unpack(centre - width), space.unpack(centre + width)
@@ -88,12 +88,12 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
 
 
 def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarray:
-    """Standardised residuals, or their slopes, with the noise that they show themselves.
+    """Standardised residuals, or their slopes, scaled by the noise of the residuals.
 
     Args:
-        rows: As of an evaluation; the last are priors and links, which stay.
-        own_row_count: How many these are.
-        scale: Variance of what was measured over the stated.
+        rows: As of an evaluation; the last are priors and links, which are not scaled.
+        own_row_count: Number of these.
+        scale: Variance of the measurements over the stated one.
     """
     scaled, count = rows.copy(), len(rows) - own_row_count
     scaled[:count] /= np.sqrt(max(scale, 1e-300))
@@ -108,14 +108,14 @@ def inverse_information(slopes: np.ndarray) -> np.ndarray:
 
 
 def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:
-    """Standard deviation of log E, all alike, from recording to recording.
+    """Standard deviation of log E between recordings, common to all moduli.
 
-    Each pull alone asks for a step of the common scale, known to within its own noise; by how much
-    more these steps differ is the spread (DerSimonian and Laird's random effect). Few pulls tell
-    it badly: what the calibration says of it counts as one further recording.
+    Each pull alone gives a step of the common scale, known to within its own noise; the excess
+    scatter of these steps is the spread (DerSimonian and Laird's random effect). Few pulls
+    determine it badly, so the calibration's value counts as one further recording.
 
     Args:
-        scale: Variance of what was measured over the stated.
+        scale: Variance of the measurements over the stated one.
     """
     stated = float(np.mean([calibration_of(forward.entry).repeat_sigma
                             for forward in objective.forwards]))
@@ -148,12 +148,12 @@ def recording_spread(evaluation: Evaluation, objective: Objective, scale: float)
 def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Integrated autocorrelation of residuals over the frames, all points and axes together.
 
-    1 + 2 sum of the correlations at growing lags, up to the first that is lost in its own noise,
-    or lies well past what is found so far (Sokal's estimate of how many samples of a sequence are
-    worth one independent sample).
+    1 + 2 sum of the correlations at increasing lags, up to the first that is below its own noise,
+    or well beyond the current result (Sokal's estimate of the number of samples of a sequence per
+    independent sample).
 
     Args:
-        series: Per pull, residuals of points [f, m, 3] and of force [f, 3], NaN where none.
+        series: Per pull, residuals of points [f, m, 3] and of force [f, 3], NaN if there are none.
     """
     product, count = np.zeros(0), np.zeros(0)
     for points, forces in series:
@@ -179,7 +179,7 @@ def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
 
 
 class Outlier(TypedDict):
-    """A measurement that does not fit: of which pull, when [s], of what, by how many deviations."""
+    """A measurement that does not fit: its pull, time [s], kind, and number of deviations."""
 
     pull: str
     time_s: float

@@ -1,4 +1,4 @@
-"""How long a piece the gripper holds, carried to Young's modulus."""
+"""Effect of the held length on Young's modulus."""
 
 import numpy as np
 
@@ -11,15 +11,16 @@ from limber.recordings.cell_errors import calibration_of
 def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
     """Relative standard deviation of E from the length in a clamping gripper, shape [K].
 
-    By pads that give way, and by where the branch leaves its jaws, that length is never known to
-    the millimetre (``held_length_sigma_m`` of the calibration); it is alike in all pulls.
+    Because of soft pads and the position where the branch leaves the jaws, that length is never
+    known to a millimetre (``held_length_sigma_m`` of the calibration). Its error is the same in all
+    pulls.
 
     Args:
-        evaluation: At the fit's end.
-        objective: What was minimised.
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
 
     Returns:
-        None where no gripper clamps or its length is known, or as
+        None if no gripper clamps or its length is known, or as for
         :func:`limber.estimation.uncertainty.shape_sensitivity.taken_up`.
     """
     if not any(forward.entry.grasp.mode == "clamped"

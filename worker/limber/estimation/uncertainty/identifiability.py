@@ -1,4 +1,4 @@
-"""What a pull can determine, computed before the fit."""
+"""What a pull can determine; computed before the fit."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,11 @@ from limber.estimation.fitting.objective import Evaluation
 from limber.estimation.parameters import ParameterSpace
 
 UNRESOLVED_DEVIATION = 0.5
-"""A modulus whose logarithm has a larger standard deviation is linked to its neighbour: chosen."""
+"""Deviation of a log E above which the modulus is linked to its neighbour. Chosen."""
 SCALE_DEVIATION = 0.7
-"""The data must give the scale of all moduli together better than this (in its logarithm): a
-factor of two, chosen."""
+"""Largest deviation of the common scale of all moduli (in its logarithm) from the data: a factor of
+two. Chosen, not measured.
+"""
 
 
 @dataclass(frozen=True)
@@ -20,10 +21,10 @@ class Identifiability:
     """Singular values of the sensitivity matrix and the resulting standard deviations.
 
     Attributes:
-        singular_values: Of the derivative of the standardised residuals to the free vector,
-            largest first, shape [p].
-        deviations: Standard deviation that each free value would have, shape [p].
-        scale_deviation: That of the common scale of all moduli.
+        singular_values: Singular values of the derivative of the standardised residuals to the free
+            vector, largest first, shape [p].
+        deviations: Standard deviation of each free value, shape [p].
+        scale_deviation: Standard deviation of the common scale of all moduli.
     """
 
     singular_values: np.ndarray
@@ -36,7 +37,7 @@ def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiab
     jacobian = evaluation.slopes
     values = np.linalg.svd(jacobian, compute_uv=False)
     together = np.r_[np.ones(space.group_count), np.zeros(space.size - space.group_count)]
-    # Of the scale with the ratios known: the best that the data can do for it.
+    # Deviation of the scale if the ratios are known: the best possible from the data.
     information = float(np.sum((jacobian @ together)**2))
     return Identifiability(values, evaluation.deviations,
                            float(information**-0.5) if information > 0 else np.inf)
@@ -46,7 +47,7 @@ def require_scale(found: Identifiability) -> None:
     """Reject data that do not determine the overall scale of Young's modulus.
 
     Raises:
-        InputError: with the reason.
+        InputError: the data do not determine it; states the reason.
     """
     if found.scale_deviation <= SCALE_DEVIATION:
         return
@@ -65,9 +66,9 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
     """Link control points that the data do not determine to a neighbour.
 
     A link is not an equality: the two may differ by a factor of ten, and the interval includes
-    that. With an equality both moduli would be wrong, with intervals that are too narrow.
-    The worst-determined modulus is linked to the neighbour that is known better, until all others
-    are resolved. Returns the space, with a sentence for each link.
+    that. With an equality both moduli would be wrong, with intervals that are too narrow. The
+    worst-determined modulus is linked to the better-known neighbour, until all others are resolved.
+    Returns the space, with a sentence for each link.
 
     Args:
         evaluation: With derivatives; its last rows are those of the space's links.

@@ -1,11 +1,11 @@
-"""The moduli that are likeliest when every form of their field counts, not its likeliest alone.
+"""The most likely moduli over all forms of their field, not for the most likely form alone.
 
-A fit ends at the moduli and the form that are likeliest together. But the form acts the more the
-more neighbouring moduli differ: under steeper moduli a pull leaves a smaller part of the forms that
-were thought possible, which the likeliest form does not show. With the form integrated out by
+A fit ends at the most likely combination of moduli and form. But the effect of the form increases
+with the difference of neighbouring moduli: with steeper moduli a pull leaves a smaller fraction of
+the prior forms possible, which the most likely form does not show. With the form integrated out by
 Laplace's approximation, the density of the moduli is that along the fit's valley over the root of
-the determinant of what is known of all else, and its mode lies towards smaller steps: by a
-hundredth or two of a modulus, where the form matters.
+the determinant of the information on all other unknowns. Its mode is at smaller steps: by one or
+two hundredths of a modulus, if the form matters.
 """
 
 import numpy as np
@@ -18,12 +18,13 @@ from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import ParameterSpace
 
 LONGEST_STEP = 0.5
-"""In standard deviations; beyond it the approximation says nothing, and the fit is left alone."""
+"""In standard deviations; beyond it the approximation is invalid, and the fit is kept."""
 
 
 def averaged(fit: Fit, objective: Objective) -> Fit:
-    """Return the fit moved to the mode of the moduli's marginal density; itself where the form of
-    the field is no unknown."""
+    """Return the fit moved to the mode of the moduli's marginal density; unchanged if the form of
+    the field is not an unknown.
+    """
     full = objective.forwards[0].full
     if not isinstance(full, QuasiStaticForward | DynamicForward):
         return fit
@@ -39,10 +40,10 @@ def averaged(fit: Fit, objective: Objective) -> Fit:
 
 
 def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungField) -> np.ndarray:
-    """Way from the joint mode to the marginal one in the free vector, shape [p].
+    """Step from the joint mode to the marginal one in the free vector, shape [p].
 
     Args:
-        evaluation: At the fit's end, with derivatives.
+        evaluation: At the end of the fit, with derivatives.
         field: Its further unknowns are among the free ones.
     """
     count = space.group_count

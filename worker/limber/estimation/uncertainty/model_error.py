@@ -1,8 +1,9 @@
-"""What a fit cannot see of its own error: the branch's shape, and the mesh.
+"""Errors that the residuals of a fit do not show: the branch's shape and the mesh.
 
-Residuals tell how well the data fix Young's modulus of the model. If the model is too thick, or
-its mesh too stiff, the fit is as good and the modulus wrong. Both are known otherwise: the scan
-says how sure each radius is, and a finer mesh how much stiffer this one is than the body.
+Residuals show how well the data determine Young's modulus of the model. If the model is too thick
+or its mesh too stiff, the fit is as good and the modulus wrong. Both errors are known from
+elsewhere: the scan gives the uncertainty of each radius, and a finer mesh the excess stiffness of
+this one.
 """
 
 from collections.abc import Sequence
@@ -23,15 +24,17 @@ from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces
 
 RADIUS_POWER = 4.0
-"""Bending stiffness is Young's modulus times radius to the fourth: one can stand for the other."""
+"""Bending stiffness is Young's modulus times the radius to the fourth power."""
 REFINED_LIMIT = 60_000
-"""Tetrahedra of a refined mesh from which its check is left out: it would take minutes."""
+"""Tetrahedra of a refined mesh above which its check is left out: it would take minutes."""
 SMALL = 1e-6
 """Displacement over the length of an element at which the response is linear."""
 REMAINING = 4 / 3
-"""Error over its drop when edges are halved, at second order."""
+"""Error over its decrease when edges are halved, at second order."""
 UNSURE = 1 / 3
-"""Part of that drop by which the error may be another: singular corners converge slower."""
+"""Uncertainty of the remaining error as a fraction of that drop: singular corners converge more
+slowly.
+"""
 
 
 @dataclass(frozen=True)
@@ -39,20 +42,20 @@ class ModelError:
     """Relative standard deviations of Young's modulus that no residual shows.
 
     Attributes:
-        geometry: At the control points, from what the scan leaves open, shape [K]; None where
-            the branch's radii came without a deviation.
-        bending: What of ``geometry`` is left in bending stiffness E I, shape [K]; 0 where an error
-            of the radii is the same all over a control point's part of the branch.
-        mesh: From the mesh, shape [K]; None where it was not measured.
+        geometry: At the control points, from the uncertainty of the scan, shape [K]; None if the
+            branch's radii have no deviation.
+        bending: Remainder of ``geometry`` in the bending stiffness E I, shape [K]; 0 if an error of
+            the radii is constant over a control point's section of the branch.
+        mesh: From the mesh, shape [K]; None if it was not measured.
         axis_is_exact: Whether ``geometry`` is of the radii alone (:func:`geometry_error`), not
             of axis and radii (:func:`limber.estimation.uncertainty.shape_error.shape_error`).
         mesh_factor: Young's modulus of the material over that of the model on its mesh, which is
-            too stiff by as much; shape [K]. ``mesh`` is what that leaves open.
-        path: From the gripper's frame where its path leads the fit, shape [K]; None where none
-            does (:func:`limber.estimation.uncertainty.path_error.path_error`).
-        hung: From the mass of twigs and leaves beside the mesh, shape [K]; None where there are
-            none (:func:`limber.estimation.uncertainty.shape_error.hung_error`).
-        grip: From the length of the piece in a clamping gripper, shape [K]; None where none clamps
+            too stiff by this factor; shape [K]. ``mesh`` is its uncertainty.
+        path: From the gripper's frame if its path drives the fit, shape [K]; None if no path does
+            (:func:`limber.estimation.uncertainty.path_error.path_error`).
+        hung: From the mass of twigs and leaves outside the mesh, shape [K]; None if there are none
+            (:func:`limber.estimation.uncertainty.shape_error.hung_error`).
+        grip: From the length of the piece in a clamping gripper, shape [K]; None if none clamps
             (:func:`limber.estimation.uncertainty.grip_error.grip_error`).
     """
 
@@ -79,16 +82,16 @@ class ModelError:
 def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.ndarray | None:
     """Relative standard deviation of E at the control points from that of the radii.
 
-    Errors of neighbouring radii come from the same side of the same scan: within a control
-    point's part of the branch they are taken to be the same, not to average out.
+    Errors of neighbouring radii come from the same side of the same scan: within a control point's
+    section of the branch they are assumed to be equal, and do not average out.
 
     Args:
         cylinders: ``skeleton.csv`` of a branch folder.
         mesh: The branch's tetrahedra.
-        weights: Part of each control point in each tetrahedron, shape [tet_count, K].
+        weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
 
     Returns:
-        Shape [K], or None where no radius has a deviation.
+        Shape [K], or None if no radius has a deviation.
     """
     names = ("sx", "sy", "sz", "ex", "ey", "ez", "radius")
     table = read_columns(cylinders, names, "a cylinder model")
@@ -106,11 +109,11 @@ def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class MeshStiffness:
-    """How much a mesh is too stiff.
+    """Excess stiffness of a mesh.
 
     Attributes:
-        factor: Young's modulus of the material over that with which the mesh bends as the
-            material does, at the control points, shape [K].
+        factor: Young's modulus of the material over that for which the mesh bends as the material
+            does, at the control points, shape [K].
         deviation: Relative standard deviation of that factor, shape [K].
     """
 
@@ -120,7 +123,7 @@ class MeshStiffness:
 
 @dataclass(frozen=True)
 class SmallLoad:
-    """What bends a branch a little: a force at the grasp, and weight.
+    """Small loads on a branch: a force at the grasp, and weight.
 
     Attributes:
         force: Shape [3].
@@ -133,22 +136,23 @@ class SmallLoad:
 
 def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.ndarray,
                young: np.ndarray, loads: Sequence[SmallLoad] = ()) -> MeshStiffness | None:
-    """Find how much the mesh is too stiff.
+    """Find the excess stiffness of the mesh.
 
-    Loads bend the branch a little on this mesh and on a refined one; the moduli that make this
-    one bend like the refined one differ by the mesh's error. That is not the same everywhere (most
-    of it stands at the clamp), nor for every load: it is looked at where the fit looked.
+    Small loads bend the branch on this mesh and on a refined one; the moduli for which this one
+    bends like the refined one differ by the mesh's error. The error varies along the branch (most
+    of it is at the clamp) and between loads, so it is evaluated for the observations and loads of
+    the fit.
 
     Args:
         model: The branch; its own gravity is left out.
-        grasp: Where a force acts.
-        operator: Displacement of what was observed from the nodes', shape [3 m, 3 n]; sparse.
-        weights: Part of each control point in each tetrahedron, shape [tet_count, K].
+        grasp: Grasp at which a force acts.
+        operator: Displacement of the observations from the nodes', shape [3 m, 3 n]; sparse.
+        weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
         young: At the control points [Pa], shape [K].
-        loads: Of any size; without them two forces across the branch.
+        loads: Loads of any size; without them two forces across the branch.
 
     Returns:
-        None where the refined mesh is too large, or gives no answer.
+        None if the refined mesh is too large, or gives no result.
     """
     mesh = model.mesh
     if 8 * mesh.tet_count > REFINED_LIMIT or not mesh.is_quadratic:
@@ -173,7 +177,7 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
             continue
         # The refined mesh has the coarse one's nodes first.
         missing.append(operator @ (more[:mesh.node_count] - moved).ravel() / size)
-        # So little that the force is linear in it.
+        # Small enough that the force is linear in it.
         little = SMALL * model.mean_edge / np.abs(moved).max()
         slopes.append(np.column_stack([
             operator @ ours.solve(-partial).ravel()
@@ -183,10 +187,10 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
     lacking, slope = np.concatenate(missing), np.vstack(slopes)
     together = slope.sum(axis=1)
     alike = float(lacking @ together / (together @ together))
-    # Around the change alike everywhere, as far as the response tells the moduli apart.
+    # Beside the common change, as far as the response distinguishes the moduli.
     apart = np.linalg.lstsq(slope, lacking - alike * together, rcond=0.03)[0]
-    # What all moduli have in common is told well and corrected; the rest shows how unevenly the
-    # mesh errs, and is left open.
+    # The common part is well determined and corrected; the rest, the uneven error of the mesh,
+    # stays in the uncertainty.
     count = len(young)
     return MeshStiffness(np.full(count, np.exp(-REMAINING * alike)),
                          np.hypot(UNSURE * alike, REMAINING * apart) * np.ones(count))
@@ -194,12 +198,12 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
 
 def observer(mesh: TetMesh, forwards: Sequence[Forward], grasp: Grasp, points: np.ndarray,
              ) -> sparse.csr_matrix:
-    """Displacement of what pulls observed from that of the nodes, shape [3 m, 3 n].
+    """Displacement of the pulls' observations from that of the nodes, shape [3 m, 3 n].
 
-    The points; and the gripper, where its path and force were measured together.
+    The points; and the gripper, if its path and force were measured together.
 
     Args:
-        points: Taken where no pull observes any [m], shape [k, 3].
+        points: Used if no pull observes any [m], shape [k, 3].
     """
     places = [forward.rest_points for forward in forwards if len(forward.rest_points)]
     rows = [point_operator(mesh, np.unique(np.vstack(places), axis=0) if places else points)]
@@ -211,7 +215,7 @@ def observer(mesh: TetMesh, forwards: Sequence[Forward], grasp: Grasp, points: n
 
 
 def steady_loads(forwards: Sequence[Forward]) -> list[SmallLoad]:
-    """The stated loads of pulls without a robot, with the weight that bent the branch as well."""
+    """The stated loads of pulls without a robot, and the weight if it bent the branch as well."""
     return [SmallLoad(forward.frames.wrenches[-1, :3],
                       np.array(forward.entry.gravity_m_s2 or (0.0, 0.0, 0.0)))
             for forward in forwards if forward.force_is_stated]
@@ -225,7 +229,7 @@ def _nodal(model: BranchModel, grasp: Grasp, load: SmallLoad) -> np.ndarray:
 
 
 def _across(grasp: Grasp, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across the way from base to grasp."""
+    """Two unit vectors perpendicular to the line from base to grasp."""
     axis = grasp.centre - base.mean(axis=0)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
@@ -243,12 +247,12 @@ def refined(mesh: TetMesh) -> TetMesh:
 
 
 def total_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> np.ndarray:
-    """95 % interval [Pa] of the material's modulus, all parts together, shape [K, 2].
+    """95 % interval [Pa] of the material's modulus, with all parts combined, shape [K, 2].
 
     Args:
         young: Estimated on the mesh [Pa], shape [K].
         sensor: 95 % interval from the sensors alone [Pa], shape [K, 2].
-        error: What the fit does not see.
+        error: Errors that the fit does not show.
     """
     return _interval(young, sensor, error.total(np.zeros(len(young))), error.mesh_factor)
 
@@ -256,7 +260,7 @@ def total_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> 
 def bending_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> np.ndarray:
     """95 % interval of E I over the I of the skeleton [Pa], shape [K, 2].
 
-    Arguments as of :func:`total_interval`.
+    Arguments as for :func:`total_interval`.
     """
     return _interval(young, sensor, error.total_of_bending(np.zeros(len(young))),
                      error.mesh_factor)
@@ -266,7 +270,7 @@ def _interval(young: np.ndarray, sensor: np.ndarray, deviation: np.ndarray,
               factor: np.ndarray | float) -> np.ndarray:
     other = 1.96 * deviation
     middle, low, high = (np.log(values) for values in (young, *sensor.T))
-    # The sensors' part may be one-sided, where a bound of the modulus cuts it.
+    # The sensors' part may be one-sided if a bound of the modulus truncates it.
     spread = np.column_stack([middle - np.hypot(middle - low, other),
                               middle + np.hypot(high - middle, other)])
     return np.exp(spread) * np.reshape(factor, (-1, 1))

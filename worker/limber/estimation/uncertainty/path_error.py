@@ -1,10 +1,10 @@
-"""Uncertainty of Young's modulus from the gripper's frame where its path is prescribed.
+"""Uncertainty of Young's modulus from the gripper's frame if its path is prescribed.
 
-Where the force leads, the gripper's frame is an unknown of the fit
-(:mod:`limber.estimation.fitting.nuisances`). Where the recorded path leads (no force, or of a
-clamped grasp no torque; asked for; a fast pull; a reduced model) the branch is held where the
-record says. How
-the pull would differ with the frame a little aside, the fit would have taken up in the moduli.
+If the force drives the pull, the gripper's frame is an unknown of the fit
+(:mod:`limber.estimation.fitting.nuisances`). If the recorded path drives it (no force, or no torque
+for a clamped grasp; on request; a fast pull; a reduced model), the branch is held at the recorded
+path. The fit would have attributed the effect of a small displacement of the frame on the pull to
+the moduli.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,11 @@ from limber.estimation.forward.forward_model import Forward
 from limber.recordings.cell_errors import CalibrationEntry, calibration_of
 
 STEP = 0.1
-"""Part of its deviation by which the frame is moved: a slender branch, stretched by all of it,
-would answer far from linearly."""
+"""Fraction of its deviation by which the frame is moved: a slender branch, stretched by the whole
+deviation, would respond far from linearly.
+"""
 WIDEST = 35.0
-"""Deviation of a log E that says no more than that nothing is known."""
+"""Standard deviation of log E that means unknown."""
 
 
 def led_by_path(forwards: Sequence[Forward]) -> list[Forward]:
@@ -37,8 +38,8 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
     six errors, of its deviation in the calibration.
 
     Args:
-        evaluation: At the fit's end.
-        objective: What was minimised.
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
 
     Returns:
         None if a simulation finds no equilibrium.
@@ -69,7 +70,7 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
 
 def _aside(poses: np.ndarray, calibration: CalibrationEntry, pivot: np.ndarray,
            error: int) -> np.ndarray:
-    """Poses [m, rad], shape [f, 6], with the frame moved or turned about the grasp at rest."""
+    """Poses [m, rad], shape [f, 6], with the frame moved or rotated about the grasp at rest."""
     moved = poses.copy()
     if error < 3:
         moved[:, error] += STEP * calibration.pose_sigma_m
@@ -83,7 +84,8 @@ def _aside(poses: np.ndarray, calibration: CalibrationEntry, pivot: np.ndarray,
 def _evaluated(evaluation: Evaluation, objective: Objective, forwards: list[Forward], *,
                jacobian: bool = False) -> Evaluation | None:
     alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
-    # A force with errors of its own is eliminated by its response, which comes with derivatives.
+    # A force with errors of its own is eliminated by its response, which is computed with the
+    # derivatives.
     linearised = any(forward.has_force_unknowns and not forward.watches_pose
                      for forward in forwards)
     return alone.evaluate(evaluation.free, jacobian=jacobian or linearised)

@@ -1,10 +1,11 @@
-"""Intervals of poorly determined moduli, from the profile likelihood, not from its curvature.
+"""Intervals of poorly determined moduli, from the profile likelihood instead of its curvature.
 
-A pull measures the compliance of a soft piece: the stiffer that is thought to be, the less the data
-see of it. Its modulus may then be several times the likeliest, where the curvature at the best
-allows twice as much to both sides; other intervals reach farther to the soft side. Limits are where
-what was measured has become as much less likely as at the limits of a normal distribution, all else
-having followed (the profile likelihood; Venzon and Moolgavkar 1988).
+A pull measures the compliance of a soft piece: the stiffer the piece, the less the data depend on
+its modulus. The modulus may then be several times the most likely value, where the curvature at the
+optimum allows a factor of two to both sides; other intervals extend farther to the soft side. The
+limits are where the likelihood of the measurements has decreased as much as at the limits of a
+normal distribution, with all other values refitted (the profile likelihood; Venzon and Moolgavkar
+1988).
 """
 
 from dataclasses import replace
@@ -19,32 +20,33 @@ from limber.estimation.parameters import LINK_DEVIATION
 from limber.estimation.uncertainty.covariance import Uncertainty, inverse_information, scaled_rows
 
 WIDE = 0.4
-"""Half width of an interval of log E, a factor of 1.5, from which its limits are looked for. Of the
-trials of the bench, limits of narrower ones lie less than a fifth of the half width elsewhere, to
-one side as to the other."""
+"""Half width of an interval of log E, a factor of 1.5, above which its limits are computed. In the
+trials of the bench, limits of narrower ones move by less than a fifth of the half width, to either
+side.
+"""
 TRIES = 4
-"""Simulations for one limit, at most: seen were 1 to 4."""
+"""Most simulations for one limit; observed were 1 to 4."""
 NEAR = 0.1
-"""A limit of log E that would move by less is found."""
+"""Change of log E below which a limit has converged."""
 
 
 def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
              progress: Progress = SILENT) -> Uncertainty:
     """Return the uncertainty with the limits of wide intervals from the profile likelihood.
 
-    The covariance stays: it is of what depends on the moduli as the measurements do, and that,
-    linear in the compliance as they are, changes by as much as the covariance says while the
-    modulus is already far beyond it.
+    The covariance is not changed. It applies to quantities that depend on the moduli as the
+    measurements do. These are linear in the compliance, and change by as much as the covariance
+    states even if the modulus is already far beyond it.
 
     Args:
-        evaluation: At the fit's end, with derivatives.
-        objective: What was minimised. It is not changed.
+        evaluation: At the end of the fit, with derivatives.
+        objective: The minimised objective. It is not changed.
     """
     space = objective.space
     found = _Profile(sure, evaluation, objective, progress)
     interval = sure.young_interval.copy()
     for group in range(space.group_count):
-        # What all moduli have in common from recording to recording, no single one shows.
+        # A single modulus does not show the spread between recordings that all moduli share.
         whole = sure.quantile * np.sqrt(sure.covariance[group, group])
         if whole < WIDE:
             continue
@@ -58,7 +60,7 @@ def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
 
 
 class _Profile:
-    """How much less likely the measurements are where one log E is held aside."""
+    """Decrease of the likelihood of the measurements if one log E is held off its optimum."""
 
     def __init__(self, sure: Uncertainty, evaluation: Evaluation, objective: Objective,
                  progress: Progress):
@@ -68,16 +70,16 @@ class _Profile:
         self._slopes = self._scaled(evaluation.slopes)
         self._covariance = inverse_information(self._slopes)
         self.deviations = np.sqrt(np.diag(self._covariance))
-        # As in the fit, an outlier pulls no harder than what is just beyond the others.
+        # As in the fit, an outlier has no more weight than a residual just beyond the others.
         residual = evaluation.residual
         self._pull = self._scaled(residual / np.sqrt(1 + (residual / OUTLYING)**2))
-        # Priors and links are linear: they have no bend that could be pulled at.
+        # Priors and links are linear: they have no curvature to account for.
         self._pull[len(residual) - objective.space.own_row_count:] = 0.0
 
     def limits(self, group: int) -> tuple[float, float]:
         """Distances of log E at which the interval of a group ends, to the soft and stiff side."""
-        # The stiff side is safe to try. What it shows keeps the other from moduli so soft that
-        # nothing stands.
+        # The stiff side is safe to evaluate. It keeps the soft side away from moduli without an
+        # equilibrium.
         high, bend = self._limit(group, 1.0, self._quantile)
         low, _ = self._limit(group, -1.0, max(limit_of(bend, -self._quantile), -self._quantile))
         if high > self._quantile and high == self._farthest(group, 1.0):
@@ -91,7 +93,7 @@ class _Profile:
         return -low * deviation, high * deviation
 
     def _limit(self, group: int, side: float, first: float) -> tuple[float, float]:
-        """Limit to one side, in deviations, and the bend of the profile up to there."""
+        """Limit to one side, in deviations, and the curvature of the profile up to there."""
         objective, wanted = self._objective.apart(), side * self._quantile
         farthest, bend = self._farthest(group, side), 0.0
         at, others = side * min(abs(first), abs(farthest)), np.zeros(len(self._best.free))
@@ -99,7 +101,7 @@ class _Profile:
             self._progress(1.0, "finding the limits of wide intervals")
             found = self._rise(objective, group, at, others)
             if found is None:
-                # Nothing stands there, or is not found from so far away.
+                # There is no equilibrium, or it is not found from so far away.
                 at, others = at / 2, others / 2
                 continue
             rise, others = found
@@ -111,7 +113,7 @@ class _Profile:
         return side * min(abs(limit_of(bend, wanted)), abs(farthest)), bend
 
     def _farthest(self, group: int, side: float) -> float:
-        """What is looked at no further, in deviations: neighbours hardly differ by more."""
+        """Largest shift that is evaluated, in deviations: neighbours hardly differ by more."""
         free, count = self._best.free, self._objective.space.group_count
         beside = [k for k in (group - 1, group + 1) if 0 <= k < count] or [group]
         away = max(side * (free[k] - free[group]) for k in beside) + self._quantile * LINK_DEVIATION
@@ -119,11 +121,11 @@ class _Profile:
 
     def _rise(self, objective: Objective, group: int, at: float, others: np.ndarray,
               ) -> tuple[float, np.ndarray] | None:
-        """Rise of the squared residuals with log E ``at`` so many deviations, and how far the
-        others are then off the straight way there; None where nothing stands.
+        """Rise of the squared residuals with log E shifted by ``at`` deviations, and the offset of
+        the others from the linear path there; None if no equilibrium exists.
 
         Args:
-            others: How far they are thought to be, shape [p].
+            others: Expected offset of the others, shape [p].
         """
         best = self._best
         way = at * self._covariance[group] / self.deviations[group]
@@ -133,8 +135,8 @@ class _Profile:
             return None
         slopes = self._scaled(found.slopes)
         change = self._scaled(found.residual - best.residual)
-        # The best is the mode of the moduli's own density, not of this one: what rises is counted
-        # from the slope there.
+        # The optimum is the mode of the moduli's marginal density, not of this one: the rise is
+        # relative to the slope there.
         bent = change - self._slopes @ (free - best.free)
         gradient = slopes.T @ change + (slopes - self._slopes).T @ self._pull
         movable = np.arange(len(free)) != group
@@ -149,14 +151,14 @@ class _Profile:
 
 
 def bend_of(at: float, root: float) -> float:
-    """How a profile bends that goes through a point: a of (1 - exp(-a x)) / a.
+    """Curvature of a profile through a point: a of (1 - exp(-a x)) / a.
 
-    That is the root of the rise where what was measured is linear in a power of the modulus: its
+    That is the root of the rise if the measurements are linear in a power of the modulus: its
     exponent is -a over the deviation of log E; -1 is the compliance, 0 log E itself.
 
     Args:
         at: Shift x of log E in its deviations, not 0.
-        root: Of the rise of the squared residuals there, with the sign of the shift.
+        root: Root of the rise of the squared residuals there, with the sign of the shift.
     """
     ratio = float(np.clip(root / at, 0.01, 100.0))
     if abs(ratio - 1) < 1e-6:
@@ -166,7 +168,7 @@ def bend_of(at: float, root: float) -> float:
 
 
 def limit_of(bend: float, root: float) -> float:
-    """Shift at which such a profile has risen to ``root``; infinite where it never does."""
+    """Shift at which such a profile has risen to ``root``; infinite if it never does."""
     if bend * root >= 1:
         return float(np.copysign(np.inf, root))
     return root if bend == 0 else float(-np.log1p(-bend * root) / bend)

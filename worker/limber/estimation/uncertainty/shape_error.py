@@ -1,9 +1,10 @@
 """Uncertainty of Young's modulus from the shape of the scan and the mass of twigs.
 
-Branches as likely as the fitted one (:mod:`limber.geometry.shape_samples`) are pulled as the branch
-was, with the moduli found. By how much their points and forces differ, to first order, the fit
-would have taken up in the moduli: that is how far off these may be. Errors of neighbouring places,
-of axis and radius, and of several moduli go together as they do in the scan.
+Branches that fit the scan as well as the fitted one (:mod:`limber.geometry.shape_samples`) are
+pulled as the branch was, with the estimated moduli. To first order, the fit would have attributed
+the differences of their points and forces to the moduli; that is the possible error of the moduli.
+Errors at neighbouring positions, of axis and radius, and of several moduli are correlated as in the
+scan.
 """
 
 import numpy as np
@@ -20,7 +21,7 @@ from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.mechanics.added_masses import HungTwig
 
 FEWEST = 8
-"""Fewer shapes do not tell how far shapes spread."""
+"""Fewest shapes that show the spread."""
 
 
 def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
@@ -28,21 +29,21 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
                 progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray] | None:
     """Relative standard deviations of E and of E I at the control points from axis and radii.
 
-    Root mean square over the shapes of what the fit would have taken up, times Student's quantile
-    over the normal one since they are few. A shape that is thicker all along changes E by what it
-    changes I, so that E I stays.
+    Root mean square over the shapes of the changes that the fit would have made, times Student's
+    quantile over the normal one since the shapes are few. A uniformly thicker shape changes E as it
+    changes I, so that E I is unchanged.
 
     Args:
-        evaluation: At the fit's end.
-        objective: What was minimised.
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
         subject: The branch that was fitted.
         points: Its scan [m], shape [m, 3].
-        count: How many shapes.
-        seed: Of the shapes.
-        progress: Called as it goes.
+        count: Number of shapes.
+        seed: Seed of the shapes.
+        progress: Called during the work.
 
     Returns:
-        Those of E and of E I, shape [K] each; None where shapes are too few, or as
+        Those of E and of E I, shape [K] each; None if there are too few shapes, or as for
         :func:`taken_up`.
     """
     if count < FEWEST:
@@ -64,18 +65,18 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
 
 
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
-    """Relative standard deviation of E from the mass of twigs and leaves beside the mesh, [K].
+    """Relative standard deviation of E from the mass of twigs and leaves outside the mesh, [K].
 
     Args:
-        evaluation, objective: As of :func:`shape_error`.
-        sigma: Relative standard deviation of that mass, all alike.
+        evaluation, objective: As for :func:`shape_error`.
+        sigma: Relative standard deviation of that mass, common to all.
 
     Returns:
-        None where nothing hangs on the branch or nothing weighs, or as :func:`taken_up`.
+        None if nothing hangs on the branch or there is no gravity, or as :func:`taken_up`.
     """
     models = [forward.full.model for forward in objective.forwards
               if isinstance(forward.full, QuasiStaticForward)]
-    # Masses that somebody stated are known; twigs' and leaves' are those of their volume.
+    # Stated masses are known; those of twigs and leaves come from their volume.
     if not sigma or not any(
             model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)
             for model in models):

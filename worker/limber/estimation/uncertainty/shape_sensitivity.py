@@ -1,14 +1,14 @@
-"""First-order effect of shape and mass, which the fit takes as known, on pulls and moduli.
+"""First-order effect of shape and mass, which the fit assumes known, on pulls and moduli.
 
-All nodes X of the mesh go a way w aside, to another shape of the same tree; or what hangs on the
-branch is heavier. At a state u in balance the internal force f, the loads p and what holds the
-branch change, and the state follows:
+All nodes X of the mesh move by w to another shape of the same tree; or the added masses on the
+branch become heavier. At an equilibrium state u the internal force f, the loads p and the
+constraints of the branch change, and the state follows:
 
     K du = dp - df,      df = (f(X + s w, u) - f(X, u)) / s  for a small s,
 
-with the tangent stiffness K that belongs to the state. So one factor a key frame serves all shapes,
-at an assembled force and a solve each, where a mesh of its own would have to find its own states.
-What the fit would have taken up in the moduli follows from the change of its residuals.
+with the tangent stiffness K of the state. One factor per key frame thus serves all shapes, at the
+cost of one assembled force and one solve each; a separate mesh would have to find its own states.
+The change of the residuals gives the change of the moduli that the fit would have made.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,24 +29,25 @@ from limber.mechanics.sensitivities import reactions
 from limber.recordings.cell_errors import calibration_of
 
 STEP = 1e-4
-"""Part of the way to another shape, or of a mass, over which the force's derivative is taken: a
-branch turned by a radian answers far from linearly to the whole of a radius' change."""
+"""Fraction of the change to another shape or mass over which the force's derivative is taken: the
+response of a branch turned by a radian to the whole change of a radius is far from linear.
+"""
 
 
 def taken_up(evaluation: Evaluation, objective: Objective,
              slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
-    """Change of log E at the control points by which a fit takes up S changes of its pulls, [K, S].
+    """Change of log E at the control points by which a fit compensates S changes, [K, S].
 
     Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr, at few key frames:
     differences vary slowly along a pull.
 
     Args:
-        evaluation: At the fit's end.
-        objective: What was minimised.
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
         slopes: Change of a pull, simulated for these values, by each of the S.
 
     Returns:
-        None where a pull is dynamic, since that would take too long, or finds no equilibrium.
+        None if a pull is dynamic, since that would take too long, or has no equilibrium.
     """
     if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
         return None
@@ -67,9 +68,9 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
     """Return the change of a pull's observations by each of S other shapes.
 
     Args:
-        forward: Simulated for ``values`` last.
+        forward: Last simulated for ``values``.
         values: The physical parameters.
-        meshes: The same tetrahedra with their nodes elsewhere.
+        meshes: The same tetrahedra with other node positions.
     """
     nodes = forward.mesh.nodes
     operator = point_operator(forward.mesh, forward.rest_points)
@@ -79,9 +80,9 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
 
 
 def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
-    """Return the change of a pull's observations by the mass of what hangs on the branch, relative.
+    """Return the change of a pull's observations by the relative mass of the added masses.
 
-    Arguments as of :func:`shape_slopes`.
+    Arguments as for :func:`shape_slopes`.
     """
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
     return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
@@ -90,7 +91,7 @@ def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
 def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
     """Return the change of a pull's observations by the deviation of the length in its gripper.
 
-    Arguments as of :func:`shape_slopes`.
+    Arguments as for :func:`shape_slopes`.
     """
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
     longer = STEP * calibration_of(forward.entry).held_length_sigma_m
@@ -99,7 +100,7 @@ def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
 
 def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiStaticForward],
             elsewhere: Sequence[sparse.csr_matrix]) -> ErrorSlopes:
-    """Changes to pulls that are a step aside, where points may sit in the mesh elsewhere."""
+    """Changes of pulls by a step; the points may then be elsewhere in the mesh."""
     here = _Pulled(forward, forward.model_with(values))
     equations = here.model.equations((forward.grasp,) if here.is_held else ())
     operator = point_operator(here.model.mesh, forward.rest_points)
@@ -139,8 +140,8 @@ class _Pulled:
         return self.model.internal(state).force - load
 
     def hold(self, key: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement of the nodes that are clamped [n, 3], and what is missing of the mean of
-        those that are pinned [p, 3].
+        """Displacement of the clamped nodes [n, 3], and missing displacement of the means of the
+        pinned ones [p, 3].
         """
         held, grasp = np.zeros_like(state), self.forward.grasp
         if not self.is_held:
@@ -153,9 +154,10 @@ class _Pulled:
 
     def seen(self, key: int, state: np.ndarray, out: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The gripper's force [N], its torque about the recorded place [N m], and its place [m].
+        """The gripper's force [N], its torque about the recorded position [N m], and its position
+        [m].
 
-        Where a force leads, force and torque are what they are.
+        If a force drives, force and torque do not change.
         """
         grasp, place = self.forward.grasp, self.forward.place(state)
         if not self.is_held:
@@ -167,8 +169,8 @@ class _Pulled:
 
 def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndarray,
               tangent: Tangent, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """How the state follows to each of the others [m over the whole way], and what is out of
-    balance there after a step.
+    """Response of the state to each of the others [m over the whole path], and the imbalance there
+    after a step.
     """
     held, missing = here.hold(key, state)
     moved, rights, pins, after = [], [], [], []

@@ -1,9 +1,9 @@
 """Causes of the uncertainty of a modulus, as parts that add up to its variance.
 
-With the information of all that was measured or known beforehand in rows J, the covariance is
-C = (J^T J)^-1, and C = sum over groups of rows of C J_g^T J_g C: each group's part is what its
-errors, passed through the fit, do to the result. The zero of a force sensor, unknown, costs what
-the fit has to spend to find it; that too is in the part of what it was found from.
+With the information of all measurements and priors in rows J, the covariance is C = (J^T J)^-1, and
+C = sum over groups of rows of C J_g^T J_g C: each group's part is the effect of its errors on the
+result through the fit. The unknown zero of a force sensor uses up part of the information; that is
+included in the part of the measurements that determine it.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ ADVICE = {
     "mesh": "use a finer mesh (--mesh-spacing of reconstruct)",
     "clamp": "scan farther down, so that the clamped position is known",
 }
-"""What would narrow an interval, by cause."""
+"""Advice to narrow an interval, by cause."""
 
 _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
            ("grasp position", "gripper frame"), ("slip", "slip of the grasp"),
@@ -60,9 +60,9 @@ def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 
     """Return the part of each cause in the variance of log E at the control points, [K] each.
 
     Args:
-        evaluation: At the fit's end, with derivatives.
-        objective: What was minimised.
-        scale: Variance of what was measured over the stated.
+        evaluation: At the end of the fit, with derivatives.
+        objective: The minimised objective.
+        scale: Variance of the measurements over the stated one.
     """
     rows = _information(evaluation, objective, scale)
     everything = np.vstack([each.rows for each in rows])

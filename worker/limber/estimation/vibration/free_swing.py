@@ -1,14 +1,15 @@
 """Young's modulus and damping from the free swing of a released branch, without a robot.
 
-The branch is held in its shape at rest until its weight and a hung load act all at once, or a load
-bends it until it is gone. Simulated in time from there, it is laid over the marker tracks. Free are
-one factor on Young's modulus, the moment of release, Rayleigh's two numbers, how much each marker
-moves for its place on the branch (known to the registration), and the branch's density within what
-is known of it. Frequency and displacement both tell the modulus.
+The branch is held in its shape at rest until its weight and an added load act all at once, or a
+load bends it until the load is removed. The motion is simulated from there and fitted to the marker
+tracks. Free are one factor on Young's modulus, the time of release, Rayleigh's two parameters, a
+gain of each marker's motion for the error of its position on the branch (known from the
+registration), and the branch's density within its prior. Both frequency and displacement determine
+the modulus.
 
-What the model gets wrong goes on through many frames: the residual counts as so many independent
-readings as its autocorrelation leaves, and the intervals are of what is left over, not of the
-camera's noise.
+Errors of the model persist through many frames. The number of independent readings therefore
+follows from the autocorrelation of the residual, and the intervals are based on the residual, not
+on the camera's noise.
 """
 
 from dataclasses import dataclass
@@ -30,15 +31,15 @@ from limber.mechanics.sensitivities import ParameterSet
 from limber.recordings.hung_load import REGISTRATION_SHARE
 
 STEPS_PER_PERIOD = 40
-"""Of the first vibration: the step's own error in its frequency is then 0.2 %."""
+"""Steps per period of the first vibration; the error in its frequency is then 0.2 %."""
 _FIRST_PERIODS = 1.5
-"""The fit begins with so many, so that simulated and seen phases cannot be a turn apart."""
+"""Periods at the start of the fit: simulation and observation cannot differ by a period."""
 _DAMPING_BOUNDS = (1e-4, 1e3)
-"""Of Rayleigh's alpha over the first angular frequency, and beta times it: both without unit."""
+"""Bounds of Rayleigh's alpha over the first angular frequency, and of beta times it."""
 _GONE = 0.3
-"""Part of its way at which a branch has surely been let go."""
+"""Fraction of its path at which a branch has certainly been released."""
 _MARGIN = 0.1
-"""Deviation of how much a marker moves, where the registration is not known."""
+"""Deviation of a marker's gain if the registration is not known."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +48,15 @@ class SwingSeen:
 
     Attributes:
         times: [s], shape [n].
-        moved: Displacement of the markers from the branch's shape at rest [m], shape [n, m, 3];
-            NaN where a marker was not seen.
-        rest_points: The markers' places on the branch [m], shape [m, 3].
+        moved: Displacement of the markers from the branch's shape at rest [m], shape [n, m, 3]; NaN
+            if a marker was not observed.
+        rest_points: Positions of the markers on the branch [m], shape [m, 3].
         start: "held": in the shape at rest until weight and load act; "loaded": bent by the load
-            until it is gone.
+            until it is removed.
         load: The load [N], shape [3].
-        load_mass: That swings with the branch [kg]; 0 where the load is a pull, or gone.
-        noise: Of one reading [m].
-        registration: RMS distance of the markers from their places [m], None: not known.
+        load_mass: Mass that swings with the branch [kg]; 0 if the load is a pull, or removed.
+        noise: Noise of one reading [m].
+        registration: RMS distance of the markers from their positions [m], None: not known.
     """
 
     times: np.ndarray
@@ -73,20 +74,20 @@ class SwingFit:
     """Result of a swing. Intervals are 95 % intervals.
 
     Attributes:
-        factor: On the start's Young's modulus, the mesh's own stiffness taken out;
+        factor: Factor on the start's Young's modulus, corrected for the mesh's stiffness;
             factor_interval: shape [2].
-        mesh_factor: What was taken out; 1 where a finer mesh was out of reach.
+        mesh_factor: The correction; 1 if a finer mesh was not possible.
         release: [s] on the recording's clock; release_deviation: [s].
         damping: Rayleigh's alpha [1/s] and beta [s]; damping_interval: shape [2, 2].
-        damping_ratio: Of the first vibration; damping_ratio_interval: shape [2].
-        frequency: Of the first vibration about the place of rest [Hz].
-        residual: RMS of seen less simulated [m]; over the largest displacement it is
+        damping_ratio: Damping ratio of the first vibration; damping_ratio_interval: shape [2].
+        frequency: Frequency of the first vibration about the equilibrium [Hz].
+        residual: RMS of observed minus simulated [m]; over the largest displacement it is
             ``relative_residual``.
-        readings: Independent ones, as the residual's autocorrelation leaves.
-        forward_count: Simulations.
+        readings: Number of independent readings, from the residual's autocorrelation.
+        forward_count: Number of simulations.
         window: First and last time used [s].
         times, seen, simulated: For figures [s, m], shapes [f], [f, m, 3].
-        converged: Whether the last fit did.
+        converged: Whether the last fit converged.
     """
 
     factor: float
@@ -115,9 +116,9 @@ def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: flo
     """Fit Young's modulus and damping of a branch to a swing.
 
     Args:
-        model: The branch, with the moduli to start from (their pattern stays) and its weight.
-        grasp: Where the load hangs or pulls.
-        periods: Of the swing that are fitted.
+        model: The branch, with the initial moduli (their ratios are kept) and its weight.
+        grasp: Point where the load hangs or pulls.
+        periods: Number of fitted periods of the swing.
         density_sigma: Relative standard deviation of the branch's density.
 
     Raises:
@@ -130,18 +131,18 @@ def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: flo
     for number, share in enumerate((_FIRST_PERIODS, periods)):
         progress(number / 2, "fitting the swing", periods=share)
         found = swing.fitted(released, share * period, found)
-    # Once more, what is known beforehand weighed against what the model really leaves over.
+    # Fit again with priors weighted against the actual residual of the model.
     return swing.judged(swing.fitted(released, periods * period, found))
 
 
 def first_guess(seen: SwingSeen) -> tuple[float, float]:
-    """Return when a branch was released and its period [s], from the tracks alone.
+    """Return a branch's time of release and its period [s], from the tracks alone.
 
     Raises:
-        InputError: nothing moves, or the branch does not oscillate.
+        InputError: no motion is found, or the branch does not oscillate.
     """
     way = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
-    # Of the marker that goes farthest: others are jostled while the branch is still held.
+    # From the marker that moves farthest: others are disturbed while the branch is still held.
     far = way[:, np.argmax(np.nan_to_num(way).max(axis=0))]
     far = np.where(np.isfinite(far), far, 0.0)
     if far.max() < 10 * seen.noise:
@@ -167,7 +168,7 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
                          "Release it abruptly, or fit the rest position: --motion quasi_static.")
     cross = times[turns] - away[turns] * (times[turns + 1] - times[turns]) / (
         away[turns + 1] - away[turns])
-    # Over whole turns: where it rests may be a little beside, as of a branch that creeps.
+    # Over whole periods: the equilibrium may be slightly offset, as for a branch that creeps.
     period = float(np.median(cross[2:] - cross[:-2]))
     rate = float(np.median(np.diff(seen.times)))
     if period < 6 * rate:
@@ -178,8 +179,9 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
 
 
 class _Swing:
-    """The model laid over the tracks; free: log factor, release, log alpha/w, log beta w, log
-    density, and each marker's gain."""
+    """The model fitted to the tracks; free: log factor, release, log alpha/w, log beta w, log
+    density, and each marker's gain.
+    """
 
     def __init__(self, model: BranchModel, grasp: Grasp, seen: SwingSeen, density_sigma: float):
         share = np.maximum(grasp.weights, 0.0) / np.maximum(grasp.weights, 0.0).sum()
@@ -188,7 +190,7 @@ class _Swing:
                 PointMass(tuple(model.mesh.nodes[node]), float(seen.load_mass * part))
                 for node, part in zip(grasp.nodes, share, strict=True) if part > 0)
         self.model, self.grasp, self.seen = model, grasp, seen
-        # A hung mass weighs by itself.
+        # A hung mass acts by its own weight.
         self.load = np.zeros(3) if seen.start == "held" and seen.load_mass else seen.load
         self.operator = point_operator(model.mesh, seen.rest_points)
         self.nodes = np.unique(self.operator.indices // 3)
@@ -202,7 +204,7 @@ class _Swing:
         self._known: tuple[bytes, tuple] | None = None
 
     def scale_to(self, period: float, released: float) -> None:
-        """Take the modulus from the period, and damping from how the swing dies away."""
+        """Estimate the modulus from the period, and damping from the decay of the swing."""
         frequency = self.frequency(self.model, RayleighDamping(0.0, 0.0))
         self.factor0 = (1 / period / frequency) ** 2
         self.omega, self.period = 2 * np.pi / period, period
@@ -217,18 +219,18 @@ class _Swing:
 
     @property
     def ramp(self) -> float:
-        """Middle of the step within which the load goes [s]."""
+        """Middle of the step in which the load is removed [s]."""
         return 0.5 * self.period / STEPS_PER_PERIOD if self.seen.start == "loaded" else 0.0
 
     def mesh_stiffness(self, model: BranchModel) -> MeshStiffness:
-        """Return how much the mesh is too stiff; nothing is said where no finer one is in reach."""
+        """Return the excess stiffness of the mesh; 1 if a finer mesh would be too large."""
         level = float(model.young.mean())
         found = mesh_error(model.without_point_masses(), self.grasp, self.operator,
                            (model.young / level)[:, None], np.array([level]))
         return found or MeshStiffness(np.ones(1), np.zeros(1))
 
     def frequency(self, model: BranchModel, damping: RayleighDamping) -> float:
-        """Return the first frequency about the place of rest [Hz]."""
+        """Return the first frequency about the equilibrium [Hz]."""
         from limber.mechanics.statics.solve import solve_static
 
         model = model.with_parameters(damping=damping)
@@ -339,21 +341,22 @@ class _Swing:
         return _Found(found.x, chosen, duration, found.success, known, sigma, priors)
 
     def left_over(self, found: "_Found") -> tuple[float, float, float]:
-        """Return the residual's RMS [m], how many readings count as one, and the deviation [m]
-        that each reading has if they are to count as independent."""
+        """Return the residual's RMS [m], the number of readings that count as one, and the
+        deviation [m] of each reading if they are to count as independent.
+        """
         model, _ = self.rows(found.free, found.chosen, found.duration + self.period)
         left = np.where(found.known, model - self.seen.moved[found.chosen], np.nan)
         rms, stretch = float(np.sqrt(np.nanmean(left**2))), _correlated(left)
         return rms, stretch, max(rms, self.seen.noise) * float(np.sqrt(stretch))
 
     def judged(self, found: "_Found") -> SwingFit:
-        """Return the fit with the intervals that what is left over allows."""
+        """Return the fit with intervals that follow from the residuals."""
         seen, free = self.seen, found.free
         model, slopes = self.rows(free, found.chosen, found.duration + self.period)
         columns = slopes[found.known]
         rms, stretch, sigma = self.left_over(found)
         information = columns.T @ columns / sigma**2 + np.diag(1 / found.priors**2)
-        # Alpha and beta cannot both be told from one vibration: what is open stays wide.
+        # One vibration does not determine both alpha and beta: their intervals stay wide.
         information[[2, 3], [2, 3]] += 1 / np.log(_DAMPING_BOUNDS[1] / _DAMPING_BOUNDS[0]) ** 2
         cov = np.linalg.inv(information)
         wide = 1.96 * np.sqrt(np.diag(cov))
@@ -394,7 +397,7 @@ class _Found:
 
 
 def _correlated(left: np.ndarray) -> float:
-    """Return how many readings count as one: the sum of the residual's autocorrelation.
+    """Return the number of readings that count as one: the sum of the residual's autocorrelation.
 
     Over time, and over markers and axes, which all follow the same motion.
     """
@@ -408,7 +411,7 @@ def _correlated(left: np.ndarray) -> float:
         if value < 0.05:
             break
         total += 2 * value
-    # Axes and markers that move together are one: the participation of the principal ones.
+    # Axes and markers that move together count as one: the participation of the principal ones.
     values = np.linalg.eigvalsh(flat.T @ flat)
     together = flat.shape[1] * float((values**2).sum()) / float(values.sum()) ** 2
     return total * max(together, 1.0)

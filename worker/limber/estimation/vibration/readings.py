@@ -1,4 +1,4 @@
-"""Which columns of a record ring, where it was plucked, and which readings a sensor cut off."""
+"""Detection of the ringing columns of a record, its plucks, and clipped readings."""
 
 from dataclasses import dataclass, replace
 
@@ -8,20 +8,20 @@ from limber.core.errors import InputError
 from limber.recordings.time_series import Stream
 
 _BAND = 0.15
-"""Around a frequency, as a fraction of it: as wide as a tenth of critical damping makes it."""
+"""Width of the band around a frequency, as a fraction: that of a tenth of critical damping."""
 _PROMINENT, _SHARE = 6.0, 0.1
-"""Density of power in that band over that beside it, and the band's share of all of it."""
+"""Density of power in that band over that beside it, and the band's fraction of all power."""
 _BURST = 2.0
-"""Power where it is strongest over what it mostly is: what was plucked dies away."""
+"""Maximum power over typical power: a plucked vibration decays."""
 _JUMP, _LOUD, _ABOVE = 2.5, 0.2, 2.0
-"""A pluck: its swing over that before it, over the record's largest, over the record's quietest."""
+"""A pluck's amplitude over that before it, over the record's largest, over its quietest."""
 _FLAT = 3
-"""Equal readings in a row at a channel's end."""
+"""Equal readings in a row at a channel's limit."""
 
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Where a column rings: its frequency [Hz], how far that stands out, whether it comes and goes.
+    """Ringing of a column: its frequency [Hz], prominence, power fraction, and burst ratio.
     """
 
     frequency: float
@@ -37,11 +37,11 @@ class _Spectrum:
 def ringing_columns(record: Stream) -> Stream:
     """Return the record with the columns that ring, and a sentence on those that do not.
 
-    Accelerations of other directions, a temperature, a voltage, a counter stand beside the reading
-    in a logger's table. Where no column rings clearly, all that change are kept.
+    A logger's table may also contain accelerations of other directions, a temperature, a voltage or
+    a counter. If no column rings clearly, all columns that change are kept.
 
     Raises:
-        InputError: none changes, or they only count.
+        InputError: no column changes, or all of them are counters.
     """
     changing = [k for k in range(record.values.shape[1])
                 if not _is_counter(record.values[:, k])]
@@ -66,7 +66,7 @@ def ringing_columns(record: Stream) -> Stream:
 
 
 def _is_counter(values: np.ndarray) -> bool:
-    """Whether a column stays as it is, or grows from row to row as a clock does."""
+    """Whether a column is constant, or increases from row to row as a clock does."""
     steps = np.diff(values)
     return not steps.any() or bool((steps > 0).all() or (steps < 0).all())
 
@@ -78,7 +78,7 @@ def _spectrum(times: np.ndarray, values: np.ndarray) -> _Spectrum:
     flat = flat - np.polyval(np.polyfit(even - even[0], flat, 1), even - even[0])
     power = np.abs(np.fft.rfft(flat * np.hanning(len(flat))))**2
     frequencies = np.fft.rfftfreq(len(flat), step)
-    # Under three turns in the record is drift.
+    # Fewer than three periods in the record are drift.
     inside = frequencies >= 3 / (times[-1] - times[0])
     tops = np.r_[False, (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:]), False] & inside
     if inside.sum() < 16 or not tops.any():
@@ -97,14 +97,13 @@ def _spectrum(times: np.ndarray, values: np.ndarray) -> _Spectrum:
 
 
 def plucks(channels: np.ndarray, period: float) -> list[tuple[int, int]]:
-    """Return the first reading of each pluck and the end of what follows it.
+    """Return the first reading of each pluck and the end of its decay.
 
-    A pluck sets in within half a turn. Two close vibrations grow more slowly where they come to
-    swing together again.
+    A pluck starts within half a period. The beat of two close vibrations grows more slowly.
 
     Args:
         channels: Shape [n, c].
-        period: Of the vibration, in readings.
+        period: Period of the vibration, in readings.
     """
     width, half = max(round(period), 8), max(round(period / 2), 4)
     if len(channels) < 4 * width:
@@ -114,33 +113,33 @@ def plucks(channels: np.ndarray, period: float) -> list[tuple[int, int]]:
     before, after = swing[:len(after)], after[:len(swing)]
     least = max(_LOUD * float(swing.max()), _ABOVE * float(np.quantile(swing, 0.1)))
     found = np.flatnonzero((after > _JUMP * before) & (after > least)) + width
-    # What sets in less than two turns after another belongs to it.
+    # A start less than two periods after another belongs to it.
     starts = found[np.diff(found, prepend=-len(channels)) > 2 * width].tolist()
     if starts and starts[0] > 2 * width and swing[0] > least:
-        # It rang from the beginning on.
+        # It rang from the beginning of the record.
         starts.insert(0, 0)
     if len(starts) < 2:
         return [(0, len(channels))]
-    # The jump is seen as soon as the window touches it.
+    # The jump is seen as soon as the window reaches it.
     return [(start, end - width) for start, end in
             zip(starts, [*starts[1:], len(channels) + width], strict=True)]
 
 
 def _extent(channels: np.ndarray, width: int) -> np.ndarray:
-    """How far each ``width`` readings in a row are apart, the largest of all channels."""
+    """Range of each ``width`` readings in a row, the largest of all channels."""
     windows = np.lib.stride_tricks.sliding_window_view(channels, width, axis=0)
     return np.ptp(windows, axis=2).max(axis=1)
 
 
 def cut_off(channels: np.ndarray, period: float) -> np.ndarray:
-    """Whether each reading is one of several equal ones at a channel's end, shape [n] of bool.
+    """Whether each reading is one of several equal ones at a channel's limit, shape [n] of bool.
 
-    A vibration that a converter rounds has equal readings at its turns too, but only as many as
-    lie within one of its steps.
+    A vibration rounded by a converter has equal readings at its extremes too, but only as many as
+    are within one of its steps.
 
     Args:
         channels: Shape [n, c].
-        period: Of the vibration, in readings.
+        period: Period of the vibration, in readings.
     """
     found = np.zeros(len(channels), bool)
     for values in channels.T:

@@ -1,10 +1,10 @@
 """Frequencies and damping of free vibration from tracks, accelerometers or strain gauges.
 
-A free decay is a few vibrations, each a frequency and a damping that all channels share, with an
-amplitude and a phase in each channel. They are fitted together by least squares, the linear part
-eliminated (variable projection: G. Golub, V. Pereyra, 1973); one more is taken in as long as the
-Bayesian information criterion falls. What the vibrations leave over is correlated in time and
-counts as so many fewer readings.
+A free decay consists of a few vibrations, each with a frequency and a damping that all channels
+share, and an amplitude and a phase in each channel. They are fitted together by least squares, with
+the linear part eliminated (variable projection: G. Golub, V. Pereyra, 1973); one more is added as
+long as the Bayesian information criterion falls. The residual of the fit is correlated in time, and
+counts as correspondingly fewer readings.
 """
 
 import re
@@ -27,12 +27,12 @@ _COUNTS = r"frames?|samples?|index|framenumber|subframes?"
 _MOST_MODES = 4
 _LEAST_READINGS = 32
 _MOST_STEPS, _MOST_GAPS = 2e6, 10
-"""Steps of a record; over its readings."""
+"""Most steps of a record; most steps over its readings."""
 _LEAST_TURNS = 3.0
 _PERIODS = 60
-"""So many of the first are used: what comes later is noise, or somebody at the branch."""
+"""Number of first periods that are used: later ones are noise, or disturbances."""
 _LEAST_SHARE = 0.005
-"""Of the record's power; a vibration below it is not taken for the first one."""
+"""Fraction of the record's power below which a vibration is not taken as the first one."""
 _DAMPING = (1e-4, 0.5)
 _SAME, _CHANGED = 0.05, 0.03
 """Plucks whose frequencies differ by less are of one vibration; by more, of a changed branch."""
@@ -45,14 +45,14 @@ class Ringing:
     Attributes:
         frequencies: [Hz], shape [k], ascending.
         frequency_deviations: Standard deviations [Hz], shape [k].
-        damping: Shares of critical damping, shape [k].
+        damping: Damping ratios, shape [k].
         damping_deviations: Shape [k].
-        shares: Of the record's power, shape [k].
-        left_over: RMS of what they do not explain over that of the record.
-        start: When the decay that was used begins [s]; of several the first.
-        duration: Of all decays that were used [s].
-        pluck_frequencies: The first frequency of each decay, where there are several [Hz].
-        warnings: What of the record was not used.
+        shares: Fractions of the record's power, shape [k].
+        left_over: RMS of the unexplained part over that of the record.
+        start: Start of the decay that was used [s]; of several the first.
+        duration: Total duration of all decays that were used [s].
+        pluck_frequencies: The first frequency of each decay, if there are several [Hz].
+        warnings: Parts of the record that were not used.
     """
 
     frequencies: np.ndarray
@@ -111,8 +111,8 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     Args:
         times: [s], ascending, shape [n].
         channels: Displacements, accelerations or strains, shape [n, c].
-        start: Start of the free decay [s]. Default: the time of the largest motion. Where the
-            branch is plucked again, each decay is used.
+        start: Start of the free decay [s]. Default: the time of the largest motion. If the branch
+            is plucked again, each decay is used.
 
     Raises:
         InputError: the record is too short, shows no free vibration, or is sampled too slowly.
@@ -129,7 +129,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     found, failed = [], []
     for number, (first, stop) in enumerate(parts):
         first, stop = first + begin, min(stop + begin, len(times))
-        # From the largest motion, or from where the user says that it was released.
+        # From the largest motion, or from the time of release that the user states.
         if start is None or number or first > begin:
             first += int(np.argmax(away[first:stop]))
         if cut[first:stop].any():
@@ -153,7 +153,7 @@ def _too_short(count: int) -> InputError:
 
 
 def _told(found: Ringing, count: int, used: int, cut: int) -> Ringing:
-    """The vibrations, and what of the record the user should know."""
+    """The vibrations, and warnings on the record for the user."""
     warnings = []
     if count > 1:
         others = "" if used == count else (
@@ -172,7 +172,7 @@ def _told(found: Ringing, count: int, used: int, cut: int) -> Ringing:
 
 
 def _united(best: Ringing, found: list[Ringing]) -> Ringing:
-    """The weighted mean of several decays of one branch; one alone as it is."""
+    """The weighted mean of several decays of one branch; a single decay is unchanged."""
     if len(found) == 1:
         return best
     columns = []
@@ -193,7 +193,7 @@ def _united(best: Ringing, found: list[Ringing]) -> Ringing:
 
 
 def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
-    """The weighted mean of values with deviations, and its own: by those, or by the scatter."""
+    """The weighted mean of values with deviations, and its own: from those, or the scatter."""
     value, deviation = np.array(values).T
     weight = 1 / np.maximum(deviation, 1e-9 * np.abs(value))**2
     mean = float(weight @ value / weight.sum())
@@ -202,7 +202,7 @@ def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _decay(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
-    """The vibrations of one decay, which begins with the first reading."""
+    """The vibrations of one decay, which starts with the first reading."""
     if len(times) < _LEAST_READINGS:
         raise _too_short(len(times))
     channels = channels - channels.mean(axis=0)
@@ -224,7 +224,7 @@ def _decay(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
 
 
 def _fitted(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
-    """Take vibrations in, the strongest first, as long as each is worth its numbers."""
+    """Add vibrations, the strongest first, as long as each improves the information criterion."""
     best: tuple[float, np.ndarray] | None = None
     free, left = np.zeros(0), channels
     power = float((channels**2).sum())
@@ -249,7 +249,7 @@ def _fitted(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
 
 
 def _basis(free: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Cosines and sines that die away, and one for what stays, shape [n, 2k + 1]."""
+    """Decaying cosines and sines, and a constant, shape [n, 2k + 1]."""
     omega = 2 * np.pi * np.exp(free[::2])
     ratio = np.exp(free[1::2])
     fade = np.exp(-(ratio * omega) * times[:, None])
@@ -290,13 +290,13 @@ def _peak(times: np.ndarray, channels: np.ndarray, step: float) -> float:
     window = np.hanning(2 * len(even))[len(even):, None]
     power = (np.abs(np.fft.rfft((flat - flat.mean(axis=0)) * window, size, axis=0))**2).sum(axis=1)
     frequencies = np.fft.rfftfreq(size, step)
-    # Under one turn in the record is drift.
+    # Less than one period in the record is drift.
     inside = frequencies >= 1 / (times[-1] - times[0])
     return float(frequencies[inside][np.argmax(power[inside])])
 
 
 def _stretch(left: np.ndarray) -> float:
-    """How many readings count as one, by the autocorrelation of what is left over."""
+    """Number of readings that count as one, from the autocorrelation of the residual."""
     power, total = float((left**2).sum()), 1.0
     for lag in range(1, len(left) // 4):
         value = float((left[lag:] * left[:-lag]).sum()) / max(power, 1e-300)

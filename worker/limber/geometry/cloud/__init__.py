@@ -1,1 +1,1 @@
-"""Point clouds: files, noise and what is no branch, made ready for a skeleton."""
+"""Point clouds: files, noise and removal of other objects, prepared for a skeleton."""

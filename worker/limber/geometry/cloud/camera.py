@@ -15,7 +15,7 @@ from limber.core.files.reading import read_toml
 from limber.core.numerics.rigid import rotation_matrix, rotation_vector
 
 _MOST = 1e6
-"""No camera's number is larger, whatever its unit; or smaller than one over it."""
+"""Largest number of a camera, whatever its unit; the smallest is one over it."""
 _Pixels = Annotated[float, Field(ge=1 / _MOST, le=_MOST)]
 
 
@@ -133,7 +133,7 @@ def read_camera(path: Path) -> Camera:
     """Read ``camera.toml``.
 
     Raises:
-        InputError: missing, or an entry makes no sense (named).
+        InputError: the file is missing, or an entry is invalid (it is named).
     """
     content = read_toml(path, "a file of camera intrinsics (depth images need it)")
     try:

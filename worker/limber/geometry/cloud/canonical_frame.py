@@ -1,7 +1,7 @@
-"""Order and axes of a cloud that are its own, not its file's.
+"""Order and axes of a cloud that do not depend on its file.
 
-What is chosen point by point, or in cells of a grid, must not depend on how a file is sorted or
-turned: the same plant is to give the same result.
+Choices point by point, or in cells of a grid, must not depend on the order or rotation of a file:
+the same plant must give the same result.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ _STEP = 1e-6  # of the cloud's size: far finer than any scanner tells, far coars
 
 @dataclass(frozen=True)
 class OwnFrame:
-    """A cloud's points in its own order and axes, from its middle, the same wherever it lies.
+    """A cloud's points in its own order and axes, from its middle, independent of its pose.
 
-    Moved, turned or in another unit, a file's numbers are rounded otherwise. What is chosen by
-    comparing two of them may then be chosen otherwise, and each choice leads to others: places
-    here are those of a grid so coarse that rounding does not show.
+    If a file is moved, rotated or given in another unit, its numbers are rounded differently. A
+    choice that compares two of them may then differ, and each choice affects others. So positions
+    here are on a grid coarse enough to hide rounding.
 
     Attributes:
         places: Points in this frame [m], shape [n, 3].
-        order: Index of each in the cloud, shape [n].
+        order: Index of each point in the cloud, shape [n].
         middle: The frame's origin [m], shape [3].
         axes: The frame's axes as columns, shape [3, 3].
     """
@@ -43,18 +43,19 @@ class OwnFrame:
         return cls(np.round(places / step) * step, order, middle, axes)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Return places in this frame of points, shape [..., 3]."""
+        """Return the positions of points in this frame, shape [..., 3]."""
         return (points - self.middle) @ self.axes
 
     def outside(self, places: np.ndarray) -> np.ndarray:
-        """Return points of places in this frame, shape [..., 3]."""
+        """Return the points at positions of this frame, shape [..., 3]."""
         return places @ self.axes.T + self.middle
 
 
 def own_order(points: np.ndarray) -> np.ndarray:
-    """Return indices of points in an order that only hangs on where they lie, shape [n].
+    """Return indices of points in an order that depends only on their positions, shape [n].
 
-    By distance from the middle alone, what grows from the first points would grow from there.
+    If ordered only by distance from the middle, regions grown from the first points would start
+    there.
 
     Args:
         points: Positions, shape [n, 3].
@@ -64,9 +65,9 @@ def own_order(points: np.ndarray) -> np.ndarray:
 
 
 def own_axes(points: np.ndarray) -> np.ndarray:
-    """The directions in which a cloud extends, farthest first, as columns, shape [3, 3].
+    """The directions in which a cloud extends, longest first, as columns, shape [3, 3].
 
-    Right-handed; the first two point to where the cloud has its longer tails.
+    Right-handed; the first two point towards the longer tails of the cloud.
     """
     offset = points - points.mean(axis=0)
     axes = np.linalg.eigh(offset.T @ offset)[1][:, ::-1]

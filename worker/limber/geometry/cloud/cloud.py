@@ -13,24 +13,23 @@ from limber.geometry.cloud.columns import PARTS, ply_columns, valid_columns
 POINTS = "\0points"
 """Name of the coordinates [n, 3] among columns of any name."""
 LEFT_OUT = "\0left_out"
-"""Name of the number of points that a reader left out, likewise."""
+"""Name of the number of points that a reader left out, in the same columns."""
 _LONGEST_TITLE = 1000  # characters of a title that a file's header repeats
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points and what is known of each.
+    """Points and their attributes.
 
     Attributes:
         points: Positions, shape [n, 3]; metres once they are in a branch folder.
         attributes: Name to array, shape [n] or [n, k]: ``normal`` [n, 3], ``color`` [n, 3] in
-            0..255, and whatever scalars the file had.
+            0..255, and any scalars of the file.
         not_finite: Number of discarded points whose coordinates are not finite.
-        titles: What the file calls an attribute, where its name is another.
-        unit: Of the points, if the file states it: m, cm, mm, um or in.
-        notes: What the user should know of the file.
-        left_out: Number of points that were left out while it was read, since there are others
-            beside them.
+        titles: The file's name of an attribute, where it differs.
+        unit: Unit of the points, if the file states it: m, cm, mm, um or in.
+        notes: Information for the user about the file.
+        left_out: Number of points left out during reading because others are next to them.
     """
 
     points: np.ndarray
@@ -78,7 +77,7 @@ class Cloud:
         return replace(self, points=points)
 
     def with_valid_columns(self, taken: Collection[str] = ()) -> "Cloud":
-        """Return the cloud with attributes that every writer can take, see :func:`valid_columns`.
+        """Return the cloud with attributes valid for every writer, see :func:`valid_columns`.
         """
         attributes, titles = valid_columns(self.attributes, self.titles, len(self), taken)
         return replace(self, attributes=attributes, titles=titles)

@@ -1,4 +1,4 @@
-"""The columns of a cloud: names and shapes that every writer of clouds can take."""
+"""Columns of a cloud: names and shapes that every writer of clouds accepts."""
 
 import re
 import unicodedata
@@ -7,22 +7,22 @@ from collections.abc import Collection, Iterable
 import numpy as np
 
 PARTS = {"normal": ("nx", "ny", "nz"), "color": ("red", "green", "blue")}
-"""Attributes of three numbers a point, and the columns that they are in files."""
+"""Attributes of three numbers per point, and their columns in files."""
 _LONGEST_NAME = 60
-"""Characters of a name; Blender cuts the names of attributes at 63."""
+"""Most characters of a name; Blender cuts the names of attributes at 63."""
 _RESERVED = frozenset({"x", "y", "z", *PARTS, *(name for parts in PARTS.values()
                                               for name in parts)})
-"""Names that mean positions, normals and colours, and may stand for nothing else."""
+"""Reserved names: positions, normals and colours only."""
 
 
 def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[str]:
     """Return a valid name of a PLY property for each title, all different.
 
-    A name has letters, digits and underscores of ASCII; titles that are such names stay as they
-    are. Capitals make no difference, since they make none to some readers.
+    A name has ASCII letters, digits and underscores; titles that are already such names are kept.
+    Names are compared without case, since some readers ignore it.
 
     Args:
-        titles: What a file calls its columns: any text, empty or repeated as well.
+        titles: Names of a file's columns: any text, may be empty or repeated.
         taken: Names that are not to be used.
     """
     used = {name.lower() for name in taken}
@@ -43,14 +43,14 @@ def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[s
 
 def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], count: int,
                   taken: Collection[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return attributes that every writer can take, and the file's names of those renamed.
+    """Return attributes that every writer accepts, and the file's names of those renamed.
 
-    ``normal`` is of shape [n, 3] and ``color`` as well, in 0..255; all other attributes are columns
-    of numbers with valid names. What is no number of each point is dropped.
+    ``normal`` and ``color`` (in 0..255) are of shape [n, 3]; all other attributes are columns of
+    numbers with valid names. Anything that is not a number per point is dropped.
 
     Args:
-        attributes: Name to array, as a reader made them.
-        titles: What the file calls an attribute, where its name is another.
+        attributes: Name to array, from a reader.
+        titles: The file's name of an attribute, where it differs.
         count: Number of points n.
         taken: Names that attributes must not have.
     """
@@ -71,7 +71,7 @@ def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], cou
 
 
 def _bytes(color: np.ndarray) -> np.ndarray:
-    """Colours in 0..255, of such ones, of fractions of 1 or of 16 bits."""
+    """Colours in 0..255, converted from 0..255, fractions of 1 or 16 bits."""
     if color.dtype == np.uint8:
         return color
     values = np.nan_to_num(color.astype(float), posinf=0.0, neginf=0.0)
@@ -92,14 +92,14 @@ def _split(title: str, name: str, values: np.ndarray) -> list[tuple[str, str, np
 
 
 def ply_columns(name: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Return the properties of a PLY file that a valid attribute becomes, in types that PLY has."""
+    """Return the PLY properties of a valid attribute, in types that PLY has."""
     values = _in_ply_type(values)
     return [(part, values[:, k]) for k, part in enumerate(PARTS[name])] if name in PARTS else [
         (name, values)]
 
 
 def _in_ply_type(values: np.ndarray) -> np.ndarray:
-    """Numbers in one of the types that PLY has: up to 32 bits if whole, float or double."""
+    """Numbers in one of PLY's types: up to 32 bits for integers, float or double."""
     kind, size = values.dtype.kind, values.dtype.itemsize
     if kind == "b":
         return values.astype(np.uint8)

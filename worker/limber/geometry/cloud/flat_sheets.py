@@ -1,4 +1,4 @@
-"""Walls and ground in a scan: wide flat sheets, which no branch has."""
+"""Walls and ground in a scan: wide flat sheets, which branches do not have."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,20 +16,20 @@ _FILLED = 0.25  # least fraction of a sheet's own box that it fills
 
 
 def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
-    """Find the largest plane that is filled with points, in both of its directions.
+    """Find the largest plane that is filled with points in both of its directions.
 
     Args:
         points: Positions [m], shape [n, 3].
         least: Smallest number of points of a sheet.
 
     Returns:
-        True where a point lies on it, shape [n]; None if there is no such plane.
+        True where a point is on it, shape [n]; None if there is no such plane.
     """
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     reach = _REACH * diagonal
     order, rng = own_order(points), np.random.default_rng(0)
     sample = order[:_SAMPLE]
-    # Among as many points as the sample needs; a sheet is no less flat for fewer.
+    # Tested on as many points as the sample needs; fewer points do not make a sheet less flat.
     dense = points[order[-20 * _SAMPLE:]]
     tree = cKDTree(dense)
     centres, normals, spreads = [], [], []

@@ -1,4 +1,4 @@
-"""Scans that come in pieces, of which no more is kept than axes and leaves can be told from."""
+"""Scans read in pieces; only the points needed to find axes and leaves are kept."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -8,25 +8,25 @@ import numpy as np
 from limber.geometry.cloud.cloud import Cloud
 
 MOST_POINTS = 5_000_000
-"""Of a scan that are kept: a branch of a metre has them a tenth of a millimetre apart."""
+"""Most points kept of a scan: a tenth of a millimetre apart on a branch of one metre."""
 PIECE_POINTS = 1_000_000
-"""That readers take from a file at once."""
+"""Points that readers take from a file at once."""
 _FINEST = 1e-5  # of the scan's size: the grid that is tried first
 
 
 def gathered(pieces: Iterable[Cloud], most: int = MOST_POINTS) -> Cloud:
-    """Put a scan together from its pieces, one point a cell of a grid if it has too many.
+    """Put a scan together from its pieces; one point per cell of a grid if there are too many.
 
-    Memory is held for twice ``most`` points and a piece.
+    Needs memory for twice ``most`` points and a piece.
 
     Args:
         pieces: At least one, all with the same attributes.
-        most: Points that are kept.
+        most: Most points to keep.
 
     Returns:
-        The first points in the cells of the finest grid that leaves no more than ``most``, of
-        grids each twice as wide as the last; ``left_out`` has the number of the others. The pieces
-        do not matter: cells of one grid lie within cells of the next.
+        The first points in the cells of the finest grid that leaves no more than ``most``, of grids
+        each twice as wide as the last; ``left_out`` has the number of the others. The result does
+        not depend on the pieces: cells of one grid are within cells of the next.
     """
     grid = _Grid(most)
     held: list[Cloud] = []
@@ -39,7 +39,7 @@ def gathered(pieces: Iterable[Cloud], most: int = MOST_POINTS) -> Cloud:
 
 
 class _Grid:
-    """A grid that grows coarser; all points are counted from where the first lay."""
+    """A grid that becomes coarser; all points are measured from the first one."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -47,7 +47,7 @@ class _Grid:
         self._size = 0.0
 
     def thinned(self, cloud: Cloud) -> Cloud:
-        """One point a cell, in cells so large that few enough stay."""
+        """One point per cell, in cells large enough to keep few enough points."""
         finite = np.isfinite(cloud.points).all(axis=1)
         lost = int((~finite).sum())
         cloud = replace(cloud.subset(finite), not_finite=cloud.not_finite + lost)

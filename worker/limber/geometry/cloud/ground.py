@@ -1,8 +1,8 @@
 """Ground in a scan, rough or on a slope: one layer of points below everything else.
 
-Looked at from above in cells, ground lies in most of them, about in one plane, no thicker than it
-is rough, and with nothing just above it but where a plant stands on it. The lower side of a crown
-is none: points go on above it.
+Seen from above in cells, ground is in most of them, roughly in one plane, no thicker than its
+roughness, and with nothing just above it except where a plant stands. The lower side of a crown is
+not ground: points continue above it.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ _ROUNDS = 10
 
 
 def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray | None:
-    """Find the ground that a plant stands on.
+    """Find the ground below a plant.
 
     Args:
         points: Positions [m], shape [n, 3].
@@ -28,7 +28,7 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
         least: Smallest number of points of the ground.
 
     Returns:
-        True where a point lies on it, shape [n]; None if there is none.
+        True where a point is on it, shape [n]; None if there is none.
     """
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     up = up / np.linalg.norm(up)
@@ -49,7 +49,8 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     if (slope > np.tan(_STEEPEST) or rough > _ROUGH * diagonal
             or np.mean(off < -_BELOW * rough) > _NOTHING):
         return None
-    # Bumps are followed, from the lower points of the cells around; a stem's cell has none lower.
+    # Bumps are followed from the lower points of the neighbouring cells; a stem's cell has none
+    # lower.
     bumps = np.full(shape, np.nan)
     where = np.full(len(count), 0)
     where[cell] = np.ravel_multi_index(tuple(place.T), shape)
@@ -81,9 +82,9 @@ def _is_broad(middle: np.ndarray, diagonal: float) -> bool:
 
 
 def _plane(middle: np.ndarray, low: np.ndarray):
-    """The plane through the cells' lowest points, and how far half of them are off it [m].
+    """The plane through the cells' lowest points, and their median distance from it [m].
 
-    Reweighted, since plants hang lower points over some cells' ground.
+    Reweighted, since plants have lower points over the ground of some cells.
     """
     system = np.column_stack([middle, np.ones(len(middle))])
     weight = np.ones(len(middle))

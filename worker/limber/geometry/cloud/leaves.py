@@ -1,11 +1,12 @@
-"""Leaves told from stems by shape alone: planarity, thickness and curvature at several scales.
+"""Separation of leaves from stems by shape: planarity, thickness, curvature at several scales.
 
 Around a point of a leaf the scan is a sheet: wide in two directions, thin in the third. On a stem
-it is so only within a part of the stem's own radius; from there on it is round, or, where one side
-alone was seen, as curved as it is wide, and farther out it is a line. So what is flat and wide
-at one scale, and neither round nor a line at the next ones, is a leaf. Of a scan whose points are
-as far apart as its twigs are thick, twigs that fork in one plane are wide and flat at a scale that
-holds several of them: there each point lies on a line at a finer scale, on a leaf it does not.
+this holds only within a fraction of the stem's radius. Beyond it the stem is round or, where only
+one side was seen, as curved as it is wide; farther out it is a line. So a neighbourhood that is
+flat and wide at one scale, and neither round nor a line at the next ones, belongs to a leaf. In a
+scan whose points are as far apart as its twigs are thick, twigs that fork in one plane are wide and
+flat at a scale that
+contains several of them. There each point is on a line at a finer scale; on a leaf it is not.
 """
 
 from dataclasses import dataclass
@@ -29,11 +30,11 @@ _AFTER = 3  # scales that are looked at after it
 _LEAST = 8  # points of a neighbourhood that tell anything
 _SMALLEST = 40  # points of a leaf
 _PATCH = 0.1  # of the largest leaf's area, up to which a piece is a patch of a stem
-# Up to half of it, a piece is one if it is so thick for its width: blades come to 0.14, stretches
-# of stem and fork to 0.34 and more.
+# Largest area of a stretch of stem, in areas of the largest leaf, and its least thickness over
+# width: blades reach 0.14, stretches of stem and fork 0.34 and more.
 _STRETCH, _THICK = 0.5, 0.25
-# Thickness over width, of stretches that are a piece's own width long, up to which it is a blade:
-# blades come to 0.26, stretches of branch that are flat for the noise alone to 0.49 and more.
+# Thickness over width, measured on stretches as long as the piece is wide, up to which it is a
+# blade: blades reach 0.26, stretches of branch that only noise makes flat 0.49 and more.
 _BLADE, _ACROSS, _PLACES = 0.4, 0.6, 40
 _NEAR = 3.0  # spacings, up to which points hang together
 _AGREE = 0.5  # of the neighbours, that make a point one of a leaf
@@ -45,7 +46,7 @@ class Leaf:
 
     Attributes:
         points: Indices of its points.
-        area: Of its blade [m^2], one side.
+        area: Area of its blade [m^2], one side.
     """
 
     points: np.ndarray
@@ -56,7 +57,7 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
     """Find the leaves of a scan.
 
     Args:
-        points: [m], shape [n, 3].
+        points: Positions [m], shape [n, 3].
     """
     own = OwnFrame.of(points)
     return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.places)]
@@ -78,9 +79,9 @@ def _found(points: np.ndarray) -> list[Leaf]:
 
 
 def _with_rims(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> np.ndarray:
-    """Add the pieces of the rest that lie along leaves: rims and folds, where a leaf is no sheet.
+    """Add the remaining pieces that run along leaves: rims and folds, where a leaf is not a sheet.
 
-    A stem touches its leaf with its end alone. Specks go with what they are nearest to.
+    A stem touches its leaf only with its end. Specks are assigned to the nearest piece.
     """
     rest = np.flatnonzero(~on_leaf)
     if len(rest) == 0 or len(rest) == len(points):
@@ -110,7 +111,7 @@ def _labels(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _on_sheets(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Which points lie on a sheet, shape [n]."""
+    """Which points are on a sheet, shape [n]."""
     wide, flat, line = [], [], []
     for step in range(_SCALES + _AFTER):
         scale = _FINEST * spacing * _STEP**step
@@ -139,7 +140,7 @@ def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray
     count = 1 + np.bincount(one, minlength=total)
     way = points[other] - points[one]
     first = np.stack([np.bincount(one, way[:, k], total) for k in range(3)], axis=1)
-    # Without a single pair bincount returns integers: no division in place.
+    # Without a single pair, bincount returns integers, so there is no division in place.
     first = first / count[:, None]
     second = np.empty((total, 3, 3))
     for i in range(3):
@@ -162,11 +163,11 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
     leaves, large = [], count[label] >= _SMALLEST
     if not large.any():
         return []
-    # Specks go with the nearest leaf.
+    # Specks are assigned to the nearest leaf.
     label = label[np.flatnonzero(large)[cKDTree(points[own[large]]).query(points[own])[1]]]
     for piece in np.flatnonzero(count >= _SMALLEST):
         members = np.flatnonzero(label == piece)
-        # The median: at a leaf's edge neighbours are missing on one side.
+        # The median is used: at a leaf's edge, neighbours are missing on one side.
         leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
     leaves = [leaf for leaf in leaves if _is_blade(points[leaf.points], leaf.area)]
     largest = max((leaf.area for leaf in leaves), default=0.0)
@@ -175,9 +176,9 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
 
 
 def _is_blade(points: np.ndarray, area: float) -> bool:
-    """Whether a piece [n, 3] of such an area [m^2] is thin wherever it is as long as it is wide.
+    """Whether a piece [n, 3] of this area [m^2] is thin wherever it is as long as it is wide.
 
-    As a whole a bent strip may be as wide as its bow is high.
+    As a whole, a bent strip may be as wide as its arc is high.
     """
     along = np.linalg.eigh(np.cov(points.T))[1][:, 2]
     tree, reach = cKDTree(points), _ACROSS * area / max(float(np.ptp(points @ along)), 1e-300)
@@ -187,6 +188,6 @@ def _is_blade(points: np.ndarray, area: float) -> bool:
 
 
 def _thickness(points: np.ndarray) -> float:
-    """Least extent of points [n, 3] over the next one, as standard deviations."""
+    """Smallest extent of points [n, 3] over the next larger one, as standard deviations."""
     across, wide, _ = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
     return float(across / max(wide, 1e-300))

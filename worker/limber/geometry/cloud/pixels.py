@@ -1,4 +1,4 @@
-"""Images of a depth camera: depths and masks, read through one door."""
+"""Images of a depth camera: a common reader of depths and masks."""
 
 import warnings
 from pathlib import Path
@@ -9,21 +9,21 @@ from limber.core.errors import InputError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 LARGEST_PIXELS = 100_000_000
-"""Of one image: no camera has more, and a small file may claim to."""
+"""Most pixels of an image: no camera has more, and a small file may claim to."""
 
 
 def read_pixels(path: Path, what: str) -> np.ndarray:
     """Return the pixels of an image, shape [height, width] or [height, width, channels].
 
     Raises:
-        InputError: it cannot be read as an image, or claims to be larger than any camera's.
+        InputError: the file cannot be read as an image, or claims to be larger than any camera's.
     """
     from PIL import Image
 
     try:
         _check_chunks(path)
         with warnings.catch_warnings():
-            # Its size is judged here.
+            # Its size is checked here.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as image:
                 width, height = image.size
@@ -39,7 +39,7 @@ def read_pixels(path: Path, what: str) -> np.ndarray:
 
 
 def _check_chunks(path: Path) -> None:
-    """Refuse a PNG file that announces longer parts than it has: memory would be taken for them."""
+    """Refuse a PNG file that announces longer chunks than it has, before allocating memory."""
     size = path.stat().st_size
     with open(path, "rb") as stream:
         if stream.read(len(_PNG)) != _PNG:

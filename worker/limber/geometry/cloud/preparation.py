@@ -1,4 +1,4 @@
-"""From a file's points to a cloud that can be worked on: unit, origin, crop, outliers, thinning."""
+"""From a file's points to a prepared cloud: unit, origin, crop, outliers, thinning."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -25,13 +25,13 @@ _COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
 
 @dataclass(frozen=True)
 class Prepared:
-    """A cleaned cloud in metres near the origin, and what was done.
+    """A cleaned cloud in metres near the origin, and a record of the cleaning.
 
     Attributes:
         cloud: The points that stayed, recentred.
-        origin: What was subtracted [m], in the file's axes, shape [3].
-        counts: Number of points dropped, by reason.
-        warnings: What the user should know.
+        origin: The subtracted origin [m], in the file's axes, shape [3].
+        counts: Number of dropped points, by reason.
+        warnings: Warnings for the user.
         view: Position of the depth camera in the cloud's frame, if there was one camera.
     """
 
@@ -47,9 +47,9 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     """Crop, convert to metres, recentre, and drop flying pixels, duplicates and outliers.
 
     Args:
-        cloud: As the file has it.
+        cloud: The cloud as read from the file.
         scale: Metres per unit of the file.
-        settings: How.
+        settings: Settings to use.
         eye: Position of the camera, if known, in the file's coordinates, shape [3].
         up: The up direction, shape [3], to look for rough ground; None: for walls and floors only.
 
@@ -65,7 +65,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     counts["cropped"] -= len(cloud)
     _enough(cloud, "The cloud")
     cloud, view = _without_flying(cloud, scale, settings, eye, counts)
-    # Subtracted in float64 before anything else: map coordinates leave no digits to a float32.
+    # Subtracted in float64 before anything else: with map coordinates, float32 has no digits left.
     scaled = cloud.points * scale
     origin = np.round(scaled.mean(axis=0), 3)
     points = scaled - origin
@@ -125,7 +125,7 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
 
 
 def _without_sheets(cloud: Cloud, counts: dict[str, int]) -> Cloud:
-    """Cut out walls and ground, unless little else is there: that is refused later."""
+    """Remove walls and ground, unless little else remains: that is refused later."""
     count = len(cloud)
     rest = cloud
     for _ in range(_SHEETS_MOST):
@@ -148,7 +148,7 @@ def _without_ground(cloud: Cloud, up: np.ndarray, counts: dict[str, int]) -> Clo
 
 
 def _enough_digits(points: np.ndarray) -> None:
-    """Refuse coordinates that lost their digits in single precision, far from the origin."""
+    """Refuse coordinates far from the origin that lost their digits in single precision."""
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     step = float(np.spacing(np.float32(np.abs(points).max())))
     if step > _COARSEST_STEP * extent and (points == points.astype(np.float32)).all():
@@ -160,7 +160,7 @@ def _enough_digits(points: np.ndarray) -> None:
 
 def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
                     eye: np.ndarray | None, counts: dict[str, int]) -> tuple[Cloud, View | None]:
-    """Drop flying pixels, if this is what one depth camera saw; and where that stood."""
+    """Drop flying pixels if one depth camera saw the cloud; also return its position."""
     eye = settings.camera_at if eye is None else eye
     if eye is None:
         place, sight = _own_sight(cloud.points * scale)
@@ -180,9 +180,9 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
 
 
 def _own_sight(points: np.ndarray) -> tuple[np.ndarray, Sight | None]:
-    """The image that a cloud is, and its camera's place [m], shape [3].
+    """The cloud as an image, and its camera's position [m], shape [3].
 
-    By the order of its points, or as seen from the origin of the file's coordinates.
+    Found from the order of its points, or as seen from the origin of the file's coordinates.
     """
     told = scan_line_view(points)
     if told is not None:
@@ -200,7 +200,7 @@ def _enough(cloud: Cloud, what: str) -> None:
 
 
 def _first_of_each(points: np.ndarray) -> np.ndarray:
-    """Mask of the points that are not where one before them is already."""
+    """Mask of the points that are not a copy of an earlier one."""
     order = np.lexsort(points.T)
     again = np.ones(len(points), bool)
     again[0] = False
@@ -212,13 +212,13 @@ def _first_of_each(points: np.ndarray) -> np.ndarray:
 
 
 def _without_outliers(points: np.ndarray, settings: PreparationSettings) -> np.ndarray:
-    """Mask of the points that stay; what is usual is taken nearby, since scans are uneven."""
+    """Mask of the points to keep; typical values are local, since scans are uneven."""
     keep = np.ones(len(points), bool)
     if settings.outlier_ratio > 0:
         count = min(settings.outlier_neighbours + 1, len(points))
         own, near = _neighbourhoods(points, count)
-        # The median over the neighbours is itself wide for a lone point among lone points, so
-        # the whole cloud's counts too.
+        # The median over the neighbours is itself large for a lone point among lone points, so the
+        # statistics of the whole cloud count too.
         overall = np.median(own)
         for part in _parts(len(points)):
             usual = np.maximum(np.median(own[near[part]], axis=1), overall)
@@ -242,12 +242,12 @@ def _neighbourhoods(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndar
 
 
 def _parts(count: int) -> Iterator[slice]:
-    """Slices of so many points as are worked on at once."""
+    """Slices of the points that are processed at once."""
     return (slice(begin, begin + _AT_ONCE) for begin in range(0, count, _AT_ONCE))
 
 
 def _rounding(points: np.ndarray) -> float:
-    """Step [m] that coordinates are rounded to, if it blurs branches; else 0."""
+    """Step [m] to which coordinates are rounded, if it blurs branches; else 0."""
     steps = []
     for axis in points.T:
         apart = np.diff(np.unique(np.round(axis, 9)))

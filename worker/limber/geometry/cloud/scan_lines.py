@@ -1,9 +1,9 @@
-"""Where the camera of an image stood, told by the order in which a file keeps its pixels.
+"""Position of an image's camera, found from the order in which a file stores its pixels.
 
-Clouds made of a depth image keep its pixels row by row, or column by column. All points of a line
-lie in one plane with the camera; all these planes meet in the line through it along which pixels
-are counted; and along a line the pixels are evenly apart. So camera and direction of view
-are known wherever the cloud was moved or turned to since.
+Clouds made of a depth image store its pixels row by row or column by column. All points of a line
+are in one plane with the camera. All these planes meet in the line through the camera along which
+pixels are counted, and along a line the pixels are evenly spaced. So camera and direction of view
+are known even if the cloud was moved or rotated since.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ _TRIED, _RULERS = 300, 3000  # from how many a first place is taken, and on how 
 
 
 def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find a camera's place [m], shape [3], and its direction of view, a unit vector, shape [3].
+    """Find a camera's position [m], shape [3], and its direction of view, a unit vector, shape [3].
 
     Args:
         points: In the order of the file [m], shape [n, 3].
@@ -56,7 +56,7 @@ def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Planes of consecutive points: normals [w, 3], offsets [m], and how wide they are [m^2]."""
+    """Planes of consecutive points: normals [w, 3], offsets [m], and their extent [m^2]."""
     start = np.arange(0, len(points) - _WINDOW + 1, _STRIDE)
     start = start[np.linspace(0, len(start) - 1, min(len(start), _WINDOWS)).astype(int)]
     group = points[start[:, None] + np.arange(_WINDOW)]
@@ -73,8 +73,8 @@ def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, e
                  ) -> tuple[np.ndarray | None, np.ndarray]:
     """Direction [3] of the line in which most of the planes meet, and a point on it [m].
 
-    Windows over the end of a line lie in no plane with the camera: two planes propose a line, the
-    one that most others pass is taken.
+    Windows over the end of a line are in no plane with the camera. Two planes propose a line, and
+    the line that most other planes pass through is taken.
     """
     rng = np.random.default_rng(0)
     best, least, miss = None, np.inf, None
@@ -107,12 +107,12 @@ def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, e
 
 def _missed(normals: np.ndarray, offsets: np.ndarray, along: np.ndarray, place: np.ndarray,
             extent: float) -> np.ndarray:
-    """By how much planes miss a line, over the cloud's extent, and in radians, shape [w]."""
+    """Distance by which planes miss a line, over the cloud's extent, and in radians, shape [w]."""
     return np.abs(normals @ along) + np.abs(normals @ place - offsets) / extent
 
 
 def _even_place(side: np.ndarray, depth: np.ndarray) -> float:
-    """Where along that line [m] the camera is: three pixels in a row look evenly apart from it."""
+    """Position of the camera along that line [m]: from it, pixels in a row are evenly spaced."""
     image, inverse = side / depth, 1 / depth
     bend = image[:-2] - 2 * image[1:-1] + image[2:]
     change = inverse[:-2] - 2 * inverse[1:-1] + inverse[2:]
@@ -120,8 +120,8 @@ def _even_place(side: np.ndarray, depth: np.ndarray) -> float:
     if not known.any():
         return 0.0
     bend, change = bend[known], change[known]
-    # Most pixels beside each other in the file are so in the image: of the places that threes of
-    # them ask for, the one that suits most.
+    # Most pixels that are consecutive in the file are neighbours in the image. Each triple proposes
+    # a position; the one that fits most triples is taken.
     tried = np.linspace(0, len(bend) - 1, _TRIED).astype(int)
     ruler = np.linspace(0, len(bend) - 1, _RULERS).astype(int)
     place, most = 0.0, -1
@@ -139,9 +139,9 @@ def _even_place(side: np.ndarray, depth: np.ndarray) -> float:
 
 
 def _turn(column: np.ndarray, row: np.ndarray) -> float | None:
-    """Angle [rad] to turn the view by so that pixels of all lines are as wide.
+    """Angle [rad] by which to rotate the view so that pixels of all lines are equally wide.
 
-    Seen from askew they are p (cos a + row sin a) wide.
+    Seen obliquely, they are p (cos a + row sin a) wide.
     """
     width, at = np.abs(np.diff(column)), (row[1:] + row[:-1]) / 2
     pitch = float(np.median(width))

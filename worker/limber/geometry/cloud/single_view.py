@@ -1,8 +1,8 @@
-"""A cloud that one depth camera saw, looked at as its image again: where pixels fly.
+"""A cloud from one depth camera, viewed as an image again, to find flying pixels.
 
-A depth camera's readings at an edge lie between what is in front and what is behind, or anywhere.
-In space they look like twigs along the line of sight; in the image each differs from the pixels
-beside it by more than a surface can fall within a pixel.
+A depth camera's readings at an edge are between foreground and background, or anywhere. In space
+they look like twigs along the line of sight. In the image each differs from the pixels beside it by
+more than a surface can change within a pixel.
 """
 
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ _LEAST = 200  # readings under which nothing is told of an image
 
 @dataclass(frozen=True)
 class View:
-    """Where a cloud was seen from.
+    """Position from which a cloud was seen, and its image.
 
     Attributes:
         eye: The camera's position [m], shape [3].
         pitch: Width of a pixel at distance 1.
-        fill: Fraction of the pixels on what was seen that are in the cloud.
+        fill: Fraction of the pixels on the seen surface that are in the cloud.
     """
 
     eye: np.ndarray
@@ -54,9 +54,9 @@ class Sight:
 
     @cached_property
     def fill(self) -> float:
-        """Fraction of the pixels on what was seen that are in the cloud: thinned images lack some.
+        """Fraction of the pixels on the seen surface that are in the cloud; lower if thinned.
 
-        Of the places in the middle between two pixels that are two apart, as many as have one.
+        Estimated from the midpoints between pixels two apart: the fraction with a pixel there.
         """
         tree = cKDTree(self.pixels)
         pairs = tree.query_pairs(_TWO[1], output_type="ndarray")
@@ -70,16 +70,16 @@ class Sight:
 
 def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
                forward: np.ndarray | None = None) -> Sight | None:
-    """Look at a cloud from its camera's place; None if it is no image from there.
+    """View a cloud from its camera's position; None if it is not an image from there.
 
-    An image has one point a pixel, and pixels lie evenly. Points that were scanned from all
-    around, thinned or moved elsewhere lie by chance in it.
+    An image has one point per pixel, and pixels are evenly spaced. Points that were scanned from
+    all around, thinned or moved elsewhere are randomly placed in it.
 
     Args:
         points: Positions [m], shape [n, 3], camera and points in one frame.
-        eye: The camera's place [m], shape [3]; None: the origin, if the cloud looks like an image
-            from there. If given, only points too wide apart for one view are refused.
-        forward: Middle of the view, a unit vector, shape [3]; None: as the points lie.
+        eye: The camera's position [m], shape [3]; None: the origin, if the cloud looks like an
+            image from there. If given, only points too wide apart for one view are refused.
+        forward: Middle of the view, a unit vector, shape [3]; None: found from the points.
     """
     if len(points) < _LEAST:
         return None
@@ -103,22 +103,23 @@ def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
 
 
 def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
-    """Find the pixels that hold together with no surface.
+    """Find the pixels that are connected to no surface.
 
-    Two pixels hold together if their depths differ by no more than noise, and a surface that is
-    seen at the angle ``grazing``, can make them. Noise is measured, as a stereo camera has it:
-    growing with the square of the depth.
+    Two pixels are connected if noise and a surface seen at the angle ``grazing`` can explain the
+    difference of their depths. Noise is measured with a stereo camera's model: it grows with the
+    square of the depth.
 
     Args:
         sight: The image.
         grazing: Steepest surface that counts, between its normal and the line of sight [deg].
-        speck: Groups of fewer pixels than that fly, or what is left of so many in a thinned image.
+        speck: Groups of fewer pixels are flying; in a thinned image, the number is reduced
+        accordingly.
 
     Returns:
         True where a pixel flies, shape [n].
     """
     depth, count = sight.depth, len(sight.depth)
-    # Where pixels are missing those beside are farther.
+    # Where pixels are missing, neighbours are farther away.
     pairs = cKDTree(sight.pixels).query_pairs(_BESIDE / np.sqrt(sight.fill), output_type="ndarray")
     one, other = pairs[:, 0], pairs[:, 1]
     mean = (depth[one] + depth[other]) / 2
@@ -132,7 +133,7 @@ def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
 
 
 def _noise(depth: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
-    """Noise of depth at depth 1: of pixels against the mean of those around, inside surfaces."""
+    """Noise of depth at depth 1: pixels against the mean of neighbours inside surfaces."""
     count = len(depth)
     around = np.bincount(one, minlength=count) + np.bincount(other, minlength=count)
     total = np.bincount(one, depth[other], count) + np.bincount(other, depth[one], count)
@@ -145,7 +146,7 @@ def _noise(depth: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _forward(ray: np.ndarray) -> np.ndarray | None:
-    """Middle of the view: the axis of the frame that points there, as cameras' frames have it."""
+    """Middle of the view: the axis of the frame that points there, as in frames of cameras."""
     middle = ray.mean(axis=0)
     length = float(np.linalg.norm(middle))
     if length < 0.3:

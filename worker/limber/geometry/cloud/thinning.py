@@ -1,4 +1,4 @@
-"""Fewer points of a cloud, evenly."""
+"""Even thinning of a cloud."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,13 +9,13 @@ from limber.geometry.cloud.canonical_frame import own_axes
 def thinned(points: np.ndarray, limit: int) -> np.ndarray:
     """Indices of at most ``limit`` points, one from each cell of a grid that fits that number.
 
-    The grid lies along the cloud's own axes, so that a turned one is thinned alike.
+    The grid follows the cloud's own axes, so a rotated cloud is thinned in the same way.
     """
     if len(points) <= limit:
         return np.arange(len(points))
     points = points @ own_axes(points)
     low = points.min(axis=0)
-    # Points lie on a surface: cells grow with the square root of how many there are too many.
+    # Points are on a surface: the cell size grows with the square root of the excess of points.
     size = float(np.median(cKDTree(points).query(
         points[:: max(len(points) // 2000, 1)], k=2)[0][:, 1])) * np.sqrt(len(points) / limit)
     size = max(size, 1e-6 * float(np.ptp(points, axis=0).max()), 1e-12)

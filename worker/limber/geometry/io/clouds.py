@@ -1,6 +1,6 @@
 """Point clouds of other programs, and the registry of their formats.
 
-All give coordinates as the file has them, as float64, and keep normals, colours and scalars.
+All return coordinates as in the file, as float64, and keep normals, colours and scalars.
 """
 
 from dataclasses import replace
@@ -27,13 +27,13 @@ from limber.geometry.io.scanners.e57 import read_e57
 from limber.geometry.io.scanners.ptx import read_ptx
 
 _FARTHEST = 1e15
-"""No coordinate lies beyond, whatever its unit."""
+"""Largest coordinate, whatever its unit."""
 
 
 def read_points(path: Path) -> Cloud:
     """Read a cloud, in the file's own units.
 
-    Its attributes have names that every writer can take; ``titles`` has those that are the file's.
+    Its attributes have names that every writer accepts; ``titles`` has the file's names.
 
     Raises:
         InputError: the file is missing, empty, cut short, of an unknown format, holds text where
@@ -65,7 +65,7 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
                          "Export it again.")
     if finite.all():
         return cloud
-    # Drivers of depth cameras write NaN, or the largest number, where a pixel saw nothing.
+    # Drivers of depth cameras write NaN, or the largest number, for a pixel without a reading.
     return replace(cloud.subset(finite), not_finite=cloud.not_finite + int((~finite).sum()))
 
 
@@ -76,11 +76,11 @@ def read_cloud(path: Path, unit: str = "m") -> Cloud:
 
 
 def unit_of(cloud: Cloud, given: str | None) -> tuple[str, list[str]]:
-    """Return the unit of a file's points, and what the user should know of it.
+    """Return the unit of a file's points, and a note for the user about it.
 
     Args:
         cloud: As read; its file may state a unit.
-        given: By the user. None and m, which nobody has to give, leave it to the file.
+        given: By the user. None and m, which need not be given, leave it to the file.
     """
     if cloud.unit is None or cloud.unit == given:
         return given or "m", []
@@ -96,7 +96,7 @@ def _read_text(path: Path) -> Cloud:
         read = read_columns(path)
     except ColumnsError as error:
         raise InputError(error.seen, error.why, error.fix) from error
-    # A column of the same name as one before would take its place.
+    # A column with the name of an earlier one would replace it.
     names = property_names(read.names)
     cloud = Cloud.from_columns(dict(zip(names, read.values.T, strict=True)),
                                dict(zip(names, read.titles, strict=True)))

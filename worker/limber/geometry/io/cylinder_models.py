@@ -1,4 +1,4 @@
-"""Cylinder models (QSM) of other programs, in and out: TreeQSM, SmartQSM, SimpleForest, rTwig.
+"""Cylinder models (QSM) of other programs: TreeQSM, SmartQSM, SimpleForest, rTwig.
 
 ======================  ===========================================================================
 ``.mat``                TreeQSM: a struct ``QSM`` with ``cylinder`` (radius, length, start, axis,
@@ -31,16 +31,16 @@ _THICK = "UnmodRadius"
 def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
     """Return the cylinders of a ``.mat`` file of TreeQSM or SmartQSM.
 
-    Of several models in a file the first counts. Cylinders without a parent that start where the
-    first one does hang on its start.
+    If a file has several models, the first is read. Cylinders without a parent that start at the
+    start of the first one are attached there.
 
     Returns:
         Arrays ``id``, ``parent`` (-1: none), ``start``, ``end``, ``radius`` and ``start_radius``,
-        which is the same where the file does not tell it.
+        which equals ``radius`` if the file does not state it.
 
     Raises:
-        InputError: it cannot be read, or has no cylinders.
-        MissingDependencyError: it is of version 7.3, and h5py is not installed.
+        InputError: the file cannot be read, or has no cylinders.
+        MissingDependencyError: the file is of version 7.3, and h5py is not installed.
     """
     found = _fields(Path(path))
     if not found:
@@ -64,7 +64,7 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
 
 
 def _fields(path: Path) -> dict[str, Any]:
-    """The fields of the cylinders and ``creator``; nothing where there are no cylinders."""
+    """The fields of the cylinders and ``creator``; empty if there are no cylinders."""
     try:
         is_new = is_hdf5(path)
     except OSError as error:
@@ -104,7 +104,7 @@ def mat_fields(path: Path) -> dict[str, np.ndarray]:
 
 
 def _thick_ends(found: dict[str, Any], radius: np.ndarray) -> np.ndarray:
-    """SmartQSM keeps a cone's other radius where TreeQSM has the one before its corrections."""
+    """SmartQSM stores a cone's other radius where TreeQSM has the radius before its corrections."""
     try:
         thick = np.asarray(found.get(_THICK, ()), float).ravel()
     except (TypeError, ValueError):

@@ -13,7 +13,7 @@ def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = Non
     """Back-project a depth image; coordinates in metres, in the frame of the camera's pose.
 
     Args:
-        depth_path: 16-bit PNG; a value divided by the camera's ``depth_scale`` is metres.
+        depth_path: 16-bit PNG; a value divided by the camera's ``depth_scale`` is in metres.
         camera_path: ``camera.toml`` (see :mod:`limber.geometry.cloud.camera`).
         mask_path: PNG of the same size, over 0 on the branch; None takes every reading.
 

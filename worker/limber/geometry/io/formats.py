@@ -1,4 +1,4 @@
-"""Registries of file formats: all that must know which files there are asks one of them.
+"""Registries of file formats: code that needs the known formats asks one of them.
 
 A format is an entry of a registry. Other packages add theirs by a call::
 
@@ -33,16 +33,16 @@ class Format:
 
     Attributes:
         name: Its common name.
-        suffixes: Of its files' names, in small letters with the dot.
-        read: Called with the path and the registry's options; returns what the registry is of, or
-            arrays of which its ``of_arrays`` makes that. None: it is only written.
+        suffixes: Suffixes of its files, in lower case with the dot.
+        read: Called with the path and the registry's options; returns the registry's type, or
+            arrays that its ``of_arrays`` converts to it. None: it is only written.
         write: Called with the object and the path. None: it is only read.
-        recognises: Whether a path is one by its content: asked where the suffix is of no format,
-            or of several.
+        recognises: Whether a path has this format by its content: asked where the suffix belongs to
+            no format, or to several.
         check: Refuses a file whose header announces more than the file holds.
-        isolated: Whether ``read``, a function of a module, is called in a process of its own with
-            the path alone, and returns arrays: compiled code may abort on a mangled file.
-        about: What help texts state about it beside its suffixes.
+        isolated: Whether ``read``, a function of a module, is called in a separate process with
+            only the path, and returns arrays: compiled code may abort on a corrupt file.
+        about: Text about it in the help, beside its suffixes.
     """
 
     name: str
@@ -63,9 +63,9 @@ class Registry(Generic[Kind]):
     """The formats of one kind of content.
 
     Attributes:
-        what: What its files hold, for messages.
+        what: Content of its files, for messages.
         group: The entry points of other packages.
-        formats: Those that are registered; those registered later are asked before.
+        formats: The registered formats; later ones are asked first.
         of_arrays: Called with the path, the arrays that a format read, and the options.
     """
 
@@ -98,15 +98,15 @@ class Registry(Generic[Kind]):
         return known_format(path, self.what, self.readers())
 
     def read(self, path: Path, **options: Any) -> Any:
-        """Return what a file holds; raises as :meth:`of` and :meth:`read_as`."""
+        """Return the content of a file; raises as :meth:`of` and :meth:`read_as`."""
         return self.read_as(self.of(path), path, **options)
 
     def read_as(self, chosen: Format, path: Path, **options: Any) -> Any:
-        """Return what a file of this format holds.
+        """Return the content of a file of this format.
 
         Raises:
-            InputError: it cannot be read. MissingDependencyError: that needs a package that is not
-                installed.
+            InputError: the file cannot be read. MissingDependencyError: it needs a package that is
+                not installed.
         """
         try:
             return self._read(chosen, path, options)
@@ -136,22 +136,22 @@ class Registry(Generic[Kind]):
         return loaded(self.of_arrays)(path, found, **options) if isinstance(found, dict) else found
 
     def readers(self) -> list[Kind]:
-        """Return the formats that are read."""
+        """Return the formats that can be read."""
         return [one for one in self if one.read is not None]
 
     def writers(self) -> list[Kind]:
-        """Return the formats that are written."""
+        """Return the formats that can be written."""
         return [one for one in self if one.write is not None]
 
 
 def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
-    """Return the format of a path that shall hold ``what``, among these.
+    """Return the format of a path that should hold ``what``, among these.
 
-    The suffix says it. Where several have it, or none, the content does; of several, one that does
-    not look at the content takes what no other recognises.
+    The suffix decides. If several formats have it, or none, the content decides; of several, one
+    that does not check the content takes what no other recognises.
 
     Raises:
-        InputError: none is known, or it is a pipe or a device.
+        InputError: no format is known, or the path is a pipe or a device.
     """
     require_no_pipe(path)
     named = [one for one in formats if path.suffix.lower() in one.suffixes]
@@ -166,7 +166,7 @@ def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
 
 
 def unknown_suffix(path: Path, formats: Iterable[Format], fix: str) -> InputError:
-    """Return the refusal of a file whose suffix is of none of these formats."""
+    """Return the error for a file whose suffix belongs to none of these formats."""
     return InputError(f"{path.name} has an unknown suffix.",
                       f"Known suffixes are {' '.join(suffixes_of(formats))}.", fix)
 
@@ -177,7 +177,7 @@ def suffixes_of(formats: Iterable[Format]) -> tuple[str, ...]:
 
 
 def listed(formats: Iterable[Format]) -> str:
-    """Return the suffixes of formats and what they stand for, as a text for people."""
+    """Return the suffixes of formats and their meaning, as a text for users."""
     told: dict[str, list[str]] = {}
     for one in formats:
         told.setdefault(" ".join(one.suffixes), []).extend([one.about] if one.about else [])
@@ -186,7 +186,7 @@ def listed(formats: Iterable[Format]) -> str:
 
 
 def head_of(path: Path, count: int) -> bytes:
-    """Return the first bytes of a file; none of a folder."""
+    """Return the first bytes of a file; empty for a folder."""
     if path.is_dir():
         return b""
     with open(path, "rb") as stream:
@@ -194,7 +194,7 @@ def head_of(path: Path, count: int) -> bytes:
 
 
 def starts_with(*marks: bytes) -> Callable[[Path], bool]:
-    """Return what recognises files that begin with one of ``marks``."""
+    """Return a function that recognises files that begin with one of ``marks``."""
     def recognises(path: Path) -> bool:
         return head_of(path, max(map(len, marks))).startswith(marks)
     return recognises

@@ -1,7 +1,7 @@
-"""Readers of compiled packages in a process of their own: on a mangled file they may abort.
+"""Readers of compiled packages in a separate process: on a corrupt file they may abort.
 
-``python -m limber.geometry.io.isolated_readers READER SOURCE TARGET.npz PARENT`` is what
-:func:`read_apart` starts. An abort, a hang or a flood of memory ends that process alone.
+:func:`read_apart` starts ``python -m limber.geometry.io.isolated_readers READER SOURCE TARGET.npz
+PARENT``. An abort, a hang or a flood of memory ends only that process.
 """
 
 import sys
@@ -26,10 +26,11 @@ _REFUSED = 2
 
 def read_apart(reader: Callable[[Path], dict[str, np.ndarray]], path: Path,
                ) -> dict[str, np.ndarray]:
-    """Return what a function of a module reads of a file or folder, as arrays.
+    """Return what a function of a module reads from a file or folder, as arrays.
 
     Raises:
-        InputError: it cannot be read, or takes far more time or memory than its size warrants.
+        InputError: the file cannot be read, or takes far more time or memory than its size
+        warrants.
     """
     parts = Path(path).rglob("*") if Path(path).is_dir() else [Path(path)]
     size_mb = sum(part.stat().st_size for part in parts if part.is_file()) / 1e6
@@ -66,7 +67,7 @@ def _main(reader: str, source: str, target: str, parent_id: str) -> int:
 
 
 def _unpacked(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Arrays by their names, which are any text, and would not all do as names within a file."""
+    """Arrays by their names, which may be any text, even invalid as a name within a file."""
     names = arrays["names"].tolist()
     return {name: arrays[f"arr_{k}"] for k, name in enumerate(names)}
 

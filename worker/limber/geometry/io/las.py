@@ -10,7 +10,7 @@ from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
 
 
 def is_packed(path: Path) -> bool:
-    """Whether it is LAZ, of which compiled code makes points; that aborts on mangled ones."""
+    """Whether the file is LAZ, whose points compiled code decodes; it aborts on corrupt ones."""
     with open(path, "rb") as stream:
         return bool(stream.read(105)[104] & 0xC0)
 
@@ -21,7 +21,7 @@ def las_columns(path: Path) -> dict[str, np.ndarray]:
     attributes = {name: values for name, values in cloud.attributes.items()
                   if name == "color" or values.any()}
     if "color" in attributes and attributes["color"].max(initial=0) > 255:
-        # 16 bits a channel by the standard, though many programs write 8.
+        # 16 bits per channel by the standard, though many programs write 8.
         attributes["color"] = attributes["color"] // 257
     return {**attributes, POINTS: cloud.points, LEFT_OUT: np.array(cloud.left_out)}
 

@@ -1,8 +1,8 @@
-"""Structs of Matlab's files of version 7.3, which are HDF5: a group is a struct, a field in it an
-array whose axes stand the other way round, and of several structs a field holds references.
+"""Structs in Matlab's version 7.3 files, which are HDF5. A group is a struct, and a field in it is
+an array with reversed axes; for several structs, a field holds references.
 
-It runs in a process of its own (:func:`limber.geometry.io.isolated_readers.read_apart`): HDF5 is
-native code, and the file may be mangled. What leads out of the file is not followed.
+Runs in a separate process (:func:`limber.geometry.io.isolated_readers.read_apart`): HDF5 is native
+code, and the file may be corrupt. Links out of the file are not followed.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from limber.core.files.reading import HARMLESS_BYTES, LARGEST_EXPANSION
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _STARTS = (0, 512)
-"""Where HDF5 begins: Matlab writes a header of its own before it."""
+"""Offset at which HDF5 begins: Matlab writes its own header before it."""
 _MOST_TEXT = 200
 
 
@@ -22,7 +22,7 @@ def is_hdf5(path: Path) -> bool:
     """Whether a file is HDF5, with Matlab's header or without.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with open(path, "rb") as stream:
         head = stream.read(_STARTS[-1] + len(_SIGNATURE))
@@ -35,11 +35,11 @@ def struct_arrays(path: Path, needed: tuple[str, ...], further: tuple[str, ...],
 
     Args:
         needed: Names of fields with numbers.
-        further: Names of fields that are read where they are there.
+        further: Names of fields that are read if present.
 
     Returns:
         Arrays as Matlab has them, shape [rows, columns]; and ``creator``, the text of
-        ``rundata.creator``. Nothing where no struct has those fields.
+        ``rundata.creator``. Empty if no struct has those fields.
 
     Raises:
         OSError, ValueError, KeyError, RuntimeError: the file is damaged.
@@ -60,7 +60,7 @@ def struct_arrays(path: Path, needed: tuple[str, ...], further: tuple[str, ...],
 
 
 def _own(group: Any, name: str) -> Any:
-    """What a group has by this name itself: no link to elsewhere is followed."""
+    """The group's own entry of this name: no link to elsewhere is followed."""
     import h5py
 
     if not isinstance(group, h5py.Group) or name not in group or not isinstance(
@@ -70,7 +70,7 @@ def _own(group: Any, name: str) -> Any:
 
 
 def _struct(file: Any, found: Any) -> Any:
-    """A struct; of an array of structs or a cell array the first one."""
+    """A struct; for an array of structs or a cell array, the first one."""
     import h5py
 
     if isinstance(found, h5py.Dataset) and h5py.check_ref_dtype(found.dtype) is h5py.Reference:
@@ -97,7 +97,7 @@ def _numbers(found: Any, most_bytes: float) -> np.ndarray:
 
 
 def _text(found: Any) -> str:
-    """A text, which Matlab keeps as numbers of its letters."""
+    """A text, which Matlab stores as the numbers of its letters."""
     import h5py
 
     if not isinstance(found, h5py.Dataset) or found.dtype.kind != "u" or found.external or (

@@ -1,4 +1,4 @@
-"""A mesh that is brought as a cloud: its vertices may be a scan, or may be far too few."""
+"""A mesh given as a cloud: its vertices may be a scan, or far too few."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import numpy as np
 from limber.core.errors import InputError
 
 _LONG = 0.05
-"""Of the extent: triangles with an edge as long have their surface where no vertex is."""
+"""Fraction of the extent: triangles with so long an edge have surface where no vertex is."""
 
 
 def mesh_notes(path: Path, vertices: np.ndarray, faces: np.ndarray) -> list[str]:

@@ -1,8 +1,8 @@
-"""Multiscale tree graphs (MTG), as OpenAlea's text files hold them, in and out.
+"""Reader and writer of multiscale tree graphs (MTG), as in OpenAlea's text files.
 
-A file has sections; the last one, ``MTG:``, holds a line a vertex. The column in which its code
-begins says what it refers to: the last vertex of the column before, or, after ``^``, the last one
-of its own column. The code is a chain of signs and labels: ``/`` a part of what stands before,
+A file has sections; the last one, ``MTG:``, has one line per vertex. The column in which its code
+begins states what it refers to: the last vertex of the column before, or, after ``^``, the last one
+of its own column. The code is a chain of signs and labels: ``/`` a part of the preceding vertex,
 ``<`` its successor, ``+`` a side branch. Vertices of any scale with XX, YY and ZZ become nodes.
 
 Source: C. Pradal, C. Godin, *MTG user guide* (OpenAlea), and its example files.
@@ -28,7 +28,7 @@ _WHAT = "a multiscale tree graph"
 
 @dataclass
 class _Vertex:
-    """A vertex as it is read: what a part of it would hang on, and where it goes on."""
+    """A vertex during reading: the node that a part of it attaches to, and where it continues."""
 
     scale: int
     whole: "_Vertex | None"
@@ -43,7 +43,7 @@ def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
 
     Args:
         path: The file.
-        scale: Metres per unit, which an MTG does not say; None takes metres.
+        scale: Metres per unit, which an MTG does not state; None means metres.
 
     Raises:
         InputError: the file is not an MTG, has no positions or radii, or is not one tree.
@@ -82,7 +82,7 @@ def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[
 
 
 def _header(path: Path, body: list[tuple[int, str]]) -> tuple[int, dict[str, int]]:
-    """How many columns are for codes, and where each feature stands."""
+    """Number of columns for codes, and the column of each feature."""
     cells = [cell.strip() for cell in body[0][1].split("\t")]
     features = {name: column for column, name in enumerate(cells) if name and column > 0}
     places = next((names for names in _PLACE if all(name in features for name in names)), None)
@@ -101,7 +101,7 @@ def _header(path: Path, body: list[tuple[int, str]]) -> tuple[int, dict[str, int
 
 
 class _Reader:
-    """Takes line after line."""
+    """Reads line by line."""
 
     def __init__(self, path: Path, scales: dict[str, int], columns: int, features: dict[str, int]):
         self.path, self.scales, self.columns, self.features = path, scales, columns, features
@@ -154,7 +154,7 @@ class _Reader:
         if before is not None:
             anchor, whole = before.anchor, before
             if sign != "/":
-                # What follows a whole grows from where its parts have ended.
+                # A vertex that follows a whole grows from the end of the whole's parts.
                 anchor = before.tail if before.scale == scale and before.tail >= 0 else anchor
                 while whole is not None and whole.scale >= scale:
                     whole = whole.whole
@@ -179,7 +179,7 @@ class _Reader:
         return len(self.nodes) - 1
 
     def values(self, number: int, cells: list[str]) -> tuple[float, ...] | None:
-        """Place and radius of a line (nan where there is none); None without a place."""
+        """Position and radius of a line (nan if it has no radius); None without a position."""
         def value(name: str) -> float:
             column = self.features[name]
             text = cells[column].strip() if column < len(cells) else ""
@@ -211,7 +211,8 @@ class _Reader:
 def write_mtg(skeleton: Skeleton, path: Path) -> None:
     """Write an MTG: a plant of axes of nodes, with positions and radii [m].
 
-    An axis hangs with ``+`` on the node that it grows from; nodes follow each other with ``<``.
+    An axis is attached with ``+`` to the node that it grows from; nodes follow each other with
+    ``<``.
     """
     depth = int(skeleton.order.max()) + 1
     tabs = "\t" * (depth + 1)
@@ -234,7 +235,7 @@ def write_mtg(skeleton: Skeleton, path: Path) -> None:
         values = "\t".join(f"{value:.9g}" for value in (*skeleton.nodes[node],
                                                         skeleton.radius[node]))
         lines.append("\t" * column + f"{sign}N{node + 1}" + "\t" * (depth + 1 - column) + values)
-        # Side axes are told before the axis goes on: "^" means the last node of that column.
+        # Side axes are written before the axis continues: "^" means the last node of that column.
         after = children.get(node, [])
         on = [one for one in after if skeleton.branch[one] == skeleton.branch[node]]
         waiting += on + [one for one in after if one not in on]

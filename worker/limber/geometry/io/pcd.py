@@ -17,7 +17,7 @@ _PADDING = "#$%&~~"  # how pypcd4 begins the names of fields that are called _
 
 
 def read_pcd(path: Path) -> Cloud:
-    """Return the points of a PCD file, with its own names of what is renamed."""
+    """Return the points of a PCD file, with the file's own names of renamed columns."""
     from pypcd4 import PointCloud
 
     stream, titles = _stream(path)
@@ -34,10 +34,10 @@ def read_pcd(path: Path) -> Cloud:
 
 
 def _stream(path: Path) -> tuple[Any, dict[str, str]]:
-    """A PCD file as its package reads it, and what the file calls fields of other names.
+    """A PCD file as its package reads it, and the file's names of renamed fields.
 
     Versions before 0.7 lack entries of the header; some programs end lines with blanks, or have
-    marks in the names of fields.
+    special characters in the names of fields.
     """
     raw, body = header_bytes(path, b"\nDATA")
     said = {words[0]: words[1:] for line in raw.decode("utf-8", "replace").splitlines()

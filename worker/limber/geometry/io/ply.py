@@ -1,4 +1,4 @@
-"""Clouds as PLY files, whose headers programs also write in other letters than ASCII."""
+"""Clouds as PLY files, whose headers may also contain letters other than ASCII."""
 
 import io
 import re
@@ -18,7 +18,7 @@ from limber.geometry.io.mesh_as_cloud import mesh_notes
 
 
 def read_ply(path: Path) -> Cloud:
-    """Return the vertices of a PLY file, with its own names of what is renamed."""
+    """Return the vertices of a PLY file, with the file's own names of renamed columns."""
     content, titles = _ply_content(path)
     if "vertex" not in content:
         raise InputError(f"{path} has no vertices.", "A PLY point cloud has an element `vertex`.",
@@ -46,7 +46,7 @@ def _triangles(content: Any) -> np.ndarray:
 
 
 def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:
-    """Read a PLY file, and what it calls the properties whose names are no ASCII.
+    """Read a PLY file, and its names of the properties that are not ASCII.
 
     A header is ASCII by the standard; programs write comments and names in other letters too.
     """

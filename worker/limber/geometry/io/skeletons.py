@@ -21,7 +21,7 @@ from limber.geometry.skeleton.skeleton import STATES, Skeleton
 
 _ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
     f"{end}{axis}": f"{end[0]}{axis}" for end in ("start", "end") for axis in "xyz"}}
-"""Names of columns in rTwig and SimpleForest, in small letters and without underscores."""
+"""Names of columns in rTwig and SimpleForest, in lower case and without underscores."""
 _HEAD = 4096  # bytes that a search for the format reads
 
 
@@ -30,10 +30,10 @@ def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
 
     Args:
         path: The file.
-        scale: Metres per unit; None takes the file's own, or metres.
+        scale: Metres per unit; None uses the file's own, or metres.
 
     Raises:
-        InputError: its format is not known, or it is no tree; see the formats' readers.
+        InputError: its format is not known, or it is not a tree; see the formats' readers.
     """
     return SKELETONS.read(Path(path), scale=scale)
 
@@ -43,7 +43,7 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
 
     Args:
         path: The file.
-        scale: Metres per unit; None takes the header's ``# unit:``, or metres.
+        scale: Metres per unit; None uses the header's ``# unit:``, or metres.
 
     Raises:
         InputError: not an SWC tree; see :meth:`Skeleton.from_edges`.
@@ -77,7 +77,7 @@ def _swc_node(line: str) -> list[float]:
 
 
 def _first_line(path: Path) -> str:
-    """The first line that is no comment, as far as a search for the format reads."""
+    """The first line that is not a comment, within the part searched for the format."""
     lines = head_of(path, _HEAD).decode("utf-8", "replace").splitlines()
     return next((line for line in lines if line.strip() and not line.startswith("#")), "")
 
@@ -96,16 +96,16 @@ def _is_cylinders(path: Path) -> bool:
 def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
     """Read a cylinder model: columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order).
 
-    A cylinder's end becomes a node that hangs on the end of its parent; the root's start becomes
-    the root node. What :func:`write_cylinders` adds (deviations, states, probabilities) is read
-    where it is there. The names of rTwig and SimpleForest are known, too.
+    A cylinder's end becomes a node attached to the end of its parent; the root's start becomes the
+    root node. The additions of :func:`write_cylinders` (deviations, states, probabilities) are read
+    if present. The names of rTwig and SimpleForest are known, too.
 
     Args:
         path: The CSV file.
-        scale: Metres per unit; None takes metres.
+        scale: Metres per unit; None means metres.
 
     Raises:
-        InputError: columns are missing, a value is no number, or it is not one tree.
+        InputError: columns are missing, a value is not a number, or it is not one tree.
     """
     rows = [{_ALIASES.get(name.strip().lower().replace("_", ""), name.strip()): value
              for name, value in row.items() if name is not None}
@@ -162,8 +162,8 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
     """Write one cylinder for each node but the root, as CSV in the skeleton's unit.
 
     Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
-    standard deviation, its state (0 measured, 1 limited, 2 interpolated, 3 unresolved,
-    4 bridged), the probability that the node is there, and the radius at the start.
+    standard deviation, its state (0 measured, 1 limited, 2 interpolated, 3 unresolved, 4 bridged),
+    the probability that the node exists, and the radius at the start.
     """
     start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
     length = np.linalg.norm(end - start, axis=1)
@@ -237,7 +237,7 @@ def _parents(path: Path, ids: np.ndarray, parent_ids: np.ndarray) -> np.ndarray:
 
 
 def _without_repeats(nodes: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge a node with its parent where both are at the same place: new parents, nodes kept."""
+    """Merge a node with its parent where both have the same position: new parents, nodes kept."""
     step = np.linalg.norm(nodes - nodes[parent], axis=1)
     repeated = (parent >= 0) & (step < 1e-9)
     target = np.arange(len(nodes))
@@ -263,5 +263,6 @@ SKELETONS = Registry("skeleton", "limber.skeletons", [
            about="cylinders of TreeQSM or SmartQSM"),
     Format("MTG", (".mtg",), read_mtg, write_mtg, about="multiscale tree graph of the axes"),
 ], of_arrays=_of_arrays)
-"""Readers take ``scale``, the metres per unit or None; what they write is in metres. Arrays that a
-format reads are cylinders: ``id``, ``parent`` (-1: none), ``start``, ``end`` and ``radius``."""
+"""Readers take ``scale``, the metres per unit or None; their results are in metres. Arrays that a
+format reads are cylinders: ``id``, ``parent`` (-1: none), ``start``, ``end`` and ``radius``.
+"""

@@ -1,5 +1,4 @@
-"""Surfaces of other programs: the registry of their formats, and what a surface must be before it
-can be filled.
+"""Surfaces of other programs: registry of their formats, and checks before filling.
 """
 
 from pathlib import Path
@@ -16,20 +15,20 @@ SURFACES = Registry("surface", "limber.surfaces", [
     Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])
 """Readers take ``scale``, the metres per unit."""
 _ROUNDED = 1e-5
-"""Of the extent: numbers of five or six digits part vertices by as much."""
+"""Fraction of the extent: rounding to five or six digits separates vertices by up to this."""
 
 
 def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
-    """Return a surface that a solid fills, and warnings about what was done or looks wrong.
+    """Return a surface that encloses a solid, and warnings about changes or suspect features.
 
     Args:
         surface: As read [m].
         path: Its file, for messages.
 
     Raises:
-        InputError: it has holes, edges of more than two faces, faces that point in and out,
-            several bodies or cavities, no volume, or it intersects itself. Each states where.
-            Or it has a size that no branch has.
+        InputError: it has holes, edges of more than two faces, faces that point in and out, several
+            bodies or cavities, no volume, or crossings (each message states where), or a size that
+            no branch has.
     """
     warnings = []
     corner = surface.faces
@@ -54,7 +53,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
 
 
 def _welded(surface: Surface) -> tuple[Surface, list[str]]:
-    """Unite vertices that few digits have moved apart, if that closes the surface."""
+    """Merge vertices that rounding has moved apart, if that closes the surface."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -140,7 +139,7 @@ def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
 
 
 def _within(parts: list[Surface], volume: np.ndarray) -> list[int]:
-    """Parts that lie inside the largest one: its winding number around a corner is not 0."""
+    """Parts inside the largest one: its winding number around a corner is not 0."""
     largest = int(np.argmax(np.abs(volume)))
     outer = parts[largest]
     return [k for k, part in enumerate(parts) if k != largest and abs(_winding(
@@ -148,7 +147,7 @@ def _within(parts: list[Surface], volume: np.ndarray) -> list[int]:
 
 
 def _winding(surface: Surface, point: np.ndarray) -> float:
-    """How often a surface winds around a point (Van Oosterom and Strackee 1983)."""
+    """Winding number of a surface around a point (Van Oosterom and Strackee 1983)."""
     a, b, c = (surface.vertices[surface.faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     over = np.einsum("ij,ij->i", a, np.cross(b, c))

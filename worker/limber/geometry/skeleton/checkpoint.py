@@ -1,4 +1,4 @@
-"""What the search for a skeleton came to, as a file: who is stopped after it goes on from there.
+"""File of the found skeleton and its search report; a stopped run resumes from it.
 
 Every number comes back to its last bit, so that the surface and the mesh made of it are those of
 an undisturbed run.
@@ -35,7 +35,7 @@ _Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FoundSkeleton:
-    """A skeleton in the prepared cloud's frame, and the part of the cloud that it belongs to.
+    """A skeleton in the prepared cloud's frame, and the part of the cloud that belongs to it.
 
     Attributes:
         result: Result of the search.
@@ -64,7 +64,7 @@ class FoundSkeleton:
         """Read a file that :meth:`write` has written.
 
         Raises:
-            InputError: it is damaged.
+            InputError: the file is damaged.
         """
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, _SKELETON | _POINTS, _WHAT)
@@ -86,7 +86,7 @@ class FoundSkeleton:
 
 
 class _Part(BaseModel):
-    """A place of the search's report, as a dict of numbers and positions."""
+    """Return an entry of the search report as a dict of numbers and positions."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -161,7 +161,7 @@ def _leaves(path: Path, arrays: dict[str, np.ndarray], told: _Told) -> list[Leaf
 
 
 def _is_tree(parent: np.ndarray) -> bool:
-    """Whether the first node is the root and each other hangs on one before it."""
+    """Whether the first node is the root and every other node follows its parent."""
     return (parent.dtype.kind == "i" and len(parent) > 1 and parent[0] == -1
             and bool(((parent[1:] >= 0) & (parent[1:] < np.arange(1, len(parent)))).all()))
 

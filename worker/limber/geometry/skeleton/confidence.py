@@ -1,4 +1,4 @@
-"""How likely a skeleton's twigs and nodes are there, by what its scan shows; and gaps in that."""
+"""Probabilities of a skeleton's twigs and nodes from the evidence of the scan; gaps in the scan."""
 
 from dataclasses import replace
 
@@ -13,13 +13,14 @@ from limber.geometry.skeleton.sweep import stretches
 
 _GAP = 4.0  # radii without a point that are a gap, not a hole
 _BRIDGED_SIGMA = 0.15  # of a radius in a gap
-# Logistic: a constant, then a slope for each column of the evidence. A twig is there where its fork
-# is a true one, a node where it lies in the true wood: both fitted by likelihood to 1,056 side
-# branches of 203 generated scans (seeds 7000 to 7215: round, one-sided with 1 to 3 mm noise, gaps,
-# single views, crowns, stray points, and points up to 6 mm apart). On 666 more (112 scans, seeds
-# from 910000) tenths of 5 and more came out within 6 points. A backward start tells that a fork is
-# elsewhere, not that the wood is not there: while unlikely twigs are dropped it must not count
-# (with a slope of -2.5 a sparse crown lost 6 % of its points).
+# Logistic models: a constant, then a slope for each column of the evidence. A twig exists where its
+# fork is true, a node where it lies inside the true wood. Both were fitted by maximum likelihood to
+# 1,056 side branches of 203 generated scans (seeds 7000 to 7215: round, one-sided with 1 to 3 mm
+# noise, gaps, single views, crowns, stray points, and points up to 6 mm apart). On 666 more (112
+# scans, seeds from 910000), bins of a tenth with 5 or more branches agreed within 6 percentage
+# points. A backward start shows that a fork is elsewhere, not that the wood is missing. While
+# unlikely twigs are dropped, it must not count (with a slope of -2.5 a sparse crown lost 6 % of its
+# points).
 _TWIG_ODDS = (-2.2, 0.97, 0.88, -1.3, -1.35, 0.0)
 _NODE_ODDS = (6.6, -0.8, -1.3, -3.4)
 _BACK = np.deg2rad(75.0), np.deg2rad(30.0)  # angle from which a twig starts backwards, and wholly
@@ -46,7 +47,7 @@ def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     """Return the skeleton with gaps and the probabilities of its nodes; radii stay as they are.
 
     Args:
-        skeleton: Led through the points; its radii are not fitted.
+        skeleton: Axes through the points; its radii are not fitted.
         points: The scan [m], shape [m, 3].
         noise: Standard deviation of the points [m].
     """
@@ -56,7 +57,7 @@ def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
 
 def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what probabilities are told by: that of runs [runs, 5] and that of nodes [n, 3].
+    """Return the evidence for the probabilities: of runs [runs, 5] and of nodes [n, 3].
 
     Args:
         skeleton: As :func:`assessed` returned it.
@@ -69,11 +70,11 @@ def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
 
 
 def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
-    """Drop side runs that are less likely there than ``least``, and what they carry.
+    """Drop side runs with a probability below ``least``, and what they carry.
 
     Returns:
-        The skeleton, and of each run dropped its ``length`` [m], its tip's place ``at`` [m] and
-        its ``probability``.
+        The skeleton, and for each dropped run its ``length`` [m], the position ``at`` [m] of its
+        tip and its ``probability``.
     """
     runs = skeleton.runs()
     told = np.ones(len(runs))
@@ -88,9 +89,9 @@ def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
 
 
 def given_carrier(skeleton: Skeleton) -> np.ndarray:
-    """Probability of each run if the run that carries it is there, shape [runs]; the main's is 1.
+    """Probability of each run, given that its carrier exists, shape [runs]; 1 for the main run.
 
-    The probability of a run's nodes holds its carriers'.
+    The probability of a run's nodes includes that of its carriers.
     """
     runs = skeleton.runs()
     stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
@@ -110,11 +111,11 @@ def shares(skeleton: Skeleton) -> dict[str, float]:
 
 
 def _twig_evidence(skeleton: Skeleton, count: np.ndarray, noise: float) -> np.ndarray:
-    """What speaks for each side run, shape [runs, 5]; zeros for the main run.
+    """Evidence for each side run, shape [runs, 5]; zeros for the main run.
 
-    ln(1 + points / 10), ln(1 + how far it reaches / its carrier's radius), the share that is
-    bridged, the noise over its radius, and whether it starts backwards, 0 to 1: where a fork is
-    misplaced, a twig comes back to it.
+    ln(1 + points / 10), ln(1 + reach / its carrier's radius), the bridged fraction, the noise over
+    its radius, and whether it starts backwards, 0 to 1: where a fork is misplaced, a twig comes
+    back to it.
     """
     told = np.zeros((skeleton.branch_count, 5))
     runs = skeleton.runs()
@@ -130,7 +131,7 @@ def _twig_evidence(skeleton: Skeleton, count: np.ndarray, noise: float) -> np.nd
 
 
 def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndarray:
-    """What speaks against each node's place on its run, shape [n, 3].
+    """Evidence against each node's position on its run, shape [n, 3].
 
     The noise over the radius, ln(1 + length of the gap that it bridges / radius), and whether its
     radius is not resolved.
@@ -149,10 +150,10 @@ def _with_probability(skeleton: Skeleton, count: np.ndarray, gap: np.ndarray, no
 
 
 def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:
-    """Probability that each node's run is there, its carriers too, and the node in its place.
+    """Probability that each node exists, with its run and carriers, and is in its position.
 
-    A run's first node stands for its fork: that this is there, and where, the run's own evidence
-    was fitted to. Its gap and its noise would count against it a second time.
+    A run's first node stands for its fork. The run's own evidence was fitted to the existence and
+    position of that fork. The node's gap and noise would count against it twice.
     """
     own = _logistic(twig, _TWIG_ODDS)
     own[0] = 1.0
@@ -169,7 +170,7 @@ def _logistic(evidence: np.ndarray, odds: tuple[float, ...]) -> np.ndarray:
 
 
 def _shown(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Spacing of the points around each node [m], and how many lie on each, shape [n] each."""
+    """Spacing of the points around each node [m], and number of points on each, shape [n] each."""
     segment, residual = nearest_cylinders(skeleton, points)
     near = np.abs(residual) < np.maximum(skeleton.radius[segment], 3 * noise)
     return (point_spacing(skeleton, points, segment, noise),
@@ -177,7 +178,7 @@ def _shown(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[np.nda
 
 
 def _gaps(skeleton: Skeleton, count: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    """Length [m] of the long stretch without points that each node lies in, or 0, shape [n]."""
+    """Length [m] of the long stretch without points that contains each node, or 0, shape [n]."""
     gap, step = np.zeros(skeleton.node_count), skeleton.steps
     for members in skeleton.runs():
         own = members[1:]

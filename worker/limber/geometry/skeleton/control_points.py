@@ -1,4 +1,4 @@
-"""Control points: positions along a branch where Young's modulus is estimated and motion seen."""
+"""Control points: positions along a branch where Young's modulus is estimated."""
 
 import numpy as np
 

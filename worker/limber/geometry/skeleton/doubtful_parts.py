@@ -1,4 +1,4 @@
-"""The parts of a skeleton that its user should look at: unlikely, vague, bridged, kinked."""
+"""Parts of a skeleton that its user should check: unlikely, vague, bridged, kinked."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -32,8 +32,8 @@ class DoubtfulPart:
         kind: Why it is uncertain.
         branch: Its run.
         at: A position on it [m], shape [3].
-        length: Of the part [m]; 0 for a single node.
-        radius: There, the median [m].
+        length: Length of the part [m]; 0 for a single node.
+        radius: Median radius there [m].
         value: Probability of an unlikely branch; standard deviation over radius of an unresolved
             one; angle [rad] of a kink; NaN for a gap.
     """
@@ -47,7 +47,7 @@ class DoubtfulPart:
 
 
 def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
-    """Return what to look at, the longest of each kind first."""
+    """Return the parts to check, the longest of each kind first."""
     found: list[DoubtfulPart] = []
     for run, (members, own) in enumerate(
             zip(skeleton.runs(), skeleton.own_runs(), strict=True)):
@@ -91,8 +91,8 @@ def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
 def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
     """Angle [rad] between the axis before and after each node of a run, shape [k].
 
-    Over two radii to each side, so that the roughness of single nodes is no kink; nodes nearer
-    than that to an end do not turn.
+    Measured over two radii to each side, so that the roughness of single nodes is not a kink. Nodes
+    nearer than that to an end have no turn.
     """
     nodes = skeleton.nodes[members]
     along = arc_lengths(nodes)

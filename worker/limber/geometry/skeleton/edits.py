@@ -61,9 +61,9 @@ class DeleteBranch(_Edit):
 
 
 class MergeBranch(_Edit):
-    """Up to ``at`` a branch is one with the branch at ``to``, from where it goes on.
+    """Merge a branch up to ``at`` with the branch at ``to``, from which it then continues.
 
-    What it carried before ``at`` hangs on the nearest nodes of that other branch.
+    What it carried before ``at`` is attached to the nearest nodes of that other branch.
     """
 
     do: Literal["merge"] = "merge"
@@ -134,7 +134,7 @@ def read_edits(path: Path) -> list[Edit]:
 
 
 def edits_text(edits: Sequence[Edit]) -> str:
-    """Return edits as the text of their file: one per line, equal for equal edits."""
+    """Return edits as the text of their file: one per line, the same text for equal edits."""
     lines = [edit.model_dump_json(exclude_none=True) for edit in edits]
     return "[" + ",\n ".join(lines) + "]\n"
 
@@ -227,7 +227,7 @@ def _split(skeleton: Skeleton, edit: SplitBranch) -> Skeleton:
 
 
 def _hung(skeleton: Skeleton, node: int, onto: int) -> Skeleton:
-    """Hang a node, with all that it carries, on another one; a way that is long is filled in."""
+    """Attach a node, with all that it carries, to another one; nodes are added along a long gap."""
     if node in _way_down(skeleton, onto):
         raise _circle()
     way = skeleton.nodes[node] - skeleton.nodes[onto]
@@ -262,7 +262,8 @@ def _with_radius(skeleton: Skeleton, edit: SetRadius) -> Skeleton:
     if edit.to is not None:
         one = _way_down(skeleton, node)
         other = _way_down(skeleton, _nearest(skeleton, edit.to))
-        # The way between two nodes: what only one of their ways to the root has, and the fork.
+        # The path between two nodes: the nodes on only one of their paths to the root, and the
+        # fork.
         fork = next(step for step in one if step in other)
         chosen = [*one[:one.index(fork)], *other[:other.index(fork)], fork]
     radius, sigma, state = (values.copy() for values in (

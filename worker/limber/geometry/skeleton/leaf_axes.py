@@ -1,4 +1,4 @@
-"""Axes in the middle of stems and leaves, where most points lie on no cylinder."""
+"""Axes through the middle of stems and leaves, where most points lie on no cylinder."""
 
 from dataclasses import replace
 
@@ -16,9 +16,9 @@ _EVENED = 3  # rounds
 
 def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,
                    radius_limits: tuple[float, float]) -> Skeleton:
-    """Lead axes through the middle of stem and leaves, without a fit: leaves are no cylinders.
+    """Place axes in the middle of stem and leaves, without a fit: leaves are not cylinders.
 
-    A leaf's radius is its stalk's, for want of a better one, and marked as not measured.
+    A leaf gets the radius of its stalk, for lack of a better one, marked as not measured.
 
     Args:
         skeleton: With first radii.
@@ -36,7 +36,7 @@ def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,
 
 
 def _evened(skeleton: Skeleton) -> np.ndarray:
-    """Each node between others of its run moved half way to their middle [m], shape [n, 3]."""
+    """Each node moved half way to the midpoint of its neighbours on the run [m], shape [n, 3]."""
     nodes = skeleton.nodes.copy()
     for members in skeleton.runs():
         inner, old = members[1:-1], skeleton.nodes

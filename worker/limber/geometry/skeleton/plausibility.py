@@ -128,7 +128,7 @@ def warnings(result: Any, where: Where) -> list[str]:
 
 
 def _joining_texts(result: Any, where: Where) -> list[str]:
-    """What to tell of bridges, pieces left away and loops."""
+    """Warnings about bridges, discarded pieces and loops."""
     texts = []
     longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
     for bridge in longest[:_NAMED]:
@@ -153,7 +153,7 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
 
 
 def _doubt_texts(result: Any, where: Where) -> list[str]:
-    """What to tell of twigs dropped, and of the root."""
+    """Warnings about dropped twigs, and about the root."""
     texts = []
     if result.unlikely:
         longest = max(twig["length"] for twig in result.unlikely)
@@ -180,7 +180,8 @@ def shows_round(result: Any) -> bool:
 
 def unexplained_share(result: Any) -> float:
     """Fraction of points that belong to no round axis: leaves, flying pixels, a second plant."""
-    # Leaves make noise look large: what lies a whole radius off is on no axis, whatever noise is.
+    # Leaves make the noise look large. A point a whole radius off is on no axis, whatever the
+    # noise.
     radius = result.skeleton.radius[result.node_of_point]
     return float(np.mean(np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)))
 
@@ -195,7 +196,7 @@ def check_explained(result: Any, limit: float) -> None:
     Raises:
         InputError: the fraction exceeds ``limit``.
     """
-    # A depth camera's scatter is noise, not leaves: there only what noise does not reach counts.
+    # A depth camera's scatter is noise, not leaves: only points beyond its reach count.
     radius = result.skeleton.radius[result.node_of_point]
     share = unexplained_share(result) if result.leafy else float(np.mean(
         result.residual > np.maximum(radius, 3 * result.noise)))

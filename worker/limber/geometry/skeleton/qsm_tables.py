@@ -11,7 +11,7 @@ from limber.core.files.reading import csv_records
 from limber.geometry.skeleton.skeleton import Skeleton
 
 HEIGHTS = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9)
-"""Shares of the main path's length at which diameters are given."""
+"""Fractions of the main path's length at which diameters are given."""
 
 
 _THICKEST = 3.0  # m
@@ -63,7 +63,7 @@ def diameters(skeleton: Skeleton, along: np.ndarray) -> np.ndarray:
 
 
 def diameters_at_heights(skeleton: Skeleton) -> list[dict[str, float]]:
-    """Diameter and its standard deviation [m] at the shares HEIGHTS of the main path's length."""
+    """Diameter and its standard deviation [m] at HEIGHTS, fractions of the main path."""
     total = float(skeleton.arc_length[skeleton.main_path()[-1]])
     along = total * np.array(HEIGHTS)
     return [{"share": share, "along_m": float(place), "diameter_m": float(row[0]),
@@ -72,7 +72,7 @@ def diameters_at_heights(skeleton: Skeleton) -> list[dict[str, float]]:
 
 
 def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[str, Any]]:
-    """Ours beside each measured diameter: the difference over it, and in standard deviations.
+    """Our diameter at each measured one: difference, relative and in standard deviations.
 
     ``sigmas`` is None where the skeleton's deviation is not known.
 
@@ -96,10 +96,10 @@ def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[s
 def read_calipers(path: Path) -> list[Caliper]:
     """Read caliper values: a CSV file with the columns ``along_m`` and ``diameter_mm``.
 
-    ``along_m`` is counted from the root along the main path; further columns are passed over.
+    ``along_m`` is counted from the root along the main path; other columns are ignored.
 
     Raises:
-        InputError: a column is missing, or a value is no positive number.
+        InputError: a column is missing, or a value is not a positive number.
     """
     rows = csv_records(path, "a CSV file of caliper values")
     if not rows:

@@ -1,4 +1,4 @@
-"""What the search for a skeleton came to: the skeleton, and what was done to get it."""
+"""Result of the search for a skeleton: the skeleton and the report on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ from limber.geometry.skeleton.totals import totals
 
 @dataclass(frozen=True)
 class SkeletonResult:
-    """A skeleton, and what was done to get it.
+    """A skeleton, and the report on its search.
 
     Attributes:
         skeleton: Axes and radii [m] in the cloud's frame.
@@ -31,11 +31,12 @@ class SkeletonResult:
         split_off: Discarded pieces: ``points``, ``distance`` [m], ``at``.
         loops: Lengths [m] of closed loops that were opened.
         pruned: Number of spurs pruned.
-        second_base: Where the plant seems to stand on the ground a second time [m], shape [3].
-        other_root: An end that is about as likely the root [m], shape [3].
-        unlikely: Twigs dropped as more likely not there: ``length`` [m], ``at`` [m, 3],
+        second_base: Position where the plant seems to reach the ground a second time [m], shape
+        [3].
+        other_root: Another end that is about as likely to be the root [m], shape [3].
+        unlikely: Dropped twigs, more likely absent than not: ``length`` [m], ``at`` [m, 3],
             ``probability``.
-        leafy: Most points lay on no cylinder, and axes were led through the middle of leaves.
+        leafy: Most points were on no cylinder, and axes were placed in the middle of leaves.
     """
 
     skeleton: Skeleton
@@ -54,15 +55,15 @@ class SkeletonResult:
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know, with places in the cloud's frame."""
+        """Warnings for the user, with positions in the cloud's frame."""
         return self.warnings_at(lambda place: place)
 
     def warnings_at(self, where: Where) -> list[str]:
-        """What the user should know, with places as ``where`` takes them to other coordinates."""
+        """Warnings for the user, with positions transformed by ``where`` to other coordinates."""
         return warnings(self, where)
 
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
-        """Return the result in another frame; ``move`` takes points [n, 3] there."""
+        """Return the result in another frame; ``move`` transforms points [n, 3] to it."""
         bridges = [bridge | {"from": move(bridge["from"][None])[0],
                              "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
         split_off, unlikely = ([part | {"at": move(part["at"][None])[0]} for part in parts]
@@ -86,7 +87,7 @@ class SkeletonResult:
 
 
 def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
-    """Wrap a user's own skeleton, in the cloud's frame; nothing is changed in it."""
+    """Wrap a user's own skeleton, in the cloud's frame; it is not changed."""
     segment, residual = nearest_cylinders(skeleton, points)
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
     nothing = Contraction(points[:0], np.empty(0), 0, ContractionStatus.given)

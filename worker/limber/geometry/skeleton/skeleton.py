@@ -89,14 +89,14 @@ class Skeleton:
 
     @property
     def steps(self) -> np.ndarray:
-        """Distance of each node from its parent [m], 0 of the root, shape [n]."""
+        """Distance of each node from its parent [m], 0 for the root, shape [n]."""
         step = np.linalg.norm(self.nodes - self.nodes[self.parent], axis=1)
         step[self.parent < 0] = 0.0
         return step
 
     @property
     def length(self) -> float:
-        """Length of all axes together [m]."""
+        """Total length of all axes [m]."""
         return float(self.steps.sum())
 
     @property
@@ -130,7 +130,7 @@ class Skeleton:
     def runs(self) -> list[np.ndarray]:
         """Node indices of each unforked run, in branch order.
 
-        A side run starts with the node that it forks off from, which is its parent's.
+        A side run starts with the node that it forks off from, which belongs to its parent.
         """
         return [self._members(run) for run in range(self.branch_count)]
 
@@ -139,8 +139,9 @@ class Skeleton:
         return [np.flatnonzero(self.branch == branch) for branch in range(self.branch_count)]
 
     def curve(self, run: int) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes [m], shape [k, 3], and radii [m] of a run from its fork on, where a twig has its
-        own radius, not its carrier's."""
+        """Nodes [m], shape [k, 3], and radii [m] of a run from its fork on; a twig has its own
+        radius there, not its carrier's.
+        """
         members = self._members(run)
         radius = self.radius[members]
         if run > 0:
@@ -173,7 +174,7 @@ class Skeleton:
 
         Args:
             keep: Shape [n].
-            parent: Other parents of all nodes, shape [n]; None: those that they have.
+            parent: Other parents of all nodes, shape [n]; None: the present ones.
         """
         new_index = np.cumsum(keep) - 1
         parent = (self.parent if parent is None else parent)[keep]

@@ -32,7 +32,7 @@ from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
 
 FIT_POINT_LIMIT = 60_000
-"""More points than that do not make the fit better, only slower."""
+"""More points do not improve the fit; they only slow it down."""
 
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
@@ -43,19 +43,19 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
 
     Args:
         points: Scanned points [m], shape [n, 3].
-        settings: How.
-        root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
+        settings: Settings to use.
+        root: A point [m] near the root, shape [3]; None: the thick end of the plant.
         up: The up direction, shape [3]; None: z.
-        camera: The points are a depth camera's, and scatter along its sight alone.
-        where: Takes places of the cloud to the coordinates of its file, for errors; None: they
-            are the same.
-        progress: Called as it goes.
+        camera: The points are a depth camera's, and scatter only along its sight.
+        where: Transforms positions of the cloud to its file's coordinates, for errors; None: the
+            same.
+        progress: Called during the work.
 
     Raises:
         InputError: the cloud is not branch-like.
     """
-    # In the cloud's own frame: boxes around it, and the triangles of its Laplacian, would be others
-    # for a turned one.
+    # In the cloud's own frame: bounding boxes and the triangles of the Laplacian would differ for a
+    # rotated one.
     own = OwnFrame.of(points)
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
     found = _of_ordered(own, settings or SkeletonSettings(),
@@ -69,11 +69,11 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
 
 @dataclass(frozen=True)
 class _Search:
-    """A cloud in its own frame, and how its skeleton is searched.
+    """A cloud in its own frame, and the search for its skeleton.
 
     Attributes:
         points: [m], shape [m, 3].
-        settings: How.
+        settings: Settings to use.
         up: The up direction, shape [3].
         diagonal: Size of the cloud [m].
     """
@@ -84,16 +84,16 @@ class _Search:
     diagonal: float
 
     def connected(self, points: np.ndarray, drawn: np.ndarray) -> CurveGraph:
-        """The tree of points that were drawn to their axes.
+        """The tree of points contracted to their axes.
 
-        As drawn: measured on 20 branches, recentred points lose two forks of 46, since circles mix
-        the branches there, and the fit centres the axes anyhow.
+        Not recentred: measured on 20 branches, recentred points lose two forks of 46, since circles
+        mix the branches there, and the fit centres the axes anyway.
         """
         return curve_graph(points, drawn, **self._joining())
 
     def root(self, graph: CurveGraph, points: np.ndarray, near: np.ndarray | None,
              ) -> tuple[int, np.ndarray | None]:
-        """The root's node, and an end that is about as likely the root."""
+        """The root's node, and another end that is about as likely to be the root."""
         return root_node(graph, points, near, self.up, self.settings.prune)
 
     def in_levels(self, points: np.ndarray, base: np.ndarray, width: float | None = None,
@@ -103,7 +103,7 @@ class _Search:
         return graph, self.root(graph, points, base)[0]
 
     def pruned(self, graph: CurveGraph, start: int) -> tuple[Skeleton, int]:
-        """A skeleton with first radii and without spurs, and how many there were."""
+        """A skeleton with first radii and without spurs, and the number of dropped spurs."""
         parent = rooted(graph.nodes, graph.edges, start)
         keep, count = prune_spurs(graph.nodes, parent, graph.thickness, self.settings.prune)
         new_index = np.cumsum(keep) - 1
@@ -128,7 +128,7 @@ class _Search:
 
 def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
                 up: np.ndarray, camera: bool, where: Where, progress: Progress) -> SkeletonResult:
-    """The skeleton of points in the cloud's own frame; ``root`` and ``up`` are in that too."""
+    """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
     points = own.places
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
     thin = points[thinned(points, settings.contraction_points)]

@@ -1,4 +1,4 @@
-"""Rotation-minimising frames and rings along a curve: what tubes and swept meshes are made of."""
+"""Rotation-minimising frames and rings along a curve, for tubes and swept meshes."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def arc_lengths(points: np.ndarray) -> np.ndarray:
 
 
 def stretches(chosen: np.ndarray) -> list[slice]:
-    """Where ``chosen`` is true for places in a row."""
+    """Consecutive indices where ``chosen`` is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
     return [slice(begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -78,8 +78,8 @@ def polygon_factor(sides: int) -> float:
 def bending_factor(sides: int) -> float:
     """Circumradius of the regular polygon with the second moment of area of the unit circle.
 
-    A branch bends as the circle does then; its area is 0.4 % under the circle's for a hexagon,
-    2.3 % for a square, whose second moment would be 4.7 % over at equal area.
+    A branch then bends as the circle does; its area is 0.4 % under the circle's for a hexagon, 2.3
+    % for a square, whose second moment would be 4.7 % over at equal area.
     """
     turn = 2 * np.pi / sides
     # Second moment of a polygon of circumradius 1: n/48 (4 sin a + sin 2a) with a = 2 pi / n.
@@ -92,11 +92,11 @@ def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormal
 
     Args:
         centres: Positions [m], shape [n, 3].
-        radius: Radii of the circles that they stand for [m], shape [n].
+        radius: Radii of the circles that they represent [m], shape [n].
         normals: Directions of their first corners, shape [n, 3].
         binormals: Normals to these in the plane of the circle, shape [n, 3].
         sides: Number of corners.
-        factor: Circumradius in radii; None: that of the circle's area.
+        factor: Circumradius in radii; None: the one with the circle's area.
     """
     factor = polygon_factor(sides) if factor is None else factor
     angle = 2 * np.pi * np.arange(sides) / sides
@@ -107,10 +107,10 @@ def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormal
 
 def resample(points: np.ndarray, radius: np.ndarray, spacing: np.ndarray | float,
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Resample points and radii along a polyline, ``spacing`` (a number, or one a point) apart."""
+    """Resample points and radii along a polyline at ``spacing`` (a number, or one per point)."""
     along = arc_lengths(points)
     wanted = np.broadcast_to(np.asarray(spacing, float), along.shape)
-    # Equal steps in the integral of 1/spacing follow a spacing that changes along the way.
+    # Equal steps in the integral of 1/spacing follow a spacing that varies along the path.
     density = np.concatenate([[0], np.cumsum(np.diff(along) * 2 / (wanted[1:] + wanted[:-1]))])
     count = max(round(density[-1]), 1)
     at = np.interp(np.linspace(0, density[-1], count + 1), density, along)

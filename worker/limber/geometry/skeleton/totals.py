@@ -1,8 +1,8 @@
-"""Length and volume of all wood as a scan leaves them open: what to expect, and how sure that is.
+"""Length and volume of all wood, as far as a scan determines them: expectation and uncertainty.
 
-A doubted twig counts by its probability, whether the skeleton has it or dropped it as more likely
-not there: so two scans of one plant, of which one shows a twig a little better, agree. What a scan
-does not show at all is not counted.
+An uncertain twig counts by its probability, whether the skeleton has it or dropped it as unlikely.
+So two scans of one plant agree, even if one shows a twig a little better. What a scan does not show
+at all is not counted.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _SURE = 1.96  # standard deviations to each side of an interval that covers 95 %
 
 @dataclass(frozen=True)
 class Total:
-    """A sum over all wood, not known exactly.
+    """An uncertain sum over all wood.
 
     Attributes:
         expected: Its mean [m or m^3].
@@ -35,7 +35,7 @@ class Total:
 
     @property
     def interval(self) -> list[float]:
-        """The 95 % interval; nothing is less than nothing."""
+        """The 95 % interval; the lower end is not negative."""
         reach = _SURE * self.sigma
         return [max(self.expected - reach, 0.0), self.expected + reach]
 
@@ -45,14 +45,14 @@ def total_length(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> 
 
     Args:
         skeleton: With the probabilities of its nodes.
-        dropped: Twigs that it has no more, each with ``length`` [m] and ``probability``.
+        dropped: Twigs no longer in the skeleton, each with ``length`` [m] and ``probability``.
     """
     runs = skeleton.runs()
     own, spread = np.empty(len(runs)), np.empty(len(runs))
     for run, members in enumerate(runs):
         step = np.linalg.norm(np.diff(skeleton.nodes[members], axis=0), axis=1)
         own[run] = step.sum()
-        # A round end hides where its axis stops, a fork where in its carrier it began.
+        # A round end hides where its axis ends; a fork hides where in its carrier the axis began.
         gap = float(step[skeleton.radius_state[members[1:]] == BRIDGED].sum())
         spread[run] = np.linalg.norm([skeleton.radius[members[-1]], skeleton.radius[members[0]],
                                       _BRIDGED * gap])
@@ -91,7 +91,7 @@ def total_volume(skeleton: Skeleton) -> Total:
 def totals(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
     """Return both as numbers of a stage's result, with intervals that cover 95 %.
 
-    ``volume_interval_m3`` is None where no radius has a deviation: a given skeleton's.
+    ``volume_interval_m3`` is None where no radius has a deviation, as for a given skeleton.
     """
     length, volume = total_length(skeleton, dropped), total_volume(skeleton)
     known = bool(skeleton.radius_sigma.any())
@@ -101,16 +101,16 @@ def totals(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> dict[s
 
 
 def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """Mean and variance of a sum over the runs that are there; with a run all on it goes.
+    """Mean and variance of a sum over the existing runs; a run exists only if its carrier does.
 
     Args:
-        skeleton: Whose runs they are.
-        own: What each run adds if it is there, shape [runs].
-        variance: Of that, shape [runs].
+        skeleton: The skeleton of the runs.
+        own: Contribution of each run if it exists, shape [runs].
+        variance: Variance of that, shape [runs].
     """
     chance = given_carrier(skeleton)
     mean, spread = own.astype(float), variance.astype(float)
-    # What hangs on a run has a higher number.
+    # A run carried by another one has a higher number.
     runs = skeleton.runs()
     for run in range(len(runs) - 1, 0, -1):
         carrier = int(skeleton.branch[runs[run][0]])
@@ -120,14 +120,14 @@ def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray) -> tuple
 
 
 def _share_of_all(relative: np.ndarray, volume: np.ndarray) -> float:
-    """Relative deviation that all radii share: not more than that of the surest of them."""
+    """Relative deviation that all radii share: at most that of the most certain one."""
     order = np.argsort(relative)
     total = np.cumsum(volume[order])
     return float(relative[order[int(np.searchsorted(total, _COMMON * total[-1]))]])
 
 
 def _hidden_share(skeleton: Skeleton, members: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Fraction of each of a side run's cylinders that lies inside its carrier, shape [k]."""
+    """Fraction of each of a side run's cylinders that is inside its carrier, shape [k]."""
     end = np.cumsum(step)
     inside = float(skeleton.radius[members[0]]) - (end - step)
     return np.clip(inside / np.maximum(step, 1e-300), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Turning a branch upright: its principal growth direction along z."""
+"""Rotation of a branch to upright: its principal growth direction along z."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,13 +10,13 @@ def upright_rotation(skeleton: Skeleton, up: np.ndarray, upright: bool) -> np.nd
     """Return the rotation to the branch's frame, shape [3, 3].
 
     The paper aligns the principal growth direction with the global z axis; that is the first
-    principal axis of the main path, from root to tip. The turn is the shortest one after ``up``
+    principal axis of the main path, from root to tip. The rotation is the shortest one after ``up``
     of the file has become z.
 
     Args:
         skeleton: In the file's axes.
         up: The up direction in the file's axes, shape [3].
-        upright: False only turns ``up`` to z.
+        upright: False only rotates ``up`` to z.
     """
     first = shortest_turn(np.asarray(up, float), np.array([0.0, 0.0, 1.0]))
     if not upright:
@@ -29,7 +29,7 @@ def upright_rotation(skeleton: Skeleton, up: np.ndarray, upright: bool) -> np.nd
 
 
 def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Rotation by the smallest angle that takes direction ``start`` to ``end``, shape [3, 3]."""
+    """Rotation by the smallest angle from direction ``start`` to ``end``, shape [3, 3]."""
     start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis, cosine = np.cross(start, end), float(start @ end)
     sine = float(np.linalg.norm(axis))

@@ -1,4 +1,4 @@
-"""Where a run's cross-sections lie, and how many sides they have."""
+"""Positions of a run's cross-sections, and their number of sides."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ _FACET = 0.025  # how far a carrier's facets may be off its circle, in radii of 
 
 
 def sides_of_runs(skeleton: Skeleton, given: int | None = None) -> list[int]:
-    """Sides of each run's cross-section: so many that facets do not show beside a twig, or given.
+    """Sides of each run's cross-section: given, or enough to hide facets beside a twig.
     """
     if given is not None:
         return [given] * skeleton.branch_count

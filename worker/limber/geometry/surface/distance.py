@@ -1,4 +1,4 @@
-"""How far points lie from a triangle surface: exact, by a grid of cells."""
+"""Distance of points from a triangle surface: exact, by a grid of cells."""
 
 import numpy as np
 from numba import njit
@@ -20,7 +20,7 @@ def distance_to_surface(points: np.ndarray, surface: Surface) -> np.ndarray:
     counts = last.max(axis=0) + 1
     keys, owner = by_cell(first, last, counts)
     order = np.argsort(keys, kind="stable")
-    # No farther than the nearest vertex, so that few cells need a look.
+    # No farther than the nearest vertex, so that few cells are searched.
     bound, _ = cKDTree(surface.vertices).query(points)
     return _distances(np.ascontiguousarray(points, np.float64), bound,
                       np.ascontiguousarray(corner), origin, cell, counts, keys[order],

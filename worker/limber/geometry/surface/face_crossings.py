@@ -1,4 +1,4 @@
-"""Where faces of a surface cross: a grid of cells, and Moeller and Trumbore's test within them."""
+"""Crossings of a surface's faces: a grid of cells, and Moeller and Trumbore's test within them."""
 
 import numpy as np
 from numba import njit
@@ -17,7 +17,7 @@ def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
         counts: Number of cells in each direction, shape [3].
 
     Returns:
-        The number of each cell that a face lies in, shape [k], and the face, shape [k].
+        The number of each cell that contains part of a face, shape [k], and the face, shape [k].
     """
     total = 0
     for f in range(len(first)):
@@ -39,9 +39,9 @@ def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
 def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray,
             first: np.ndarray, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray,
             ) -> np.ndarray:
-    """Points [m] where an edge of one face goes through another one, shape [c, 3].
+    """Points [m] where an edge of one face passes through another one, shape [c, 3].
 
-    Faces that share an edge are not compared; of faces that share a corner only the edges
+    Faces that share an edge are not compared; for faces that share a corner, only the edges
     opposite to it are.
 
     Args:
@@ -66,7 +66,7 @@ def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.n
                 near = True
                 for k in range(3):
                     near &= low[one, k] <= high[other, k] and low[other, k] <= high[one, k]
-                # Of all cells that both lie in, one compares them: the lowest.
+                # Of all cells that contain both, only the lowest compares them.
                 if near and keys[begin] == (
                         (max(first[one, 0], first[other, 0]) * counts[1]
                          + max(first[one, 1], first[other, 1])) * counts[2]
@@ -82,7 +82,7 @@ def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.n
 
 @njit(cache=True)
 def _compare(vertices: np.ndarray, faces: np.ndarray, one: int, other: int, found: list) -> None:
-    """Add the points where edges of ``one`` go through ``other`` (Moeller and Trumbore 1997)."""
+    """Add the points where edges of ``one`` pass through ``other`` (Moeller and Trumbore 1997)."""
     o, p, q = faces[other, 0], faces[other, 1], faces[other, 2]
     common, number = 0, 0  # corners of ``one`` that ``other`` has too, a bit each
     for i in range(3):

@@ -1,13 +1,13 @@
-"""Fillets where twigs leave their parents, in place of the sharp creases of a plain union.
+"""Fillets where twigs leave their parents, instead of the sharp creases of a plain union.
 
-Around each crease goes a solid whose surface is that of a rounded union of twig and parent: with
-a and b the distances from the two and rho the fillet's radius,
+Around each crease a solid is added whose surface is that of a rounded union of twig and parent.
+With a and b the distances from the two and rho the fillet's radius,
 
     max(rho, min(a, b)) = sqrt(max(rho - a, 0)^2 + max(rho - b, 0)^2).
 
-It reaches about a twig's radius beyond the crease, lies a little over the cylinders near it and
-dips under them at its rim, and is joined to them as a solid: the result is closed whatever the
-angle of the fork and however many twigs meet there.
+It reaches about a twig's radius beyond the crease, is slightly above the cylinders near it and
+below them at its rim, and is joined to them as a solid. The result is closed for any angle of the
+fork and any number of twigs there.
 """
 
 from dataclasses import dataclass
@@ -45,20 +45,20 @@ def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = No
     Args:
         surface: The union of the cylinders, :func:`branch_surface`: closed, oriented, not
             crossing itself.
-        skeleton: The axes and radii it was made of.
-        sides: The sides it was made with.
-        spacing: The spacing it was made with.
+        skeleton: The axes and radii from which it was made.
+        sides: The sides with which it was made.
+        spacing: The spacing with which it was made.
 
     Returns:
-        The surface, within 2 % of the volume; its check; and warnings about forks that had to
-        stay sharp.
+        The surface, within 2 % of the volume; its check; and warnings about forks that stayed
+        sharp.
     """
     forks = {fork.run: fork for fork in _forks(skeleton, sides, spacing)}
     made = {run: fork.fillet(_SCALES[0]) for run, fork in forks.items()}
     fillets = {run: solid(f.vertices, f.faces) for run, f in made.items() if f is not None}
     cylinders = solid(surface.vertices, surface.faces)
     tolerance = 0.02 * float(skeleton.radius.min())
-    # Where a fillet crosses something, another lattice may do; then it is left out.
+    # Where a fillet crosses something, another lattice is tried; if that fails, it is left out.
     for another in (True, False, False, False):
         joined = _joined([cylinders, *fillets.values()], tolerance)
         if joined is None or abs(joined.volume / surface.volume - 1) > VOLUME_CHANGE:
@@ -82,7 +82,7 @@ def _uncrossed(fork: "_Fork", first: Any, others: list, tolerance: float) -> Any
     """A fillet from another lattice that crosses nothing around it; None if there is none.
 
     Args:
-        fork: Where.
+        fork: The fork.
         first: The solid that crosses something.
         others: The solids that it joins.
         tolerance: How far triangles may move when they are joined [m].
@@ -109,14 +109,14 @@ def _warnings(plain: int, count: int) -> list[str]:
 
 
 def _box(fillet: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box with some room around a fillet's solid [m], shape [3] each."""
+    """Corners of a box around a fillet's solid, with a margin [m], shape [3] each."""
     low, high = np.reshape(fillet.bounding_box(), (2, 3))
     margin = 0.1 * (high - low)
     return low - margin, high + margin
 
 
 def _holds(fillet: Any, places: np.ndarray) -> bool:
-    """Whether any of the places [m], shape [n, 3], lies in the box around a fillet."""
+    """Whether any of the positions [m], shape [n, 3], is in the box around a fillet."""
     low, high = _box(fillet)
     return bool(((places > low) & (places < high)).all(axis=1).any())
 
@@ -128,7 +128,7 @@ def _meet(one: Any, other: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Fork:
-    """A twig, what it grows out of, and the stretch of it where the two meet."""
+    """A twig, its carrier, and the stretch where the two meet."""
 
     run: int
     twig: np.ndarray
@@ -144,7 +144,7 @@ class _Fork:
         """The solid of the rounded union around the crease; None if there is no crease."""
         step = scale * _STEP * self.rounding
         reach = (self.axis[:, 3] + _REACH * self.rounding + 2 * step)[:, None]
-        # An odd shift: a lattice that lies in line with the axes meets the cylinders in edges.
+        # An irregular shift: a lattice in line with the axes meets the cylinders in edges.
         low = (self.axis[:, :3] - reach).min(axis=0) - np.array([0.31, 0.17, 0.43]) * step
         high = (self.axis[:, :3] + reach).max(axis=0)
         near = 2 * _REACH * self.rounding
@@ -153,7 +153,7 @@ class _Fork:
         first = np.concatenate([[0], np.cumsum([len(other) for other in others])])
         shape = np.array([self.rounding, _REACH, _RIM, _MARGIN, self.end])
         stacked = np.vstack(others)
-        # The cut is as wide as the root; a twig may well hang down beside it.
+        # The cut is as wide as the root; a twig may well extend below it.
         root = self.base[0]
         beside = np.linalg.norm(np.maximum(np.maximum(low - root, root - high), 0)) > self.wide
         base = self.base - np.outer([1e6 * self.wide, 0], self.base[1]) if beside else self.base
@@ -177,7 +177,7 @@ def _forks(skeleton: Skeleton, sides: int | None, spacing: float) -> list[_Fork]
     cones = [segments(*axis) for axis in axes]
     points, radius = axes[0]
     upwards = tangents(points)[0]
-    # A little over the root's flat cut, so that a fillet's end lies within the solid.
+    # Slightly above the root's flat cut, so that a fillet's end is within the solid.
     base = np.stack([points[0] + 0.05 * radius[0] * upwards, upwards])
     carrier = [-1] + [int(skeleton.branch[members[0]]) for members in runs[1:]]
     starts = np.array([axis[0][0] for axis in axes])
@@ -199,7 +199,7 @@ def _forks(skeleton: Skeleton, sides: int | None, spacing: float) -> list[_Fork]
 def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
           others: tuple[np.ndarray, ...], excess: np.ndarray, base: np.ndarray, wide: float,
           ) -> _Fork | None:
-    """Where a twig comes out of what it grows from; None if it stays within."""
+    """Position where a twig leaves its carrier; None if it stays within."""
     along = np.append(twig[:, 8], twig[-1, 8] + twig[-1, 9])
     count = max(int(4 * along[-1] / axis[1].mean()), 8)
     place = np.linspace(0, along[-1], count + 1)

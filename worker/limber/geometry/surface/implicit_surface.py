@@ -1,4 +1,4 @@
-"""Triangles of an implicit surface: marching tetrahedra, then evened out on the surface itself."""
+"""Triangles of an implicit surface: marching tetrahedra, then smoothing on the surface itself."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from limber.geometry.surface.surface import Surface
 
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0],
                      [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
-# Six tetrahedra around the diagonal 0-7 of a cube (Kuhn): alike in each cube, so faces match.
+# Six tetrahedra around the diagonal 0-7 of a cube (Kuhn): the same in each cube, so faces match.
 _TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7],
                   [0, 5, 1, 7]])
 _ROUNDS = 2  # in which vertices are evened out
@@ -24,7 +24,7 @@ def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, hi
     neighbours and back along the gradient, which evens out the triangles.
 
     Args:
-        level: About a distance [m] of points [n, 3], negative inside; called for many at once.
+        level: Approximate distance [m] of points [n, 3], negative inside; called for many at once.
         low: Corner of the box [m], shape [3].
         high: The opposite corner [m].
         step: Edge of the lattice's cubes [m].
@@ -58,7 +58,8 @@ def _march(points: np.ndarray, grid: np.ndarray) -> Surface:
         (cube[:, None] + _CORNERS[None]).reshape(-1, 3).T, grid.shape).reshape(-1, 8)
     tets = corner[:, _TETS].reshape(-1, 4)
     value = grid.ravel()
-    # Corners inside first, so that the count of them tells the case; the order's parity is kept.
+    # Corners inside come first, so that their number gives the case; the parity of the order is
+    # kept.
     order = np.argsort(value[tets] >= 0, axis=1, kind="stable")
     odd = np.zeros(len(order), bool)
     for i in range(4):
@@ -80,7 +81,7 @@ def _march(points: np.ndarray, grid: np.ndarray) -> Surface:
     add(three, (a, d), (b, d), (c, d), turned=False)
     corners, turned = np.vstack(edges), np.concatenate(flip)
     pairs = corners.reshape(-1, 2)
-    # Both ends in one number: sorted ten times as fast as rows.
+    # Both ends in one number: this sorts ten times as fast as rows.
     unique, index = np.unique(pairs.min(axis=1) * grid.size + pairs.max(axis=1),
                               return_inverse=True)
     faces = index.reshape(-1, 3)

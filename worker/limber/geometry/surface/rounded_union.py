@@ -5,8 +5,8 @@ from numba import njit
 
 
 def segments(points: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Rounded cones along a polyline: start [m], step [m], radius and its change [m], where along
-    the line it starts and its length [m]; shape [n - 1, 10].
+    """Rounded cones along a polyline: start [m], step [m], radius and its change [m], start along
+    the line and length [m]; shape [n - 1, 10].
 
     Args:
         points: Polyline [m], shape [n, 3].
@@ -28,7 +28,7 @@ def near_box(cones: np.ndarray, low: np.ndarray, high: np.ndarray, reach: float)
 
 @njit(cache=True)
 def nearest(cones: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Distance [m] of a point from cones, negative inside; radius and place along there [m]."""
+    """Distance [m] of a point from cones, negative inside; radius and position along there [m]."""
     best, radius, along = np.inf, 0.0, 0.0
     for k in range(len(cones)):
         dx, dy, dz = x - cones[k, 0], y - cones[k, 1], z - cones[k, 2]
@@ -60,16 +60,16 @@ def fillet_level(points: np.ndarray, twig: np.ndarray, others: np.ndarray, first
     """Level of the solid around the crease between a twig and others, shape [n].
 
     Args:
-        points: Where [m], shape [n, 3].
+        points: Positions [m], shape [n, 3].
         twig: Its cones.
         others: Cones of all the others, one after the other.
-        first: Where each other's cones begin, and their total number, shape [k + 1].
-        excess: By how much the corners of the polygons stand over the circles, in radii; the
-            twig's, then the others', shape [k + 1].
+        first: Index of the first cone of each of the others, and their total number, shape [k + 1].
+        excess: Excess of the polygons' corners over the circles, in radii; the twig's, then the
+            others', shape [k + 1].
         base: A point [m] on the flat cut at the root and its normal, upwards, shape [2, 3].
-        shape: Radius of the fillet [m]; how far it reaches and where its rim is lowest, in such
-            radii; how far it lies over and under the cylinders, likewise; and where along the twig
-            it ends [m] (infinite: where the two are apart).
+        shape: Radius of the fillet [m]; its reach and the distance at which its rim is lowest, in
+            fillet radii; its height over and depth under the cylinders, likewise; and its end along
+            the twig [m] (infinite: where the two are apart).
     """
     rho, reach, rim, margin, end = shape
     count = len(first) - 1

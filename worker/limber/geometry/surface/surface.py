@@ -60,7 +60,8 @@ class Surface:
             scale: Metres per unit of the file.
 
         Raises:
-            InputError: it cannot be read, or holds no triangles or numbers that are not finite.
+            InputError: the file cannot be read, or holds no triangles or numbers that are not
+            finite.
         """
         import trimesh
 

@@ -1,4 +1,4 @@
-"""What a branch's surface must be: closed, oriented, of positive volume, free of crossings."""
+"""Checks of a branch's surface: closed, oriented, of positive volume, free of crossings."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,8 +16,8 @@ class SurfaceCheck:
     Attributes:
         watertight: Every edge belongs to exactly two faces.
         oriented: The two run along it in opposite directions, and the volume is positive.
-        open_edges: Places [m] of edges that do not have two faces, shape [k, 3].
-        crossings: Places [m] where faces cross, shape [c, 3].
+        open_edges: Positions [m] of edges that do not have two faces, shape [k, 3].
+        crossings: Positions [m] where faces cross, shape [c, 3].
         volume_m3: Enclosed volume.
     """
 
@@ -60,9 +60,9 @@ class SurfaceCheck:
 
 
 def check_surface(surface: Surface) -> SurfaceCheck:
-    """Check a surface; costs about half a second for 100,000 faces."""
+    """Check a surface; takes about half a second for 100,000 faces."""
     edges = np.vstack([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    # Both ends in one number: sorted ten times as fast as rows.
+    # Both ends in one number: this sorts ten times as fast as rows.
     key = edges.min(axis=1) * len(surface.vertices) + edges.max(axis=1)
     _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
     wrong = counts[inverse.ravel()] != 2
@@ -90,9 +90,9 @@ def pieces(surface: Surface) -> np.ndarray:
 
 
 def crossings(surface: Surface) -> np.ndarray:
-    """Return points [m] where an edge of one face goes through another face, shape [c, 3].
+    """Return points [m] where an edge of one face passes through another face, shape [c, 3].
 
-    Faces that share an edge are not compared; of faces that share a corner only the edges
+    Faces that share an edge are not compared; for faces that share a corner, only the edges
     opposite to it are.
     """
     from limber.geometry.surface.face_crossings import by_cell, pierced
@@ -103,7 +103,7 @@ def crossings(surface: Surface) -> np.ndarray:
     corner = surface.vertices[faces]
     low, high = corner.min(axis=1), corner.max(axis=1)
     extent = (high - low).max(axis=1)
-    # A cell holds a few faces, and a face lies in few cells.
+    # A cell has a few faces, and a face is in few cells.
     cell = max(1.5 * float(np.median(extent)), float(extent.max()) / 24, 1e-12)
     first = np.floor((low - low.min(axis=0)) / cell).astype(np.int64)
     last = np.floor((high - low.min(axis=0)) / cell).astype(np.int64)

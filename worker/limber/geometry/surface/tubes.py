@@ -53,7 +53,7 @@ def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: flo
         more = _runs_near(tubes, places) - in_pieces
         if not more:
             return surface
-        # A tube that loops through itself is no solid, whatever the union makes of it: convex
+        # A tube that loops through itself is not a solid, whatever the union makes of it. Convex
         # pieces from one cross-section to the next always are.
         in_pieces |= more
     return surface
@@ -70,7 +70,7 @@ def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: list[int], 
             solids += _pieces(tube, vertices, sides[run]) if run in in_pieces else [
                 solid(vertices, faces)]
     joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    # Where tubes cross, the union leaves slivers far below any size that matters.
+    # Where tubes cross, the union leaves slivers far below any relevant size.
     return largest_piece(joined.simplify(tolerance))
 
 
@@ -85,7 +85,7 @@ def largest_piece(joined) -> Surface:
         raise MeshingError("The union of the cylinders is empty.", "Some radii may be zero.",
                            "Check the radii of the skeleton.")
     if len(pieces) > 1:
-        # A cavity between crossing twigs comes out as a piece of negative volume: it is filled.
+        # A cavity between crossing twigs becomes a piece of negative volume: it is filled.
         joined = max(pieces, key=lambda piece: piece.volume())
     mesh = joined.to_mesh64()
     vertices = np.array(mesh.vert_properties, float)[:, :3].copy()
@@ -155,7 +155,7 @@ def tube_triangles(tube: Tube, sides: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _split_at_bends(points: np.ndarray, radius: np.ndarray,
                     ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Cut a run at its corners, where a mitre would lie inside the round cylinders' ball."""
+    """Cut a run at its corners, where a mitre would be inside the round cylinders' ball."""
     step = np.diff(points, axis=0)
     step /= np.maximum(np.linalg.norm(step, axis=1), 1e-300)[:, None]
     corners = 1 + np.flatnonzero(np.einsum("ij,ij->i", step[1:], step[:-1]) < np.cos(_CORNER))
@@ -168,7 +168,7 @@ def _split_at_folds(points: np.ndarray, radius: np.ndarray,
                     ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Cut a run where neighbouring cross-sections would cross; the parts overlap in one step.
 
-    A tube of radius r around a bend of radius under r folds into itself; two straight parts that
+    A tube of radius r around a bend of radius under r folds into itself. Two straight parts that
     overlap do not, and their union is the bend.
     """
     tangent = tangents(points)

@@ -1,4 +1,4 @@
-"""Structured tetrahedral meshes swept along axes: deterministic, of known quality, quick."""
+"""Structured tetrahedral meshes swept along axes: deterministic, fast, of known quality."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
                   quadratic: bool = True, young: float = 1e8, poisson: float = 0.35,
                   density: float = 900.0, fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8),
                   grasp_fraction: float = 1.0) -> TetMesh:
-    """Mesh a straight round beam that starts at the origin, fixed there.
+    """Mesh a straight round beam that starts at the origin and is fixed there.
 
     The cross-section is a regular polygon of the circle's area (for 6 sides its second moment is
     0.8 % over the circle's), with one node on the axis.
@@ -22,15 +22,15 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
         length: Length [m].
         radius_root: Radius at the origin [m].
         radius_tip: Radius at the end [m]; None: as at the root.
-        slice_count: Number of slices; None: about two radii long each.
+        slice_count: Number of slices; None: each about two radii long.
         sides: Sides of the polygon.
-        direction: Where the beam points.
+        direction: Direction of the beam.
         quadratic: 10-node tetrahedra, else 4-node ones.
         young: Young's modulus [Pa].
         poisson: Poisson's ratio.
         density: Density [kg/m^3].
-        fractions: Places of the control points on the axis.
-        grasp_fraction: Place of the grasp patch; at 1 the end face.
+        fractions: Positions of the control points on the axis.
+        grasp_fraction: Position of the grasp patch; at 1 the end face.
 
     Returns:
         A mesh with all the data that a branch's mesh has.
@@ -52,7 +52,7 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
 
 def curved_beam(points: np.ndarray, radius: np.ndarray, *, slice_length: float = 2.0,
                 sides: int = 6, quadratic: bool = True) -> TetMesh:
-    """Mesh a round beam along a polyline, without data on it.
+    """Mesh a round beam along a polyline, without data on the mesh.
 
     Args:
         points: Axis [m], shape [n, 3].
@@ -80,7 +80,7 @@ def swept(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
 
 
 def tube(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
-    """The same, oriented as the rings are."""
+    """The same, oriented like the rings."""
     count, sides = ring.shape[:2]
     nodes = np.concatenate([centres[:, None], ring], axis=1).reshape(-1, 3)
     centre, a = np.zeros(sides, np.int64), 1 + np.arange(sides)
@@ -91,7 +91,7 @@ def tube(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
 
 
 def split_wedges(wedges: np.ndarray) -> np.ndarray:
-    """Split triangular prisms into three tetrahedra each, alike on shared faces.
+    """Split triangular prisms into three tetrahedra each, consistently on shared faces.
 
     Each quadrilateral is cut from its corner of the lowest index, so neighbours agree: Dompierre
     et al., How to subdivide pyramids, prisms and hexahedra into tetrahedra (1999).
@@ -101,7 +101,7 @@ def split_wedges(wedges: np.ndarray) -> np.ndarray:
     """
     turns = np.array([[0, 1, 2, 3, 4, 5], [1, 2, 0, 4, 5, 3], [2, 0, 1, 5, 3, 4],
                       [3, 5, 4, 0, 2, 1], [4, 3, 5, 1, 0, 2], [5, 4, 3, 2, 1, 0]])
-    # After the turn the lowest index stands first, so two quadrilaterals are cut from corner 0.
+    # After the rotation the lowest index is first, so two quadrilaterals are cut from corner 0.
     w = np.take_along_axis(wedges, turns[np.argmin(wedges, axis=1)], axis=1)
     first = np.minimum(w[:, 1], w[:, 5]) < np.minimum(w[:, 2], w[:, 4])
     tets = np.where(

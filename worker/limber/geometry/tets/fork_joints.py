@@ -28,14 +28,14 @@ class Patch:
 
 @dataclass(frozen=True)
 class Joint:
-    """A sound block between a patch and a twig's first ring.
+    """A valid block between a patch and a twig's first ring.
 
     Attributes:
-        start: Where along the twig the ring is [m].
-        tangent: Across the ring, shape [3].
-        turn: Towards the ring's first corner, shape [3].
+        start: Position of the ring along the twig [m].
+        tangent: Normal of the ring, shape [3].
+        turn: Direction of the ring's first corner, shape [3].
         tets: Nodes of the mesh, or -1 - k for node k of the twig, shape [t, 4].
-        quality: Its flattest tetrahedron's shape.
+        quality: Shape of its flattest tetrahedron.
     """
 
     start: float
@@ -47,13 +47,13 @@ class Joint:
 
 def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, corner: np.ndarray,
            triangles: np.ndarray) -> list[Joint]:
-    """The sound blocks between a patch and a twig's first ring.
+    """The valid blocks between a patch and a twig's first ring.
 
     Args:
-        axis: The twig's.
-        start: Where along it the ring may be [m], shape [j].
-        lean: How far the ring leans over towards the patch, shape [j].
-        patch: What the twig grows out of.
+        axis: Axis of the twig.
+        start: Candidate positions of the ring along it [m], shape [j].
+        lean: How far the ring leans towards the patch, shape [j].
+        patch: The patch that the twig grows out of.
         corner: The patch's corners [m], shape [sides, 3].
         triangles: The carrier's faces there, node indices, shape [2 or 4, 3].
     """
@@ -82,17 +82,17 @@ def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, cor
 
 
 def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which way a patch's corners run about each twig, and the first normal of each one's ring.
+    """Orientation of a patch's corners about each twig, and the first normal of each twig's ring.
 
-    Ring corner k then stands over patch corner k with the least twist.
+    Ring corner k is then above patch corner k with the least twist.
 
     Args:
         corner: The patch's corners [m], shape [sides, 3].
         tangent: Directions of the twigs, shape [j, 3].
 
     Returns:
-        Whether the corners must be taken backwards, to run counter-clockwise, shape [j]; normals,
-        shape [j, 3].
+        Whether the corners must be reversed to run counter-clockwise, shape [j]; normals, shape [j,
+        3].
     """
     first = _unit(np.cross(tangent, np.eye(3)[np.argmin(np.abs(tangent), axis=1)]))
     second = np.cross(tangent, first)
@@ -106,7 +106,7 @@ def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _blocks(nodes: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra between a patch and each ring, and the flattest shape among them.
+    """Tetrahedra between a patch and each ring, and the worst shape among them.
 
     Args:
         nodes: The patch's corners, the ring's centre and its corners [m], shape
@@ -122,7 +122,7 @@ def _blocks(nodes: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarra
     after, top = (k + 1) % sides, sides
     a, b, top_a, top_b = k, after, sides + 1 + k, sides + 1 + after
     hub = np.full(sides, top)
-    # Each side quadrilateral lies on the surface, so either diagonal will do.
+    # Each side quadrilateral is on the surface, so either diagonal will do.
     one = np.stack([[b, a, top_b, hub], [top_b, a, top_a, hub]], axis=0).transpose(2, 0, 1)
     two = np.stack([[b, a, top_a, hub], [top_b, b, top_a, hub]], axis=0).transpose(2, 0, 1)
     shape_one, shape_two = (shapes(nodes[:, cut]).min(axis=2) for cut in (one, two))

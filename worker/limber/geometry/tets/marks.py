@@ -1,4 +1,4 @@
-"""Marks on a mesh: which nodes are fixed, grasped, or stand for a control point."""
+"""Marks on a mesh: nodes that are fixed, grasped, or represent a control point."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,10 +10,11 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 FACE_COSINE, FLAT_SHARE = 0.8, 0.5
-"""A face whose normal is so near the axis belongs to the base; together they have to make up so
-much of the root's section, or there is no flat face."""
+"""Least cosine between a base face's normal and the axis; least fraction of the root's section that
+these faces must cover, or there is no flat face.
+"""
 CLAMP_BAND = 0.2
-"""Length that is held where there is no flat face, in radii of the root."""
+"""Length that is held if there is no flat face, in radii of the root."""
 
 
 def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, density: float,
@@ -27,15 +28,15 @@ def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, den
         young: Young's modulus [Pa], the same everywhere.
         poisson: Poisson's ratio.
         density: Density [kg/m^3].
-        fractions: Places of the control points along the main path.
-        grasp_fraction: Place of the grasp patch along the main path.
+        fractions: Positions of the control points along the main path.
+        grasp_fraction: Position of the grasp patch along the main path.
 
     Raises:
         MeshingError: the base or the grasp patch has under three nodes.
     """
     tree = cKDTree(mesh.nodes)
     control = np.full(mesh.node_count, -1, np.int64)
-    # Last first: where two fall on one node, the earlier one keeps it.
+    # Last first: where two are at the same node, the earlier one keeps it.
     for k, point in reversed(list(enumerate(control_points(skeleton, fractions)))):
         control[tree.query(point)[1]] = k
     full = np.ones(mesh.tet_count)
@@ -48,9 +49,10 @@ def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, den
 def base_nodes(mesh: TetMesh, skeleton: Skeleton) -> np.ndarray:
     """1 for the nodes of the face at the root, else 0, shape [node_count].
 
-    Only the face is held: nodes in a band above it would be held too where the mesh is fine
-    enough to have some there, and the branch be the shorter the finer its mesh is. Where there is
-    no flat face (a scan that is rounded or ragged below), it is a band of ``CLAMP_BAND`` radii.
+    Only the face is held. Nodes in a band above it would be held too where the mesh is fine enough
+    to have some there, and the branch would become shorter as the mesh becomes finer. Where there
+    is no flat face (a scan that is rounded or ragged below), a band of ``CLAMP_BAND`` radii is
+    held.
     """
     path = skeleton.main_path()
     direction = skeleton.nodes[path[1]] - skeleton.nodes[path[0]]
@@ -66,7 +68,7 @@ def base_nodes(mesh: TetMesh, skeleton: Skeleton) -> np.ndarray:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1) / 2
     down = -(normals @ direction) / np.maximum(2 * area, 1e-300)
-    # A mesher moves a flat face a little, and a cut may be oblique; its edge is sharp all the same.
+    # A mesher moves a flat face a little, and a cut may be oblique; its edge is still sharp.
     low = (along[faces].max(axis=1) < lowest + 0.5 * radius) & beside[faces].all(axis=1)
     face = low & (down > FACE_COSINE)
     if area[face].sum() < FLAT_SHARE * np.pi * radius**2:

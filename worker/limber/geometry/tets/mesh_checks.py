@@ -1,4 +1,4 @@
-"""Whether a mesh can be computed, and whether what is fixed of it holds it."""
+"""Checks that a mesh can be computed, and that its fixed nodes hold it."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,7 +12,7 @@ def fixed_mask(mesh: TetMesh, fixed: np.ndarray | None) -> np.ndarray:
     """Return the mask of fixed nodes.
 
     Raises:
-        InputError: fewer than three, or all on a line, so that the branch could turn freely.
+        InputError: fewer than three, or all on a line, so that the branch could rotate freely.
     """
     if fixed is None:
         fixed = mesh.point_data.get("fixed", np.zeros(mesh.node_count))

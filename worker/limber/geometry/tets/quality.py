@@ -1,4 +1,4 @@
-"""How good a tetrahedral mesh is: volume, dihedral angles, radius ratios, elements across."""
+"""Quality of a tetrahedral mesh: volume, dihedral angles, radius ratios, elements across."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 FLAT = 0.02
-"""A tetrahedron's shape under that (1 is regular) is avoided."""
+"""Shape of a tetrahedron (1 is regular) below which it is avoided."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,13 @@ class MeshQuality:
         volume_ratio: That volume over the surface's.
         min_dihedral_deg: Smallest angle between two faces of a tetrahedron.
         min_radius_ratio: Smallest 3 r_in / r_out; 1 is regular, 0 flat.
-        mean_radius_ratio: Its mean.
+        mean_radius_ratio: Mean of these ratios.
         elements_across: Median over the nodes of the skeleton of the diameter over the mean edge
             of the elements there; None without a skeleton.
         surface_distance_mean: Mean distance of the mesh's boundary (its corners, edge middles and
             face centres) from the surface, in local radii; None without a surface.
         surface_distance_max_m: The largest [m].
-        fork_distance_mean: Mean of those that lie within two radii of a fork, in radii.
+        fork_distance_mean: Mean of the distances within two radii of a fork, in radii.
         fork_distance_max: The largest of them, in radii.
     """
 

@@ -15,7 +15,7 @@ class RunAxis:
 
     Attributes:
         points: Its nodes [m], shape [n, 3].
-        radius: There [m], shape [n].
+        radius: Radii there [m], shape [n].
         along: Length up to each [m], shape [n].
     """
 
@@ -35,14 +35,14 @@ class RunAxis:
         return float(self.along[-1])
 
     def straight_until(self, reach: float) -> "RunAxis":
-        """The axis without its bends up to ``reach`` [m] from its start."""
+        """The axis with its first ``reach`` [m] straightened."""
         kept = self.along >= min(reach, 0.5 * self.length)
         kept[0] = True
         points = self.points[kept]
         return RunAxis(points, self.radius[kept], arc_lengths(points))
 
     def at(self, where: np.ndarray | float) -> np.ndarray:
-        """Places [m], shape [..., 3], at lengths along it [m]."""
+        """Positions [m], shape [..., 3], at lengths along it [m]."""
         return np.stack([np.interp(where, self.along, self.points[:, k]) for k in range(3)],
                         axis=-1)
 
@@ -51,7 +51,7 @@ class RunAxis:
         return np.interp(where, self.along, self.radius)
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance of points from the axis [m], and where along it the foot is [m]."""
+        """Distance of points from the axis [m], and position of the foot along it [m]."""
         where = np.linspace(0, self.length, max(8 * len(self.points), 50))
         distance, place = cKDTree(self.at(where)).query(points)
         return distance, where[place]

@@ -1,4 +1,4 @@
-"""How a run is cut into slices: one for each of its twigs, and even ones between."""
+"""Slices of a run: one for each of its twigs, and even ones between."""
 
 import itertools
 from collections.abc import Iterable
@@ -18,8 +18,8 @@ class Window:
 
     Attributes:
         run: The twig.
-        low, high: Where the slice begins and ends along the carrier [m].
-        outward: Where the twig leaves, a unit vector, shape [3].
+        low, high: Start and end of the slice along the carrier [m].
+        outward: Direction in which the twig leaves, a unit vector, shape [3].
     """
 
     run: int
@@ -44,9 +44,9 @@ class Window:
 
 
 def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> list[Window]:
-    """Move slices along an axis from ``start`` [m], so that none overlaps another.
+    """Move slices along an axis from ``start`` [m] so that none overlap.
 
-    Twigs that leave at one height to different sides share a slice.
+    Twigs that leave at the same height to different sides share a slice.
     """
     end = axis.length + 1e-12
     placed: list[Window] = []
@@ -71,15 +71,15 @@ def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> l
 
 
 def ring_places(axis: RunAxis, start: float, windows: list[Window], spacing: float) -> np.ndarray:
-    """Where rings are along an axis from ``start`` [m], ``spacing`` local radii apart, shape [r].
+    """Positions of rings along an axis from ``start`` [m], ``spacing`` radii apart, shape [r].
     """
     fixed = sorted({round(v, 12) for w in windows for v in (w.low, w.high)})
     marks = [start, *[v for v in fixed if start < v < axis.length], axis.length]
     inside = {(round(w.low, 12), round(w.high, 12)) for w in windows}
     places = [start]
     if start == 0.0 and len(marks) > 1:
-        # Short slices at the clamp, which keeps the section from narrowing where it is
-        # stretched: long ones there made a cantilever 0.4 % too stiff, at any length elsewhere.
+        # Short slices at the clamp, which keeps the section from narrowing under tension: long ones
+        # there made a cantilever 0.4 % too stiff, at any length elsewhere.
         near = [g * float(axis.radius[0]) for g in _CLAMP_SLICES]
         places += [v for v in near if v + near[0] < marks[1]]
         marks[0] = places[-1]
@@ -102,10 +102,9 @@ def _is_tapered(axis: RunAxis, low: float, high: float) -> bool:
 
 
 def _graded(axis: RunAxis, low: float, high: float, spacing: float) -> np.ndarray:
-    """Places of rings where the radius changes much: closer where it is thin.
+    """Positions of rings where the radius changes much: closer where it is thin.
 
-    Slices as long as suits the middle would be needles at a thin end, which look as if they
-    were folded over.
+    Slices sized for the middle would be needles at a thin end, which look as if folded over.
     """
     along = np.linspace(low, high, 400)
     radii = axis.radius_at(along)

@@ -1,4 +1,4 @@
-"""Tetrahedral meshes: the type that geometry makes and mechanics computes on, and its file.
+"""Tetrahedral meshes, made by geometry and used by mechanics: the type and its file.
 
 Nodes of a quadratic tetrahedron follow VTK: four corners, then the middles of the edges
 01, 12, 20, 03, 13, 23.
@@ -106,7 +106,7 @@ class TetMesh:
                        point_data=self.point_data | (point_data or {}))
 
     def geometry_digest(self) -> str:
-        """Return a sha256 of nodes, tetrahedra and point data: what E does not change."""
+        """Return a sha256 of nodes, tetrahedra and point data, which E does not change."""
         digest = hashlib.sha256()
         arrays = [self.nodes, self.tets.astype(np.int64)]
         arrays += [self.point_data[name] for name in sorted(self.point_data)]
@@ -115,7 +115,7 @@ class TetMesh:
         return digest.hexdigest()
 
     def check(self, path: Path) -> None:
-        """Refuse a mesh as read from ``path`` that nothing can be computed on.
+        """Refuse a mesh read from ``path`` that cannot be used in computations.
 
         Raises:
             InputError: positions or data that are not finite, missing nodes, or moduli
@@ -146,8 +146,8 @@ class TetMesh:
         import meshio
 
         kind = "tetra10" if self.is_quadratic else "tetra"
-        # meshio converts tetra10 between its own (Gmsh-like) and VTK's node order: not for VTU,
-        # where it passes nodes through; test_tet_mesh holds that.
+        # meshio converts tetra10 between its own (Gmsh-like) and VTK's node order, but not for VTU,
+        # where it keeps the order; test_tet_mesh checks that.
         meshio.write_points_cells(
             path, self.nodes, [(kind, self.tets)], file_format="vtu",
             point_data=self.point_data,

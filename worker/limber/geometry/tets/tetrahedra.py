@@ -24,12 +24,12 @@ _LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTe
 
 @dataclass(frozen=True)
 class MeshResult:
-    """Tetrahedra and how they came about.
+    """Tetrahedra and their origin.
 
     Attributes:
         mesh: Quadratic, positively oriented, without data on it.
         mesher: ``ftetwild``, ``ftetwild (cached)`` or ``sweep``.
-        warnings: Why another mesher than the first took over.
+        warnings: Reasons why another mesher than the first was used.
         left_out: Runs of the skeleton that are not in the mesh.
     """
 
@@ -43,17 +43,17 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
                 progress: Progress = SILENT) -> MeshResult:
     """Mesh the generalised cylinders of a skeleton with quadratic tetrahedra.
 
-    The sweep is tried first: on the scans we have it takes half a second where fTetWild takes 6 to
-    60, comes out the same each time, keeps the volume within a percent and has no flatter angles.
-    fTetWild takes over where the sweep cannot join a twig, and the sweep again where that fails.
+    The sweep is tried first. On our scans it takes half a second where fTetWild takes 6 to 60,
+    gives the same result each time, keeps the volume within a percent and has no flatter angles.
+    fTetWild is used where the sweep cannot join a twig, and the sweep again if fTetWild fails.
 
     Args:
         skeleton: Axes and radii.
-        settings: Which mesher, how fine.
-        progress: Called as it goes.
+        settings: Choice of mesher and resolution.
+        progress: Called during the work.
 
     Raises:
-        MeshingError: no mesher could do it.
+        MeshingError: no mesher succeeded.
     """
     settings = settings or MeshSettings()
     swept, warnings = None, []
@@ -79,7 +79,7 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
 
 
 def _share(skeleton: Skeleton, runs: list[int]) -> float:
-    """Fraction of the skeleton's volume that the runs have."""
+    """Fraction of the skeleton's volume in the given runs."""
     volume = skeleton.radius**2 * skeleton.steps
     return float(volume[np.isin(skeleton.branch, runs)].sum() / volume.sum())
 
@@ -112,15 +112,15 @@ def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
 def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
                    settings: MeshSettings | None = None, stop_energy: float = 30.0,
                    coarsen: bool = False, progress: Progress = SILENT) -> tuple[TetMesh, bool]:
-    """Fill a closed surface with quadratic tetrahedra by fTetWild; the same input comes cached.
+    """Fill a closed surface with quadratic tetrahedra by fTetWild; results are cached.
 
-    fTetWild's own tolerance is a thousandth of the bounding box, which takes 7 % of a thin
+    fTetWild's own tolerance is a thousandth of the bounding box, which removes 7 % of a thin
     branch's volume; here it is absolute.
 
     Args:
         surface: Closed, oriented.
-        edge_length: Wanted edge length [m]; a finer surface makes finer tetrahedra.
-        epsilon: How far the result may be from the surface [m].
+        edge_length: Target edge length [m]; a finer surface makes finer tetrahedra.
+        epsilon: Largest distance of the result from the surface [m].
         settings: Limits of time and memory.
         stop_energy: See :func:`limber.geometry.tets.tetwild_process.run_tetwild`.
         coarsen: Likewise.
@@ -130,7 +130,7 @@ def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
         The mesh, and whether it came from the cache.
 
     Raises:
-        MeshingError: no mesh, or one that lost over 5 % of the volume or came in pieces.
+        MeshingError: no mesh, or one that lost over 5 % of the volume or is in pieces.
         MissingDependencyError: pytetwild is not installed.
     """
     settings = settings or MeshSettings()

@@ -1,7 +1,6 @@
-"""fTetWild in a process of its own: it is slow, and a crash or a leak must not be ours.
+"""fTetWild in a separate process: it is slow, and must not crash or leak memory in ours.
 
-``python -m limber.geometry.tets.tetwild_process IN.npz OUT.npz PARENT`` is what :func:`run_tetwild`
-starts.
+:func:`run_tetwild` starts ``python -m limber.geometry.tets.tetwild_process IN.npz OUT.npz PARENT``.
 """
 
 import importlib.util
@@ -27,16 +26,16 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
     Args:
         vertices: Positions [m], shape [n, 3].
         faces: Triangles, shape [m, 3].
-        edge_length: Wanted edge length [m]; where the surface is finer, so are the tetrahedra.
-        epsilon: How far the result may be from the surface [m].
-        stop_energy: Quality at which it stops improving (fTetWild's AMIPS energy; 3 is best).
+        edge_length: Target edge length [m]; where the surface is finer, so are the tetrahedra.
+        epsilon: Largest distance of the result from the surface [m].
+        stop_energy: Quality at which optimisation stops (fTetWild's AMIPS energy; 3 is best).
         coarsen: Merge elements as far as quality allows, which takes longer.
         time_limit: Processor time [s] after which it is stopped.
-        memory_limit_mb: Memory after which it is stopped.
+        memory_limit_mb: Memory above which it is stopped.
         progress: Called while waiting; cancelling stops the process.
 
     Returns:
-        Nodes [m], shape [k, 3], and tetrahedra, shape [t, 4], oriented as they come.
+        Nodes [m], shape [k, 3], and tetrahedra, shape [t, 4], in their original orientation.
 
     Raises:
         MissingDependencyError: pytetwild is not installed.
@@ -54,7 +53,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
         np.savez(source, vertices=vertices, faces=faces, edge_length=edge_length,
                  epsilon=epsilon, stop_energy=stop_energy, coarsen=coarsen)
         try:
-            # It also writes a file of its own (__tracked_surface.stl) where it runs.
+            # It also writes a file (__tracked_surface.stl) to its working folder.
             code, last = run_module(__name__, [str(source), str(target)], "fTetWild",
                                     Limits(computed_seconds=time_limit,
                                            memory_mb=memory_limit_mb), folder=Path(folder),

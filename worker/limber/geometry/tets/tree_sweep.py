@@ -1,10 +1,10 @@
-"""Our own tetrahedra for forked branches, swept along the axes: deterministic and quick.
+"""Our own tetrahedra for forked branches, swept along the axes: deterministic and fast.
 
-Each run is a stack of prisms around its axis, six sides, or four for a thin twig, with the second
-moment of area of the round section, so that it bends like one. A twig grows out
-of its carrier's side: the carrier has a slice there as long as the twig is thick, and one or two
-of that slice's side faces are the twig's first cross-section. The block between them and the
-twig's first ring is a fan of tetrahedra around that ring's centre.
+Each run is a stack of prisms around its axis. They have six sides, or four for a thin twig, and the
+second moment of area of the round section, so that they bend like it. A twig grows out of its
+carrier's side: the carrier has a slice there as long as the twig is thick, and one or two of that
+slice's side faces are the twig's first cross-section. The block between them and the twig's first
+ring is a fan of tetrahedra around that ring's centre.
 """
 
 from dataclasses import dataclass, field
@@ -24,8 +24,8 @@ from limber.geometry.tets.unfolded_tube import unfolded
 _STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # where a twig's first ring is tried, and how far it leans
 _NEAR = 2.5  # radii beyond the first place that will do, within which the best one is taken
 _STRAIGHTENED = (0.0, 3.0, 6.0, 12.0)  # radii of a twig's start that may be led straight
-# Where the main run's corners stand is tried in turn while a twig cannot be joined; in large trees,
-# where one or the other always cannot, once.
+# Angles of the main run's corners, tried in turn while a twig cannot be joined. In large trees,
+# where some twig always fails, only one is tried.
 _TURNS, _TURNED_MOST = tuple(np.deg2rad([0.0, 30.0, 15.0, 45.0])), 60
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
@@ -51,7 +51,7 @@ def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
         spacing: Length of a slice in local radii.
 
     Raises:
-        MeshingError: the main run cannot be swept, since it bends more sharply than it is thick.
+        MeshingError: the main run cannot be swept because its bend is too sharp for its thickness.
     """
     tried: list[tuple[float, SweptTree]] = []
     for turn in _TURNS if skeleton.branch_count <= _TURNED_MOST else _TURNS[:1]:
@@ -102,7 +102,8 @@ class _TreeSweep:
             return
         axis = self._axes[run]
         for reach in _STRAIGHTENED:
-            # A twig that starts along its carrier's side, or in a hook, is led out of it straight.
+            # A twig that starts along its carrier's side, or in a hook, leaves it on a straight
+            # line instead.
             self._axes[run] = axis.straight_until(reach * float(axis.radius[0]))
             for patch in self._patches(carrier, run):
                 if self._grow(carrier, run, patch):
@@ -112,7 +113,7 @@ class _TreeSweep:
         self._left_out.append(run)
 
     def _first_normal(self) -> np.ndarray | None:
-        """Where the main run's first corner stands; None: anywhere."""
+        """Direction of the main run's first corner; None: any."""
         if self._turn == 0:
             return None
         way = self._axes[0].points[1] - self._axes[0].points[0]
@@ -181,7 +182,7 @@ class _TreeSweep:
                                   indexing="ij")
         found = joints(axis, start.ravel(), lean.ravel(), patch, corner,
                        self._patch_triangles(patch))
-        # The best one near the patch: those farther out are for twigs that leave at a small angle.
+        # The best one near the patch; those farther out are for twigs that leave at a small angle.
         near = [joint for joint in found if joint.start <= found[0].start + _NEAR * float(
             axis.radius_at(joint.start))]
         for joint in sorted(near, key=lambda one: -one.quality):

@@ -15,21 +15,21 @@ _SHIFTS = (1, -1, 2, -2, 3, -3)  # where else a twig's slice may go, in its own 
 def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spacing: float,
              first_normal: np.ndarray | None, first_tangent: np.ndarray | None,
              ) -> tuple[np.ndarray, TetMesh]:
-    """Rings along an axis whose prisms are not folded over, if that can be had.
+    """Rings along an axis whose prisms are not folded over, if possible.
 
-    Cross-sections cross in a sharp bend; with one fewer they may not. A twig's slice there
-    moves along the axis, and is given up (taken from ``windows``) when no place is left.
+    Cross-sections cross in a sharp bend; with one fewer they may not. A twig's slice there moves
+    along the axis, and is given up (removed from ``windows``) if no position is left.
 
     Args:
-        axis, start: The run's, and where along it the first ring is [m].
+        axis, start: Axis of the run, and position of its first ring along it [m].
         windows: Slices of its twigs; changed in place.
         sides: Corners of a ring.
         spacing: Length of a slice in local radii.
-        first_normal: Where the first ring's first corner stands, shape [3]; None: anywhere.
-        first_tangent: Across the first ring, shape [3]; None: along the axis.
+        first_normal: Direction of the first ring's first corner, shape [3]; None: any.
+        first_tangent: Normal of the first ring, shape [3]; None: along the axis.
 
     Returns:
-        Where the rings are along it [m], and the tetrahedra.
+        Positions of the rings along it [m], and the tetrahedra.
     """
     moves = dict.fromkeys((window.run for window in windows), 0)
     first_low = {window.run: window.low for window in windows}
@@ -56,7 +56,7 @@ def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spa
 
 def _move_on(window: Window, windows: list[Window], moves: dict[int, int], first_low: float,
              start: float, end: float) -> None:
-    """Move a twig's slice to the next place that it has not been tried in, or give it up."""
+    """Move a twig's slice to the next untried position, or give it up."""
     windows.remove(window)
     moves[window.run] += 1
     length = window.high - window.low
@@ -70,10 +70,10 @@ def _move_on(window: Window, windows: list[Window], moves: dict[int, int], first
 
 def _tube_mesh(axis: RunAxis, where: np.ndarray, sides: int, first_normal: np.ndarray | None,
                first_tangent: np.ndarray | None) -> TetMesh:
-    """Tetrahedra of a tube with rings at places ``where`` [m] along an axis."""
+    """Tetrahedra of a tube with rings at positions ``where`` [m] along an axis."""
     centres = axis.at(where)
     tangent = tangents(centres)
-    # The flat end stands for a round one of the same volume.
+    # The flat end replaces a round one of the same volume.
     centres[-1] += 2 / 3 * axis.radius[-1] * tangent[-1]
     if first_tangent is not None:
         tangent[0] = first_tangent

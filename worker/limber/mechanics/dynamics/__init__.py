@@ -1,1 +1,1 @@
-"""Motion in time: implicit Newmark, what drives it, derivatives along it."""
+"""Motion in time: implicit Newmark steps, loads, derivatives along the motion."""

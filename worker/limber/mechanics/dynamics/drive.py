@@ -1,4 +1,4 @@
-"""What moves a branch: grasps along poses or with forces, loads, gravity; at any time."""
+"""What drives a branch over time: grasps along poses or with forces, loads, gravity."""
 
 from collections.abc import Sequence
 
@@ -20,13 +20,13 @@ class Drive:
     """Loads and constraints of a motion; arguments as for simulate_dynamics.
 
     Attributes:
-        times: Of the frames [s].
-        grasps: All of them; single: whether one was given by itself.
-        path: The grasps' motion; None where they do not follow poses.
-        equations: With the grasps held that follow poses.
+        times: Times of the frames [s].
+        grasps: All grasps; single: whether one was given by itself.
+        path: The grasps' motion; None if they do not follow poses.
+        equations: Those with pose-driven grasps held.
 
     Raises:
-        InputError: arguments that do not fit each other.
+        InputError: the arguments contradict each other.
     """
 
     def __init__(self, model: BranchModel, grasp: Grasp | Sequence[Grasp] | None,
@@ -62,10 +62,10 @@ class Drive:
         return load
 
     def equilibrium(self) -> StaticResult:
-        """Return the equilibrium under pose and loads of the first time.
+        """Return the equilibrium under the pose and the loads of the first time.
 
         Raises:
-            ConvergenceError: there is none.
+            ConvergenceError: no equilibrium exists.
         """
         pose = self.path.poses[0] if self.path else None
         force = None if self._grasp_forces is None else self._grasp_forces[0]
@@ -74,7 +74,7 @@ class Drive:
                             nodal_forces=loads).require()
 
     def moves(self, state: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
-        """Return how held nodes and pinned means have to move to where the path is.
+        """Return how held nodes and pinned means have to move to reach the path.
 
         Returns:
             [m], shape [node_count, 3], or None if they do not, and shape [pinned, 3].
@@ -89,7 +89,7 @@ class Drive:
         return (moved if moved.any() else None), means[0] - now.reshape(-1, 3)
 
     def hold(self, state: MotionState) -> None:
-        """Give held nodes the path's velocity and acceleration."""
+        """Set velocity and acceleration of held nodes to the path's."""
         if self.path:
             held, _ = self._at(state.time)
             for values, motion in zip((state.velocity, state.acceleration), held[1:],
@@ -98,7 +98,7 @@ class Drive:
                     values[grasp.nodes] = patch
 
     def impose(self, state: MotionState) -> None:
-        """Give held nodes, and the means of pinned patches, all of the path's motion."""
+        """Set the motion of held nodes and of the means of pinned patches to the path's."""
         path = present(self.path, "path of the grasps")
         held, pins = self._at(state.time)
         fields = (state.displacement, state.velocity, state.acceleration)
@@ -114,7 +114,7 @@ class Drive:
         return self._known[1]
 
     def _between(self, values: np.ndarray, instant: float) -> np.ndarray:
-        """Return values of the frames, shape [frames or 1, ...], linearly at a time."""
+        """Return the values at a time, linear between frames of shape [frames or 1, ...]."""
         if len(values) == 1:
             return values[0]
         after = int(np.clip(np.searchsorted(self.times, instant), 1, len(self.times) - 1))

@@ -1,15 +1,15 @@
-"""One implicit step that keeps energy exactly, at any amplitude and step.
+"""One implicit step that conserves energy exactly, for any amplitude and step size.
 
 With the mean u_m of two successive displacements and the mean velocity,
 
     M (v_1 - v_0) / dt + alpha M (v_0 + v_1) / 2 + f = load,     (u_1 - u_0) / dt = (v_0 + v_1) / 2,
 
-where f is the integral of F(u_m) S grad N and S belongs to the mean of the strains E_0 and E_1, not
-to the strain of the mean (Simo and Tarnow 1992). F(u_m) times the change of F is exactly the change
-of E, so the work of f is the change of the energy: nothing is gained, and damping only takes.
-A rigid turn has no strain at either end, hence no stress between, however far it goes. Where the
-energy is not quadratic in E, S has a part along E_1 - E_0 that makes up the difference (Gonzalez
-2000).
+where f is the integral of F(u_m) S grad N. S is the stress of the mean of the strains E_0 and E_1,
+not of the strain of the mean (Simo and Tarnow 1992). F(u_m) times the change of F is exactly the
+change of E, so the work of f equals the change of the energy: no energy is gained, and damping only
+removes it. A rigid rotation of any size has no strain at either end, hence no stress in between. If
+the energy is not quadratic in E, S has a component along E_1 - E_0 that makes up the difference
+(Gonzalez 2000).
 """
 
 from collections import deque
@@ -27,41 +27,42 @@ from limber.mechanics.motion_state import MotionState
 from limber.mechanics.solve_status import Status
 
 _STRAIN_CHANGE = 1e-6
-"""Under this change of the strain in a step its cube, which Gonzalez' part is of, is round-off."""
+"""Below this change of strain in a step, Gonzalez' correction (its cube) is round-off."""
 _GOOD_TANGENT = 0.3
-"""Part of the residual that a solve may leave for its tangent to be used again."""
+"""Fraction of the residual that a solve may leave for its tangent to be reused."""
 _FRESH = 3
-"""Tangents made anew in one step, at most: later ones would be of nearly the same state. Both
-chosen, not measured."""
+"""Most new tangents in one step; later ones belong to nearly the same state. Both chosen, not
+measured.
+"""
 _NOTHING = np.zeros(6)
 
 
 class EnergyMomentumStepper(Stepper):
-    """Takes steps that keep energy and momentum."""
+    """Takes steps that conserve energy and momentum."""
 
     def __init__(self, drive: Drive, settings: MotionSettings):
         super().__init__(drive, settings)
         self._balances: deque[tuple[float, np.ndarray]] = deque(maxlen=2)
         law = self.model.material
-        # Its stress is given through the strain that St. Venant-Kirchhoff would have it at.
+        # Its stress is expressed by the strain that has this stress in St. Venant-Kirchhoff.
         self._bearing = (self.model if law.is_hookean
                          else self.model.with_material("st_venant_kirchhoff"))
         self._stiff = self._bearing if law.is_compiled else self.model
 
     def begin(self, start: MotionState, out: np.ndarray) -> None:
-        """Begin where the holds bear ``out`` [N] on each node, shape [node_count, 3]."""
+        """Begin with the reactions ``out`` [N] of the holds on each node, shape [node_count, 3]."""
         self._balances.append((start.time, out))
 
     def viscous(self, old: MotionState, dt: float) -> None:
-        """Return None: the step makes its own from the strains at its ends."""
+        """Return None: the step computes its own from the strains at its ends."""
 
     def step(self, old: MotionState, dt: float, viscous: Viscous | None = None,
              ) -> MotionState | None:
-        """Return the state ``dt`` after ``old``, or None where it is not found.
+        """Return the state ``dt`` after ``old``, or None if it is not found.
 
-        Newton's unknown is the mean displacement. Its tangent is F(u_m) C F(u_1), not symmetric;
-        the factor is of F(u_m) C F(u_m), so that what is left falls by about the turn in half a
-        step each time.
+        Newton's unknown is the mean displacement. Its tangent F(u_m) C F(u_1) is not symmetric. The
+        factorised matrix is F(u_m) C F(u_m), so each iteration reduces the error by a factor of
+        about the rotation in half a step.
         """
         equations, settings = self.equations, self.settings
         new = replace(old, time=old.time + dt, step_before=dt,
@@ -109,10 +110,10 @@ class EnergyMomentumStepper(Stepper):
         return None
 
     def borne(self, instant: float) -> np.ndarray | None:
-        """Return what holds the branch bears on each node [N], shape [node_count, 3].
+        """Return the reactions of the holds on each node [N], shape [node_count, 3].
 
-        Extrapolated from the middles of the last two steps, where the forces balance; None
-        before there are two. At the ends of a step what the mesh cannot resolve rings.
+        Extrapolated from the mid-points of the last two steps, where forces balance; None before
+        there are two. At the ends of a step, modes that the mesh cannot resolve ring.
         """
         if len(self._balances) < 2:
             return None
@@ -120,18 +121,22 @@ class EnergyMomentumStepper(Stepper):
         return now + (now - was) * (instant - last) / (last - before)
 
     def _bearing_strain(self, before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
-        """Return the strain whose linear elastic stress is that of the step, viscosity and all."""
+        """Return the strain whose linear elastic stress equals that of the step, including
+        viscosity.
+        """
         mean, change = 0.5 * (before + after), after - before
         if not self.model.material.is_hookean:
             mean = self._bearing_mean(before, after)
         return mean + self.model.damping.stiffness / dt * change
 
     def _bearing_mean(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Return the strain whose linear elastic stress, times the change, is the energy's."""
+        """Return the strain whose linear elastic stress times the change gives the change of
+        energy.
+        """
         model, law = self.model, self.model.material
         lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
         change = after - before
-        # A motion that grows without bound is found, and told, by its imbalance.
+        # A motion that grows without bound is detected by its imbalance.
         with np.errstate(over="ignore", invalid="ignore"):
             size = contracted(change, change)
             stress = law.stress(0.5 * (before + after), lam, mu)
@@ -146,7 +151,7 @@ class EnergyMomentumStepper(Stepper):
 
     def _imbalance(self, old: MotionState, new: MotionState, dt: float, load: np.ndarray,
                    middle: np.ndarray, bearing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what forces are left over, and the inertial ones."""
+        """Return residual and inertial forces."""
         force = self._bearing.internal(middle, viscous=Viscous(0.0, bearing)).force
         inertial = self.model.mass_times(
             (new.velocity - old.velocity) / dt
@@ -159,7 +164,7 @@ class EnergyMomentumStepper(Stepper):
         growth = 1 + 2 * damping.stiffness / dt
         model = self._stiff
         memory = bearing - model.bearing_strain(model.strains(middle), Viscous(growth, _NOTHING))
-        # The mean strain is quadratic in the increment with twice the factor of the strain itself.
+        # The mean strain is quadratic in the increment, with twice the factor of the strain itself.
         mixed = None if increment is None else np.sqrt(2) * increment
         self.tangent = None
         try:

@@ -1,9 +1,9 @@
-"""Motion in time: implicit steps of second order, energy-momentum or Newmark's.
+"""Motion in time: implicit second-order steps, energy-momentum or Newmark.
 
 M a + alpha M v + f(u, v) = loads, where the internal force f has a Kelvin-Voigt part (stress from
-the rate of the Green-Lagrange strain). The energy-momentum step keeps the energy at any amplitude;
-Newmark's with beta 1/4 and gamma 1/2 (average acceleration) does in linear problems. A step that
-fails is halved.
+the rate of the Green-Lagrange strain). The energy-momentum step conserves energy at any amplitude.
+Newmark's step with beta 1/4 and gamma 1/2 (average acceleration) conserves it in linear problems. A
+step that fails is halved.
 """
 
 import time
@@ -47,28 +47,27 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
                       sensitivities: ParameterSet | None = None,
                       sensitivity_nodes: np.ndarray | None = None,
                       progress: Progress = SILENT) -> DynamicResult:
-    """Move a branch in time; never raises for want of convergence.
+    """Simulate the motion of a branch; a failure to converge is a status, not an exception.
 
     Args:
-        grasp: The grasp, or several.
-        poses: Pose of the grasp at each time [m, rad], shape [frames, 6] ([frames, g, 6]);
-            between frames a cubic spline that starts at rest.
+        grasp: The grasp, or several grasps.
+        poses: Pose of the grasp at each time [m, rad], shape [frames, 6] ([frames, g, 6]),
+            interpolated by a cubic spline that starts at rest.
         grasp_forces: Force [N] of the gripper instead, shape [frames, 3] ([frames, g, 3]),
             linear between frames.
-        nodal_forces: Loads [N] besides gravity: constant, shape [node_count, 3], or linear between
-            frames, shape [frames, node_count, 3].
-        times: Of the frames [s], ascending, shape [frames].
+        nodal_forces: Loads [N] in addition to gravity: constant, shape [node_count, 3], or linear
+            between frames, shape [frames, node_count, 3].
+        times: Times of the frames [s], ascending, shape [frames].
         start: State at the first time: ``equilibrium`` under the loads and pose of that time,
             ``rest`` (undeformed), a static result, displacements, or the last state of another
-            motion. At rest unless it is that last.
-        settings: Their kind is the scheme; default energy-momentum, and Newmark where derivatives
-            are wanted.
-        sensitivities: Which derivatives to accumulate; by Newmark's scheme alone.
-        sensitivity_nodes: Nodes that they are kept for; default all.
+            motion. Velocities are zero unless it is the last state of a motion.
+        settings: Their type selects the scheme. Default: energy-momentum, or Newmark if derivatives
+            are requested.
+        sensitivities: Derivatives to accumulate; Newmark's scheme only.
+        sensitivity_nodes: Nodes for which they are kept; default all.
 
     Raises:
-        InputError: arguments that do not fit each other. ConvergenceError: no equilibrium at
-            the start.
+        InputError: arguments do not fit each other. ConvergenceError: no equilibrium at the start.
     """
     if settings is None:
         settings = EnergyMomentumSettings() if sensitivities is None else NewmarkSettings()
@@ -85,7 +84,7 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
 
 
 class _Run:
-    """A motion under way."""
+    """A motion in progress."""
 
     def __init__(self, drive: Drive, settings: MotionSettings,
                  tangents: MotionTangents | None):
@@ -122,7 +121,7 @@ class _Run:
             self.tangents.begin(self.state, equilibrium)
 
     def _strains(self, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return strains of now and before, for a branch at rest."""
+        """Return current and previous strains of a branch at rest."""
         if not self.model.damping.stiffness:
             return np.zeros((0, 0, 6)), np.zeros((0, 0, 6))
         strain = self.model.strains(displacement)
@@ -161,7 +160,7 @@ class _Run:
         return True
 
     def _step(self, dt: float) -> bool:
-        """Take one step of ``dt``; False, and nothing changed, if it fails."""
+        """Take one step of ``dt``; if it fails, return False and change nothing."""
         old, drive, stepper = self.state, self.drive, self.stepper
         viscous = stepper.viscous(old, dt)
         new = stepper.step(old, dt, viscous)

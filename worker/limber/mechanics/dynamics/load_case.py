@@ -1,4 +1,4 @@
-"""A load case: what holds a branch, what pulls it, and the motion that follows."""
+"""A load case: what holds and pulls a branch, and the resulting motion."""
 
 from dataclasses import dataclass
 
@@ -18,16 +18,16 @@ class LoadCase:
     """Loads and constraints over the frames of a pull.
 
     Attributes:
-        model: The branch, with all that hangs on it.
-        start: Its equilibrium before the pull, with the grippers on and no force in them.
+        model: The branch, with its added masses.
+        start: Equilibrium before the pull, with grippers attached and without force.
         grasp: The gripper that pulls.
-        follows_pose: Whether it follows poses; else it exerts ``grasp_force``.
-        holds: Other grippers and ties; they stay where they are at the start.
-        way: Poses of the gripper [m, rad], shape [frames, 6]; unused where it exerts a force.
-        grasp_force: At the end of the pull [N], shape [3].
+        follows_pose: Whether it follows poses; otherwise it exerts ``grasp_force``.
+        holds: Other grippers and ties; they stay in their initial positions.
+        way: Poses of the gripper [m, rad], shape [frames, 6]; unused if it exerts a force.
+        grasp_force: Force at the end of the pull [N], shape [3].
         loads: Other forces on the nodes at the end of the pull [N], shape [node_count, 3].
-        times: Of the frames [s], shape [frames].
-        part: Part of the pull's forces at each frame, shape [frames].
+        times: Times of the frames [s], shape [frames].
+        part: Fraction of the pull's forces at each frame, shape [frames].
     """
 
     model: BranchModel
@@ -43,11 +43,11 @@ class LoadCase:
 
     @property
     def held(self) -> list[Grasp]:
-        """All that follow a pose; the gripper first, if it does."""
+        """All grasps that follow a pose; the gripper first, if it does."""
         return [self.grasp, *self.holds] if self.follows_pose else list(self.holds)
 
     def poses(self) -> np.ndarray:
-        """Poses of :attr:`held` [m, rad], shape [frames, held, 6]."""
+        """Poses of the grasps in :attr:`held` [m, rad], shape [frames, held, 6]."""
         pose = present(self.start.pose, "pose of the grasps")
         still = np.tile(pose[1:], (len(self.times), 1, 1))
         return np.concatenate([self.way[:, None], still], axis=1) if self.follows_pose else still
@@ -60,10 +60,10 @@ class LoadCase:
         return forces
 
     def at_grippers(self, reactions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Part what the held patches get into the gripper's and that of the holds.
+        """Split the reactions of held patches into the gripper's and those of the holds.
 
         Args:
-            reactions: Of :attr:`held`, shape [frames, held, 3].
+            reactions: Reactions of the grasps in :attr:`held`, shape [frames, held, 3].
 
         Returns:
             Shapes [frames, 3] and [frames, holds, 3].
@@ -75,18 +75,20 @@ class LoadCase:
 
 @dataclass(frozen=True)
 class SimulatedMotion:
-    """Frames of a motion; shorter than the pull where the branch could not follow.
+    """Frames of a motion; fewer than the pull's if the branch could not follow.
 
     Attributes:
         times: [s], shape [frames].
-        displacement: Of all nodes from the rest shape [m], shape [frames, node_count, 3].
+        displacement: Displacement of all nodes from the rest shape [m], shape [frames, node_count,
+        3].
         energy, kinetic_energy: [J], shape [frames]; energy: the potential of strain and weight
-            above the first state of the pull, before anything pulls.
-        grasp_force, grasp_torque: Of the gripper on the branch [N, Nm], shape [frames, 3].
-        hold_forces: Of the other holds [N], shape [frames, holds, 3].
+            above the first state of the pull, before any pulling force acts.
+        grasp_force, grasp_torque: Force and torque of the gripper on the branch [N, Nm], shape
+        [frames, 3].
+        hold_forces: Forces of the other holds [N], shape [frames, holds, 3].
         min_det_f: Smallest det F, shape [frames].
-        converged: Whether all frames were reached; ``message`` tells why not.
-        warnings: What the user should know.
+        converged: Whether all frames were reached; ``message`` states why not.
+        warnings: Warnings for the user.
     """
 
     times: np.ndarray
@@ -103,7 +105,7 @@ class SimulatedMotion:
 
 
 def static_motion(case: LoadCase, progress: Progress) -> SimulatedMotion:
-    """Follow a pull through equilibria; ends with the first frame that has none."""
+    """Follow a pull through equilibria, up to the first frame without one."""
     held, poses, forces = case.held, case.poses(), case.nodal_forces()
     results: list[StaticResult] = []
     for number, part in enumerate(case.part):
@@ -128,7 +130,7 @@ def static_motion(case: LoadCase, progress: Progress) -> SimulatedMotion:
 
 def dynamic_motion(case: LoadCase, settings: MotionSettings,
                    progress: Progress) -> SimulatedMotion:
-    """Follow a pull in time, with inertia and damping."""
+    """Compute a pull in time, with inertia and damping."""
     held, forces = case.held, case.nodal_forces()
     found = simulate_dynamics(
         case.model, grasp=held or None, poses=case.poses() if held else None,

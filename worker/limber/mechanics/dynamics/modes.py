@@ -16,11 +16,11 @@ _TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Modes:
-    """Small free vibrations, undamped.
+    """Small undamped free vibrations.
 
     Attributes:
         frequencies: [Hz], ascending, shape [k].
-        shapes: Of unit modal mass [kg^-1/2], shape [k, node_count, 3].
+        shapes: Mode shapes of unit modal mass [kg^-1/2], shape [k, node_count, 3].
     """
 
     frequencies: np.ndarray
@@ -28,17 +28,17 @@ class Modes:
 
 
 def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None = None) -> Modes:
-    """Return the lowest modes by subspace iteration (Bathe) on one factorisation.
+    """Return the lowest modes by subspace iteration (Bathe) with one factorisation.
 
     Args:
-        model: Of the hanging branch, or one without weight.
-        count: Of modes.
-        displacement: Of the equilibrium about which it swings [m], shape [node_count, 3]; default
-            the mesh's own shape.
+        model: The hanging branch, or a model without weight.
+        count: Number of modes.
+        displacement: Displacement of the equilibrium about which the branch vibrates [m], shape
+            [node_count, 3]; default the mesh's own shape.
 
     Raises:
-        NotPositiveDefiniteError: it is no stable equilibrium.
-        ConvergenceError: the iteration does not settle.
+        NotPositiveDefiniteError: the equilibrium is not stable.
+        ConvergenceError: the iteration does not converge.
     """
     at = np.zeros_like(model.mesh.nodes) if displacement is None else displacement
     tangent = model.equations(()).tangent(model, at)
@@ -57,15 +57,15 @@ def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None
 
 def subspace_round(model: BranchModel, tangent: Tangent, vectors: np.ndarray,
                    ) -> tuple[np.ndarray, np.ndarray]:
-    """Do one round of subspace iteration (Bathe), with Rayleigh and Ritz.
+    """Do one iteration of the subspace (Bathe), with Rayleigh-Ritz.
 
     Args:
-        tangent: Of the equilibrium.
-        vectors: Of the subspace, shape [k, node_count, 3].
+        tangent: Tangent of the equilibrium.
+        vectors: Vectors of the subspace, shape [k, node_count, 3].
 
     Returns:
-        Squared angular frequencies [1/s^2], ascending, shape [k], and their modes, of unit modal
-        mass, of the subspace one round on.
+        Squared angular frequencies [1/s^2], ascending, shape [k], and their modes of unit modal
+        mass, from the next subspace.
     """
     pushed = np.array([model.mass_times(vector) for vector in vectors])
     vectors = np.array([tangent.solve(force) for force in pushed])

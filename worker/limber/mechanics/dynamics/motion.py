@@ -1,4 +1,4 @@
-"""What goes into a motion and comes out of it: settings, states, results."""
+"""Settings, states and results of a motion."""
 
 from dataclasses import dataclass, field
 
@@ -11,14 +11,14 @@ from limber.mechanics.solve_status import Status
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """How motion is computed, whatever the scheme.
+    """Settings of a motion, common to all schemes.
 
     Attributes:
-        max_step: Longest time step [s]; frames farther apart are divided evenly.
-        min_step: Shortest step [s] that is tried before giving up.
+        max_step: Longest time step [s]; longer intervals between frames are divided evenly.
+        min_step: Shortest step [s] tried before the solve is abandoned.
         tolerance: Residual force relative to loads, reactions and inertia.
-        max_iterations: Iterations a step.
-        stretch_limit: Principal stretch at which the branch is taken as torn.
+        max_iterations: Most iterations of a step.
+        stretch_limit: Principal stretch above which the branch counts as torn.
     """
 
     max_step: float = 1 / 60
@@ -35,9 +35,9 @@ class MotionSettings:
 
 @dataclass(frozen=True)
 class EnergyMomentumSettings(MotionSettings):
-    """The energy-momentum scheme: no energy comes from nowhere, at any amplitude and step.
+    """The energy-momentum scheme: it creates no energy at any amplitude and step.
 
-    What a step leaves unbalanced does work, so the tolerance is stricter than Newmark's.
+    The residual of a step does work, so the tolerance is stricter than Newmark's.
     """
 
     tolerance: float = 1e-6
@@ -45,11 +45,11 @@ class EnergyMomentumSettings(MotionSettings):
 
 @dataclass(frozen=True)
 class NewmarkSettings(MotionSettings):
-    """The paper's scheme: exact in energy where motion is small; far swings can blow up.
+    """The paper's scheme: exact in energy for small motion; large swings can diverge.
 
     Attributes:
-        beta, gamma: Newmark's numbers; gamma over 1/2 damps high frequencies.
-        keep_factor: Below this relative residual the last factor is used again, and for the
+        beta, gamma: Newmark's parameters; gamma above 1/2 damps high frequencies.
+        keep_factor: Relative residual below which the last factorisation is reused, also in the
             first solve of the next step; 0 factorises each time.
     """
 
@@ -71,8 +71,9 @@ class DynamicSensitivities:
     """Derivatives along a motion.
 
     Attributes:
-        labels: Name of each of the p columns (limber.mechanics.sensitivities).
-        displacement: Of the followed nodes [m per parameter], shape [frames, nodes, 3, p].
+        labels: Name of each of the p columns (:mod:`limber.mechanics.sensitivities`).
+        displacement: Derivatives for the followed nodes [m per parameter], shape [frames, nodes, 3,
+        p].
         reaction_force: [N per parameter], shape [frames, 3, p] ([frames, g, 3, p] for several).
     """
 
@@ -86,19 +87,19 @@ class DynamicResult:
     """A motion.
 
     Attributes:
-        status: How it ended. If not converged, the arrays end with the last good frame.
+        status: Status at the end. If not converged, the arrays end with the last good frame.
         times: [s], shape [frames].
         displacement: [m], shape [frames, node_count, 3].
         strain_energy, kinetic_energy: [J], shape [frames].
         energy: Potential of strain and weight, as in StaticResult [J], shape [frames].
         load_energy: Potential [J] of gravity and nodal forces, shape [frames].
-        reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], the torque about
-            the pose's position, shape [frames, 3] ([frames, g, 3] for several grasps).
-        base_force: Of the base on the branch [N], shape [frames, 3].
+        reaction_force, reaction_torque: Force and torque of the gripper on the branch [N, Nm], the
+            torque about the pose's position, shape [frames, 3] ([frames, g, 3] for several grasps).
+        base_force: Force of the base on the branch [N], shape [frames, 3].
         min_det_f: Shape [frames].
-        last: The last state, to go on from.
-        step_count, iteration_count, factorisation_count: Work done.
-        sensitivities: Where asked for.
+        last: The last state, from which a motion can be continued.
+        step_count, iteration_count, factorisation_count: Cost of the motion.
+        sensitivities: Derivatives, if asked for.
     """
 
     status: Status
@@ -130,7 +131,7 @@ class DynamicResult:
         """Return the result itself.
 
         Raises:
-            ConvergenceError: it has not converged.
+            ConvergenceError: the result has not converged.
         """
         if not self.converged:
             raise ConvergenceError(

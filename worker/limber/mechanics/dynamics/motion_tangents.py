@@ -1,4 +1,4 @@
-"""Derivatives along a motion: each step's, from the tangent that it was solved with."""
+"""Derivatives along a motion, step by step, with the tangent of each step."""
 
 from collections.abc import Sequence
 
@@ -20,11 +20,11 @@ from limber.mechanics.statics.result import StaticResult
 
 
 class MotionTangents:
-    """Derivatives of the present state to the parameters.
+    """Derivatives of the current state with respect to the parameters.
 
     Args:
-        wanted: The parameters.
-        followed: Nodes whose derivatives are kept for the frames; None: all.
+        wanted: The requested parameters.
+        followed: Nodes whose derivatives are stored at the frames; None: all.
     """
 
     def __init__(self, drive: Drive, settings: NewmarkSettings, wanted: ParameterSet,
@@ -56,21 +56,21 @@ class MotionTangents:
                     equilibrium.displacement, tangent.displacement)
 
     def explicit(self, state: MotionState, viscous: Viscous | None) -> list[np.ndarray]:
-        """Return the explicit derivatives of forces where pinned patches make them jump."""
+        """Return the explicit derivatives of forces; pinned patches make them jump."""
         if not self.equations.pinned:
             return []
         return explicit_forces(self.model, self.wanted, state.displacement, motion=state,
                                viscous=viscous)
 
     def jump(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
-        """Take the reaction of the motion that was imposed on pinned patches."""
+        """Store the reaction to the motion imposed on pinned patches."""
         if before:
             self._out = [out + now - was
                          for out, now, was in zip(self._out, after, before, strict=True)]
 
     def advance(self, old: MotionState, new: MotionState, dt: float,
                 viscous: Viscous | None, tangent: Tangent) -> None:
-        """Go a step along with the motion, which was solved with ``tangent``."""
+        """Advance the derivatives by a step that was solved with ``tangent``."""
         model, settings = self.model, self.settings
         beta, gamma = settings.beta, settings.gamma
         rate, inertia = gamma / (beta * dt), 1 / (beta * dt**2)
@@ -85,7 +85,7 @@ class MotionTangents:
         self._out = []
         for number, partial in enumerate(partials):
             past = self._states[number]
-            # Velocity and acceleration if the displacement's derivative were 0.
+            # Velocity and acceleration if the derivative of the displacement were 0.
             a_zero = (-(past.displacement + dt * past.velocity) / dt**2
                       - (0.5 - beta) * past.acceleration) / beta
             v_zero = past.velocity + dt * ((1 - gamma) * past.acceleration + gamma * a_zero)
@@ -100,7 +100,8 @@ class MotionTangents:
             motion = (v_zero + rate * change, a_zero + inertia * change)
             free = alpha * motion[0] + motion[1]
             for grasp in self.equations.pinned:
-                # The path gives the means' velocity and acceleration, whatever the parameters.
+                # The path prescribes the velocity and acceleration of the means, independent of the
+                # parameters.
                 for values in motion:
                     values[grasp.nodes] -= grasp.weights @ values[grasp.nodes]
             imposed = model.mass_times(alpha * motion[0] + motion[1] - free)

@@ -1,4 +1,4 @@
-"""One implicit Newmark step: mixed-point Newton with tangents kept as long as they serve."""
+"""One implicit Newmark step: mixed-point Newton that reuses a tangent while it converges."""
 
 from dataclasses import replace
 
@@ -13,12 +13,13 @@ from limber.mechanics.motion_state import MotionState
 from limber.mechanics.solve_status import Status
 
 _GOOD_TANGENT = 1e-3
-"""Part of the residual that a tangent's own solve may leave for the next step to begin with it:
-chosen, not measured."""
+"""Fraction of the residual that a tangent's solve may leave for the next step to start with it.
+Chosen, not measured.
+"""
 
 
 class NewmarkStepper(Stepper):
-    """Takes steps by Newmark's formulas."""
+    """Steps by Newmark's formulas."""
 
     settings: NewmarkSettings
 
@@ -36,11 +37,11 @@ class NewmarkStepper(Stepper):
 
     def step(self, old: MotionState, dt: float,
              viscous: Viscous | None) -> MotionState | None:
-        """Return the state ``dt`` after ``old``, or None where it is not found.
+        """Return the state ``dt`` after ``old``, or None if it is not found.
 
-        The first solve starts from the balanced state before, not from one extrapolated in time:
-        straight extrapolation stretches whatever turns. Mixed-point Newton then does the same
-        service as in statics.
+        The first solve starts from the previous balanced state, not from an extrapolation in time:
+        linear extrapolation stretches rotating parts. Mixed-point Newton then works as well as in
+        statics.
         """
         model, equations, settings = self.model, self.equations, self.settings
         load = self.drive.load_at(old.time + dt)
@@ -87,7 +88,7 @@ class NewmarkStepper(Stepper):
         return None
 
     def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
-        """Give velocity and acceleration by Newmark's formulas, and the path's to held nodes."""
+        """Set velocity and acceleration by Newmark's formulas, and held nodes to the path's."""
         beta, gamma = self.settings.beta, self.settings.gamma
         new.acceleration = ((new.displacement - old.displacement - dt * old.velocity) / dt**2
                             - (0.5 - beta) * old.acceleration) / beta
@@ -98,7 +99,7 @@ class NewmarkStepper(Stepper):
     def _may_keep(self, dt: float) -> bool:
         """Whether the last tangent fits the state before this step.
 
-        It does if its own solve brought the residual down a thousandfold.
+        It does if its own solve reduced the residual a thousandfold.
         """
         return (self.settings.keep_factor > 0 and self.tangent is not None
                 and self._tangent_step == dt and self._tangent_error <= _GOOD_TANGENT)
@@ -107,7 +108,7 @@ class NewmarkStepper(Stepper):
                    viscous: Viscous | None, dt: float) -> bool:
         settings, damping = self.settings, self.model.damping
         rate, inertia = settings.gamma / (settings.beta * dt), 1 / (settings.beta * dt**2)
-        # Its memory serves the new one.
+        # Its memory is reused by the new one.
         self.tangent = None
         try:
             self.tangent = self.equations.tangent(
@@ -121,7 +122,7 @@ class NewmarkStepper(Stepper):
 
     def _imbalance(self, new: MotionState, load: np.ndarray, viscous: Viscous | None,
                    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return what forces are left over, the inertial ones, and min det F."""
+        """Return residual forces, inertial forces, and min det F."""
         internal = self.model.internal(new.displacement, viscous=viscous)
         inertial = self.model.mass_times(
             new.acceleration + self.model.damping.mass * new.velocity)

@@ -19,7 +19,7 @@ class PosePath:
     Args:
         grasps: The grasps.
         rest: Rest positions of all nodes [m].
-        times: Of the poses [s].
+        times: Times of the poses [s].
         poses: [m, rad], shape [frames, 6] or [frames, grasps, 6].
 
     Attributes:
@@ -27,7 +27,7 @@ class PosePath:
         clamped, pinned: The grasps of each mode.
 
     Raises:
-        InputError: shapes that do not fit, or values that are not finite.
+        InputError: shapes do not fit, or values are not finite.
     """
 
     def __init__(self, grasps: Sequence[Grasp], rest: np.ndarray, times: np.ndarray,
@@ -54,7 +54,7 @@ class PosePath:
         """Return displacement, velocity and acceleration at a time.
 
         Returns:
-            Of the nodes of each clamped grasp: three lists of arrays [k, 3]; and of the means
+            For the nodes of each clamped grasp: three lists of arrays [k, 3]; and for the means
             of the pinned ones: three arrays [pinned, 3].
         """
         before, now, after = (self._placed(instant + shift)
@@ -86,7 +86,7 @@ def unwrapped(poses: np.ndarray) -> np.ndarray:
             vector, last = result[frame, number, 3:], result[frame - 1, number, 3:]
             angle = np.linalg.norm(vector)
             if angle < 1e-12:
-                # No turn has every axis: a full turn about the last axis may be the nearer one.
+                # A zero rotation has no unique axis: a full turn about the last axis may be nearer.
                 size = np.linalg.norm(last)
                 turns = np.round(size / (2 * np.pi))
                 result[frame, number, 3:] = last / size * 2 * np.pi * turns if turns else 0.0

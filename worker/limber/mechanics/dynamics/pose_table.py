@@ -1,4 +1,4 @@
-"""A gripper's way as a table of poses, from a recording or a plan."""
+"""A gripper's path as a table of poses, from a recording or a plan."""
 
 import hashlib
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from limber.core.errors import InputError
 
 @dataclass(frozen=True)
 class PoseTable:
-    """Poses of a gripper over time; what counts is how it moves from the first of them.
+    """Poses of a gripper over time; only the motion relative to the first pose matters.
 
     Attributes:
         times: [s], ascending, shape [n].
@@ -34,14 +34,14 @@ class PoseTable:
 
     @property
     def duration(self) -> float:
-        """From the first pose to the last [s]."""
+        """Duration from the first pose to the last [s]."""
         return float(self.times[-1] - self.times[0])
 
     def changes(self, times: np.ndarray) -> np.ndarray:
-        """Return how the gripper has moved and turned since the first pose, shape [m, 6].
+        """Return the gripper's displacement and rotation since the first pose, shape [m, 6].
 
         Args:
-            times: Since the first pose [s], shape [m]; after the last it stays.
+            times: Times since the first pose [s], shape [m]; after the last pose it stays there.
         """
         from scipy.spatial.transform import Rotation, Slerp
 
@@ -54,5 +54,5 @@ class PoseTable:
         return np.hstack([moved, turned])
 
     def digest(self) -> str:
-        """What tells one way from another."""
+        """Key that distinguishes one path from another."""
         return hashlib.sha256(np.column_stack([self.times, self.poses]).tobytes()).hexdigest()

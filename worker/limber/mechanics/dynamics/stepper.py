@@ -1,4 +1,4 @@
-"""What the schemes of implicit steps in time have in common."""
+"""What the implicit time integration schemes have in common."""
 
 from abc import ABC, abstractmethod
 
@@ -13,12 +13,12 @@ from limber.mechanics.solve_status import Status
 
 
 class Stepper(ABC):
-    """Takes steps, and keeps the tangent of the last.
+    """Takes steps and keeps the tangent of the last one.
 
     Attributes:
-        iteration_count: So far.
-        status, trouble: Why the last step failed.
-        tangent: The last step was solved with; None before the first.
+        iteration_count: Iterations so far.
+        status, trouble: Reason for the failure of the last step.
+        tangent: Tangent of the last solve; None before the first.
     """
 
     def __init__(self, drive: Drive, settings: MotionSettings):
@@ -29,27 +29,27 @@ class Stepper(ABC):
         self.tangent: Tangent | None = None
 
     def forget_tangent(self) -> None:
-        """Use the last tangent no more."""
+        """Discard the last tangent."""
         self.tangent = None
 
     @abstractmethod
     def viscous(self, old: MotionState, dt: float) -> Viscous | None:
-        """Return the viscous part of a step of ``dt`` from ``old``; None where there is none."""
+        """Return the viscous part of a step of ``dt`` from ``old``; None if there is none."""
 
     @abstractmethod
     def step(self, old: MotionState, dt: float, viscous: Viscous | None) -> MotionState | None:
-        """Return the state ``dt`` after ``old``, or None where it is not found."""
+        """Return the state ``dt`` after ``old``, or None if it is not found."""
 
     def _is_balanced(self, norm: float, reference: float) -> bool:
-        """Whether a residual is small, over the forces or beside what is round-off."""
-        # Differences of displacements in an element carry round-off of about one unit each.
+        """Whether a residual is small relative to the forces or to round-off."""
+        # Differences of displacements in an element carry a round-off error of about one unit each.
         tangent = present(self.tangent, "tangent")
         floor = 8 * float(np.finfo(float).eps) * tangent.diagonal_norm * self.model.mean_edge
         return norm <= max(self.settings.tolerance * reference, floor)
 
     def _change(self, residual: np.ndarray, moved: np.ndarray | None,
                 pins: np.ndarray) -> np.ndarray:
-        """Return what the tangent answers to a residual, with what held nodes are ``moved`` by."""
+        """Return the tangent's response to a residual and to the motion ``moved`` of held nodes."""
         change = present(self.tangent, "tangent").solve(residual, pins)
         return change if moved is None or not self.equations.held.any() else change + moved
 

@@ -2,21 +2,21 @@
 
 All refer to the rest shape: with H = du/dX and F = I + H, the second Piola-Kirchhoff stress S
 follows from the Green-Lagrange strain E = (H + H^T + H^T H) / 2, and the force of node a is the
-integral of F S grad N_a. See limber.mechanics.elements.stiffness_pairs for how runs of numbers
-are laid out.
+integral of F S grad N_a. See :mod:`limber.mechanics.elements.stiffness_pairs` for the memory layout
+of runs of numbers.
 
 Shared arguments:
     displacement: Node displacements [m], shape [node_count, 3].
     gradients, weights, nodes: From :class:`ForceLayout`.
     lame_lambda, lame_mu: Lamé coefficients [Pa], shape [batch, LANES].
     material: ``kernel`` of a limber.mechanics.materials.law.MaterialLaw.
-    growth, memory: In motion the stress is that of the strain ``growth * E + memory``: viscous
-        stress (Kelvin-Voigt) follows the strain's rate, and a difference formula gives that rate
-        from the strain now and the strains before, which are the memory, [tet_count, q, 6] (00
-        11 22 01 02 12). Growth 1 and a memory of no rows: no viscosity.
+    growth, memory: In motion the stress is that of the strain ``growth * E + memory``. Viscous
+        stress (Kelvin-Voigt) follows the strain rate, which a difference formula gives from the
+        current strain and the previous strains; the previous strains are the memory, [tet_count, q,
+        6] (00 11 22 01 02 12). Growth 1 and a memory without rows: no viscosity.
 
-Displacements are taken relative to the element's first node: gradients sum to zero, so this
-changes nothing but the round-off of a branch that has moved far.
+Displacements are relative to the element's first node. The gradients sum to zero, so this only
+reduces the round-off of a branch with large displacements.
 """
 
 from functools import cached_property
@@ -30,11 +30,11 @@ from limber.mechanics.materials.law import NEO_HOOKE, SMALL_STRAIN
 
 
 class ForceLayout:
-    """Elements in batches, in their own order, the element the last axis.
+    """Elements in batches, in their own order; the element is the last axis.
 
     Attributes:
-        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES]:
-        what :func:`internal_force` takes; what fills the last batch up has no weight.
+        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES]: the
+        arguments of :func:`internal_force`. Padding in the last batch has zero weight.
     """
 
     def __init__(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray):
@@ -51,12 +51,12 @@ class ForceLayout:
         return self.gradients.mean(axis=1)
 
     def per_element(self, values: np.ndarray) -> np.ndarray:
-        """Return one number a tetrahedron in this layout, shape [batch, LANES]."""
+        """Return one number per tetrahedron in this layout, shape [batch, LANES]."""
         return values[self._order].reshape(-1, LANES)
 
 
 def lanes_last(array: np.ndarray) -> np.ndarray:
-    """Return an array of elements in batches of LANES, the element the last axis."""
+    """Return an array of elements in batches of LANES; the element is the last axis."""
     batched = array.reshape(-1, LANES, *array.shape[1:])
     return np.ascontiguousarray(np.moveaxis(batched, 1, -1))
 
@@ -142,7 +142,7 @@ def tangent_times(displacement, direction, gradients, weights, lame_lambda, lame
             if material == NEO_HOOKE:
                 _add_volume_change(F, H, lam, mu, weight, P)
             if material != NEO_HOOKE or is_viscous:
-                # F is the identity where the material is linear, and E then zero.
+                # F is the identity if the material is linear, and E is then zero.
                 green_strain(F, E)
                 _strain_rate(F, H, D)
                 for k in range(6 * LANES):
@@ -202,7 +202,7 @@ def strain_changes(displacement, direction, gradients, nodes, material, out):
 
 @compiled
 def largest_stretch(displacement, mean_gradients, nodes):
-    """Return the largest principal stretch of the mean deformation of any element, and which."""
+    """Return the largest principal stretch of the mean deformation, and its element."""
     node_count = nodes.shape[1]
     flat = mean_gradients.reshape(len(nodes), 3 * node_count * LANES)
     local, F, E = np.empty(3 * node_count * LANES), np.empty(9 * LANES), np.empty(6 * LANES)
@@ -217,7 +217,7 @@ def largest_stretch(displacement, mean_gradients, nodes):
             x, y, z = E[l] - mean, E[LANES + l] - mean, E[2 * LANES + l] - mean
             size = np.sqrt((x * x + y * y + z * z
                             + 2.0 * (e01 * e01 + e02 * e02 + e12 * e12)) / 6.0)
-            # No eigenvalue is above this.
+            # Upper bound of the eigenvalues.
             if not mean + 2.0 * size > largest:
                 continue
             half = 0.5 * (x * (y * z - e12 * e12) - e01 * (e01 * z - e12 * e02)
@@ -231,10 +231,10 @@ def largest_stretch(displacement, mean_gradients, nodes):
 
 @compiled
 def sparse_times(starts, columns, values, field, product):
-    """Write a matrix in compressed rows times a nodal field, shape [node_count, 3]."""
+    """Write the product of a matrix in compressed rows and a nodal field, shape [node_count, 3]."""
     for row in range(len(starts) - 1):
         x, y, z = 0.0, 0.0, 0.0
-        # Unsigned: numba looks whether a signed index counts from the end.
+        # Unsigned: numba checks whether a signed index counts from the end.
         for p in range(np.uint64(starts[row]), np.uint64(starts[row + 1])):
             value, node = values[p], np.uint64(columns[p])
             x += value * field[node, 0]
@@ -269,7 +269,7 @@ def _spread(pull, nodes, count, force):
 
 @compiled
 def _strain_rate(F, H, D):
-    """Write the symmetric part of F^T H: the strain's change as F changes by H."""
+    """Write the symmetric part of F^T H: the change of the strain as F changes by H."""
     for l in range(LANES):
         f00, f01, f02 = F[l], F[LANES + l], F[2 * LANES + l]
         f10, f11, f12 = F[3 * LANES + l], F[4 * LANES + l], F[5 * LANES + l]

@@ -1,8 +1,8 @@
-"""The stiffness of any law's moduli, LANES elements at a time.
+"""The stiffness for the moduli of any law, LANES elements at a time.
 
-Stress needs no kernel of its own: Hooke's kernels take that of any law as the strain that it
-belongs to (BranchModel.bearing_strain). Moduli of 21 numbers a point take about five times as long
-as Hooke's two; a law's own formulas in numpy take longer than both.
+Stress needs no kernel of its own: Hooke's kernels take the stress of any law as the corresponding
+strain (BranchModel.bearing_strain). Moduli of 21 numbers per point take about five times as long as
+Hooke's two; a law's own formulas in numpy take longer than both.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from limber.mechanics.elements.stiffness_pairs import LANES, scatter_block
 def moduli_stiffness(displacement: np.ndarray, gradients: np.ndarray, weights: np.ndarray,
                      moduli: np.ndarray, nodes: np.ndarray, slots: np.ndarray,
                      lengths: np.ndarray, values: np.ndarray) -> None:
-    """Add the integral of B^T C B [N/m] of all elements to ``values``, B the strain's change.
+    """Add the integral of B^T C B [N/m] of all elements to ``values``; B gives the strain's change.
 
     Args:
         moduli: C by rows, 00 11 22 and shear angles 01 02 12 [Pa], shape [batch, q, 36, LANES].
@@ -53,7 +53,7 @@ def moduli_stiffness(displacement: np.ndarray, gradients: np.ndarray, weights: n
 
 @compiled
 def _strain_changes(F: np.ndarray, gradients: np.ndarray, out: np.ndarray) -> None:
-    """Write how strain and shear angles change as a node moves along each axis, by axes."""
+    """Write the changes of strain and shear angles as a node moves along each axis, by axes."""
     for i in range(3):
         for l in range(LANES):
             x, y, z = gradients[l], gradients[LANES + l], gradients[2 * LANES + l]

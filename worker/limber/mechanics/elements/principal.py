@@ -14,8 +14,8 @@ def largest_principal_strains(displacement, mean_gradients, nodes, carried, out)
     Args:
         displacement: [m], shape [node_count, 3].
         mean_gradients, nodes: From limber.mechanics.elements.forces.ForceLayout.
-        carried: Strain that each element has in the mesh's shape already, [tet_count, 6] (00 11 22
-            01 02 12), or no rows.
+        carried: Strain of each element in the mesh's shape, [tet_count, 6] (00 11 22 01 02 12), or
+            no rows.
         out: Shape [tet_count].
     """
     node_count = nodes.shape[1]

@@ -1,6 +1,6 @@
 """Tetrahedra with 4 or 10 nodes: shape functions, quadrature, gradients at quadrature points.
 
-Node order is VTK's (limber.geometry.tets.tet_mesh). Everything refers to the rest shape, so
+Node order is VTK's (:mod:`limber.geometry.tets.tet_mesh`). Everything refers to the rest shape, so
 gradients are computed once; straight and curved sides differ only in the number of quadrature
 points.
 """
@@ -13,7 +13,8 @@ from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 CURVED_TOLERANCE = 1e-6
-"""A side is curved if its middle node is off the chord's middle by more than this part of it."""
+"""Relative offset of a middle node from the chord's middle above which a side is curved.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def shape_functions(barycentric: np.ndarray, node_count: int) -> np.ndarray:
 
 
 def shape_gradients(barycentric: np.ndarray, node_count: int) -> np.ndarray:
-    """Return derivatives to the three last barycentric coordinates, shape [q, 3, node_count]."""
+    """Return derivatives to the last three barycentric coordinates, shape [q, 3, node_count]."""
     # The first coordinate is 1 minus the others.
     to_local = np.array([[-1.0, 1, 0, 0], [-1.0, 0, 1, 0], [-1.0, 0, 0, 1]])
     if node_count == 4:
@@ -81,8 +82,8 @@ def has_curved_sides(mesh: TetMesh) -> bool:
 def stiffness_quadrature(mesh: TetMesh) -> Quadrature:
     """Return the rule for forces and stiffness: 1 point linear, 4 straight, 14 curved.
 
-    Four points integrate a straight-sided quadratic element's linear stiffness exactly, and are
-    used for StVK's energy consistently; curved sides have gradients that are not polynomial.
+    Four points integrate the linear stiffness of a straight-sided quadratic element exactly, and
+    are used for StVK's energy consistently; on curved sides the gradients are not polynomial.
     """
     if not mesh.is_quadratic:
         return quadrature(1)
@@ -97,7 +98,7 @@ def element_gradients(mesh: TetMesh, rule: Quadrature) -> tuple[np.ndarray, np.n
         [tet_count, q]; the weights of an element sum to its volume.
 
     Raises:
-        InputError: an element is inverted or flat, with its number and place.
+        InputError: an element is inverted or flat; its number and position are given.
     """
     corners = mesh.nodes[mesh.tets]
     local = shape_gradients(rule.points, mesh.tets.shape[1])
@@ -110,7 +111,7 @@ def element_gradients(mesh: TetMesh, rule: Quadrature) -> tuple[np.ndarray, np.n
 
 
 def node_weights(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integrals over each element of N_a N_b, and the lumped ones.
+    """Return the integrals of N_a N_b over each element, consistent and lumped.
 
     Returns:
         consistent [m^3], shape [tet_count, n, n], and lumped [m^3], shape [tet_count, n]: the

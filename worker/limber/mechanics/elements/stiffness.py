@@ -1,13 +1,13 @@
-"""The kernel that makes the tangent stiffness and scatters it into the factor's own pattern.
+"""The kernel that computes the tangent stiffness and scatters it into the factor's pattern.
 
-Elements are taken LANES at a time (limber.mechanics.elements.stiffness_pairs); the layout, made by
-limber.mechanics.linear.pattern, has the element as the last axis.
+Elements are processed LANES at a time (:mod:`limber.mechanics.elements.stiffness_pairs`). The
+layout comes from :mod:`limber.mechanics.linear.pattern`; the element is the last axis.
 
-``slots`` has, for each pair of an element's nodes, where the pair's block starts in the values of
-the lower triangle in compressed columns; the block's other two columns follow at distances that
-the column's length gives. An element's nodes are sorted so that the earlier eliminated comes first,
-so every pair's block is in the lower triangle as it stands. Pairs with a constrained node point
-behind the end of the values.
+``slots`` gives, for each pair of an element's nodes, the start of the pair's block in the values of
+the lower triangle in compressed columns; the block's other two columns follow at distances that the
+column's length gives. An element's nodes are sorted by elimination order, so every pair's block is
+in the lower triangle without transposing. Pairs with a constrained node point behind the end of the
+values.
 """
 
 import numpy as np
@@ -39,16 +39,16 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
 
     Args:
         displacement: See limber.mechanics.elements.forces.
-        increment: The last increment of the displacement; the stress of the geometric part is
-            then taken at the strain less dH^T dH / 2, dH the increment's gradient: the stress
-            that the last linearisation predicted (mixed integration points, Magisano, Leonetti
-            and Garcea 2017). Without rows: Newton's. Only for St. Venant-Kirchhoff.
+        increment: The last increment of the displacement. The geometric part then uses the stress
+            at the strain less dH^T dH / 2, with dH the increment's gradient: the stress that the
+            last linearisation predicted (mixed integration points, Magisano, Leonetti and Garcea
+            2017). Without rows: Newton's. Only for St. Venant-Kirchhoff.
         gradients, weights: Shapes [batch, q, n, 3, LANES] and [batch, q, LANES].
         lame_lambda, lame_mu: Shape [batch, LANES].
         nodes: Shape [batch, n, LANES].
         growth, memory: See limber.mechanics.elements.forces; memory of shape [batch, q, 6, LANES].
         slots, lengths: Shape [batch, pairs, LANES]; pair (a, b <= a) has number a (a+1)/2 + b.
-        values: Lower triangle by columns, with a few numbers of scratch behind its end.
+        values: Lower triangle by columns, followed by a few numbers of scratch space.
     """
     batch_count, point_count = weights.shape[0], weights.shape[1]
     node_count = nodes.shape[1]

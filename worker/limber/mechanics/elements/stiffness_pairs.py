@@ -1,9 +1,9 @@
 """The innermost kernels of the stiffness: 3 x 3 blocks of two nodes, LANES elements at a time.
 
-Every number is a run of LANES numbers, one an element, and a function's arrays are flat runs at
-distances known to the compiler: so it sees that nothing overlaps, unrolls the quadrature points
-and keeps all sums in vector registers. (Measured: with runs of 8 LLVM unrolls instead of
-vectorising, and sums that go through memory at each point take four times as long.)
+Every number is a run of LANES numbers, one per element, and a function's arrays are flat runs at
+distances known to the compiler. The compiler therefore sees that nothing overlaps, unrolls the
+quadrature points and keeps all sums in vector registers. (Measured: with runs of 8, LLVM unrolls
+instead of vectorising; sums that go through memory at each point take four times as long.)
 
 A block's nine runs are its columns one after the other: 00 10 20 01 11 21 02 12 22.
 """
@@ -13,16 +13,16 @@ from collections.abc import Callable
 from limber.core.numerics.compiled import compiled
 
 LANES = 16
-"""Elements a run."""
+"""Elements per run."""
 
 STRAIN_ROWS = 9
-"""Runs a node and point has for strain_pairs: F g times the weight's root, g, S g."""
+"""Runs per node and point for strain_pairs: F g times the weight's root, g, S g."""
 STRAIN_TERMS = 6
-"""Runs a point has: weight times mu F F^T (00 11 22 01 02 12)."""
+"""Runs per point: weight times mu F F^T (00 11 22 01 02 12)."""
 VOLUME_ROWS = 6
-"""Runs a node and point has for volume_pairs: cof(F) g times the weight's root, g."""
+"""Runs per node and point for volume_pairs: cof(F) g times the weight's root, g."""
 VOLUME_TERMS = 10
-"""Runs a point has: weight times pressure times F by rows, weight times mu."""
+"""Runs per point: weight times pressure times F by rows, weight times mu."""
 
 
 def _strain_pairs(points: int) -> Callable:
@@ -76,8 +76,8 @@ def _volume_pairs(points: int) -> Callable:
     def volume_pairs(one, two, terms, both, block):
         """Add the blocks of stable neo-Hookean elements, summed over a few points.
 
-        With c = cof(F) g it is mu (g g') 1 + (lambda + mu) c c'^T + the skew matrix of
-        pressure F (g' x g), which the cofactor's change gives.
+        With c = cof(F) g it is mu (g g') 1 + (lambda + mu) c c'^T + the skew matrix of pressure F
+        (g' x g), from the change of the cofactor.
         """
         for l in range(LANES):
             n00 = n11 = n22 = n01 = n10 = n02 = n20 = n12 = n21 = 0.0

@@ -1,4 +1,4 @@
-"""The linear equations of the free nodes, assembled again and again; each gives a tangent."""
+"""The linear equations of the free nodes, assembled repeatedly; each assembly gives a tangent."""
 
 import copy
 from collections.abc import Sequence
@@ -25,8 +25,9 @@ _NO_INCREMENT = np.zeros((0, 3))
 _NO_MEMORY = np.zeros((0, 0, 6, 0))
 _FIRST_SHIFT = 1e-7
 _LAST_SHIFT = 1.0
-"""What is added to the diagonal until it is positive definite, tenfold each time, as parts of its
-mean: a range, from just over round-off to another matrix."""
+"""Terms added to the diagonal, tenfold each time, until the matrix is positive definite, as
+fractions of its mean: from just above round-off to a different matrix.
+"""
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Viscous:
     """Viscous stress in motion: the stress is that of the strain ``growth * E + memory``.
 
     Attributes:
-        growth: 1 plus the damping factor times the rate of the strain per strain.
-        memory: What the strains before contribute, shape [tet_count, q, 6].
+        growth: 1 plus the damping factor times the derivative of the strain rate to the strain.
+        memory: Contribution of the previous strains, shape [tet_count, q, 6].
     """
 
     growth: float
@@ -43,17 +44,17 @@ class Viscous:
 
 
 class Tangent:
-    """A factorised stiffness, with inertia perhaps; it stays what it is while others are made.
+    """A factorised stiffness, optionally with inertia; it stays valid while others are made.
 
-    Its memory goes back to the equations when nothing refers to it any more.
+    Its memory returns to the equations when nothing refers to it.
 
     Attributes:
-        equations: Whose tangent it is: their constraints hold.
-        is_positive_definite: Whether it was, as it was assembled. If not, its diagonal was raised
-            until it was: a solution is then still a descent direction of the energy, but not
-            Newton's.
+        equations: Equations with the constraints of this tangent.
+        is_positive_definite: Whether it was positive definite as assembled. If not, its diagonal
+            was raised until it was: a solution is then still a descent direction of the energy, but
+            not Newton's.
         diagonal_norm: 2-norm of its diagonal [N/m].
-        drag: What was added to its diagonal on purpose [N/m].
+        drag: Term added to its diagonal on purpose [N/m].
     """
 
     def __init__(self, equations: "Equations", factor: Factor, values: np.ndarray, drag: float):
@@ -87,7 +88,7 @@ class Tangent:
 
     @cached_property
     def _pin_halves(self) -> np.ndarray:
-        # Not before they are asked for: many a tangent only says whether a state is stable.
+        # Computed on demand: many tangents are only checked for stability.
         factor = self._factor
         if not isinstance(factor, SupernodalFactor):
             raise TypeError(f"{type(factor).__name__} cannot solve in two halves.")
@@ -101,8 +102,7 @@ class Tangent:
         """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
 
         Args:
-            right: Forces [N] on all nodes, shape [node_count, 3]; those on held nodes are left
-                out.
+            right: Forces [N] on all nodes, shape [node_count, 3]; those on held nodes are ignored.
             pin_moves: Prescribed means of the pinned patches [m], shape [pinned, 3]; default 0.
         """
         return self.solve_all([right], pin_moves)[0]
@@ -112,8 +112,8 @@ class Tangent:
         """Return the displacements for several forces, as :meth:`solve` does for one.
 
         Args:
-            rights: As there, each.
-            pin_moves: As there, or for each of S forces its own, shape [3 pinned, S].
+            rights: The forces, each as for :meth:`solve`.
+            pin_moves: As for :meth:`solve`, or one set per force for S forces, shape [3 pinned, S].
         """
         equations = self.equations
         order = equations.pattern.order
@@ -132,12 +132,13 @@ class Tangent:
         return results
 
     def _solve_pinned(self, forces: np.ndarray, moves: np.ndarray | float) -> np.ndarray:
-        """Return the solutions [size, S] for ``forces``, whose pinned means are ``moves``."""
+        """Return the solutions [size, S] for ``forces``, with the pinned means ``moves``."""
         factor, rows = self._factor, self.equations.pin_rows
         if not isinstance(factor, SupernodalFactor):
             solutions, pins = factor.solve(forces), self._pin_solutions
             return solutions - pins @ np.linalg.solve(rows.T @ pins, rows.T @ solutions - moves)
-        # What the pins take is known half-way, and the other half is gone once for all.
+        # The multipliers follow from the forward substitution; the backward one is then done once
+        # for all.
         half, pins = factor.down(forces), self._pin_halves
         return factor.up(half - pins @ np.linalg.solve(pins.T @ pins, pins.T @ half - moves))
 
@@ -145,15 +146,15 @@ class Tangent:
 class Equations:
     """Stiffness equations for one set of constraints; shared by models of one mesh.
 
-    Fixed nodes and those of clamped grasps are left out. A pinned grasp prescribes the mean of
-    its patch: three Lagrange multipliers, on top of a stiffness that is augmented by the outer
-    product of the mean's weights. That changes no solution, and makes the matrix positive
-    definite wherever the constrained problem is.
+    Fixed nodes and those of clamped grasps are eliminated. A pinned grasp prescribes the mean of
+    its patch by three Lagrange multipliers, on a stiffness augmented by the outer product of the
+    mean's weights. The augmentation changes no solution, and makes the matrix positive definite
+    wherever the constrained problem is.
 
     Attributes:
         held: Whether a node is fixed or clamped, shape [node_count].
         pinned: The pinned grasps.
-        pin_rows: Their constraints: rows of the mean of each patch, shape [size, 3 pinned].
+        pin_rows: Constraint rows: the mean of each patch, shape [size, 3 pinned].
         factorisation_count: Numeric factorisations so far.
     """
 
@@ -167,7 +168,7 @@ class Equations:
         self.pattern = Pattern(tets, len(fixed), ~self.held, [g.nodes for g in self.pinned])
         self.layout = LaneLayout(self.pattern, tets, gradients, weights)
         self.factorisation_count = 0
-        # Factors that no tangent uses: their memory and symbolic part serve the next one.
+        # Unused factorisations; their memory and symbolic part are reused.
         self._spare: list[Factor] = [make_factor(self.pattern)]
         self._twin = self._spare[0].twin
         self._known: tuple[BranchModel, np.ndarray, Tangent] | None = None
@@ -181,20 +182,20 @@ class Equations:
                 self.pin_rows[rows + axis, 3 * number + axis] = grasp.weights
 
     def placed(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray) -> "Equations":
-        """Return the equations of the same tetrahedra elsewhere; pattern and memory are shared."""
+        """Return the equations of the same tetrahedra at other positions, with shared pattern."""
         other = copy.copy(self)
         other.layout = LaneLayout(self.pattern, tets, gradients, weights)
         other._axes, other._known = {}, None
         return other
 
     def exact_tangent(self, model: "BranchModel", displacement: np.ndarray) -> Tangent:
-        """Return the tangent stiffness at a state; the last one, asked for again, is at hand.
+        """Return the tangent stiffness at a state; the last one is cached.
 
-        A solve looks at it to see whether its end is stable; what differentiates that end, and
-        the solve that goes on from there, need it too.
+        A solve uses it to check whether its end is stable. The derivatives at that end and the next
+        solve need it too.
 
         Raises:
-            NotPositiveDefiniteError: as :meth:`tangent`.
+            NotPositiveDefiniteError: as for :meth:`tangent`.
         """
         known = self._known
         if known is None or known[0] is not model or not np.array_equal(known[1], displacement):
@@ -209,18 +210,18 @@ class Equations:
         """Return tangent stiffness plus ``mass_factor`` [1/s^2] times the mass, factorised.
 
         Args:
-            increment: The last increment [m], for mixed-point Newton; where the force is not
-                cubic it changes nothing.
-            strain: At whose stress the geometric part is taken instead, shape [tet_count, q, 6]
+            increment: The last increment [m], for mixed-point Newton; no effect if the force is not
+                cubic.
+            strain: Strain whose stress the geometric part uses instead, shape [tet_count, q, 6]
                 (St. Venant-Kirchhoff only).
             viscous: Viscous part in motion.
-            drag: Part of the mean diagonal that is added to the diagonal.
+            drag: Fraction of the mean diagonal that is added to the diagonal.
 
         Raises:
             NotPositiveDefiniteError: it is not positive definite, however far its diagonal is
                 raised.
         """
-        # Its memory serves the one that is made now.
+        # Its memory is reused for the new one.
         self._known = None
         return self.factorised(self.assemble(
             model, displacement, increment=increment, strain=strain, viscous=viscous,
@@ -233,7 +234,7 @@ class Equations:
         return self.factorised(self._values[:self.pattern.value_count])
 
     def factorised(self, values: np.ndarray, drag: float = 0.0) -> Tangent:
-        """Return the tangent of assembled ``values``; they are raised in place where it needs it.
+        """Return the tangent of assembled ``values``; the diagonal is raised in place if needed.
 
         Args:
             values: Lower triangle by columns, from :meth:`assemble`.
@@ -243,7 +244,7 @@ class Equations:
         return Tangent(self, factor, values, drag)
 
     def take_back(self, factor: Factor) -> None:
-        """Keep the memory of a tangent that is no longer used for the next one."""
+        """Keep the memory of an unused tangent for the next one."""
         self._spare.append(factor)
 
     def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
@@ -251,7 +252,7 @@ class Equations:
                  viscous: Viscous | None = None, mass_factor: float = 0.0) -> np.ndarray:
         """Return the matrix of :meth:`tangent`, lower triangle by columns, shape [value_count].
 
-        In the one memory that all assembly of these equations writes to.
+        All assembly of these equations writes to the same memory.
         """
         if mass_factor:
             np.multiply(self._mass_values(model), mass_factor, out=self._values)
@@ -280,9 +281,9 @@ class Equations:
 
     def _add_moduli(self, model: "BranchModel", displacement: np.ndarray,
                     viscous: Viscous | None) -> tuple[float, np.ndarray]:
-        """Add the stiffness of a law's own moduli.
+        """Add the stiffness for a law's own moduli.
 
-        Return growth and memory with which Hooke's kernel adds that of its stress and viscosity.
+        Return growth and memory for which Hooke's kernel adds the law's stress and viscosity.
         """
         layout, strain = self.layout, model.strains(displacement)
         moduli = model.material.moduli(strain, model.lame_lambda[:, None], model.lame_mu[:, None])
@@ -293,14 +294,14 @@ class Equations:
         return growth, layout.per_point(model.bearing_strain(strain, viscous) - growth * strain)
 
     def free_part(self, force: np.ndarray) -> np.ndarray:
-        """Return forces without what the constraints bear: held nodes, means of pinned patches."""
+        """Return forces less what constraints carry: held nodes, means of pinned patches."""
         rest = np.where(self.held[:, None], 0.0, force)
         for grasp, reaction in zip(self.pinned, self.pin_forces(force), strict=True):
             rest[grasp.nodes] -= grasp.weights[:, None] * reaction
         return rest
 
     def pin_forces(self, force: np.ndarray) -> np.ndarray:
-        """Return the force [N] that each pinned grasp takes of nodal forces, shape [pinned, 3]."""
+        """Return the nodal forces [N] that each pinned grasp carries, shape [pinned, 3]."""
         return np.array([grasp.weights @ force[grasp.nodes] / (grasp.weights @ grasp.weights)
                          for grasp in self.pinned]).reshape(-1, 3)
 
@@ -308,7 +309,7 @@ class Equations:
         return self._axis_values("mass", model.mass_matrix)
 
     def _axis_values(self, name: str, matrix: sp.csr_matrix) -> np.ndarray:
-        """Return a matrix that is the same in each axis, in the pattern; kept until it changes."""
+        """Return a matrix that is equal in each axis, in the pattern; cached until it changes."""
         if name not in self._axes or self._axes[name][0] is not matrix:
             entries = matrix.tocoo()
             lower = self.pattern.position[entries.row] >= self.pattern.position[entries.col]

@@ -1,7 +1,7 @@
-"""Factorisation of a symmetric matrix whose pattern stays and whose values change.
+"""Factorisation of a symmetric matrix with a fixed pattern and changing values.
 
-Limber's own supernodal factor, made for slender branches; for the dense kernels of bulky meshes
-a general library's (:mod:`limber.core.numerics.sparse`).
+Limber's own supernodal factor is made for slender branches. For the dense kernels of bulky meshes a
+general library is used (:mod:`limber.core.numerics.sparse`).
 """
 
 from typing import TYPE_CHECKING
@@ -17,26 +17,27 @@ if TYPE_CHECKING:
     from limber.mechanics.linear.pattern import Pattern
 
 _MOST_FLOPS = 1e11
-"""Of a factorisation that Limber's own loops take on; at 1.5e10 they are still 1.7 times as fast
-as CHOLMOD, whose share of fast dense kernels grows with the fronts."""
+"""Most operations of a factorisation that Limber's own loops do. At 1.5e10 they are still 1.7 times
+as fast as CHOLMOD, whose fraction of fast dense kernels grows with the fronts.
+"""
 
 
 Factor = SupernodalFactor | CholmodFactor | SuperLuFactor
 
 
 def make_factor(pattern: "Pattern") -> Factor:
-    """Return the fastest factor for a pattern that is installed."""
+    """Return the fastest installed factor for a pattern."""
     fronts = make_fronts(pattern.node_starts, pattern.node_rows)
     if fronts.flops <= _MOST_FLOPS:
         return SupernodalFactor(fronts)
-    # The order of elimination is ours, found once on nodes instead of rows.
+    # The elimination order is Limber's own, found once on nodes instead of rows.
     return general_factor(*pattern.entries(), pattern.size)
 
 
 def elimination_order(graph: sp.csr_matrix) -> np.ndarray:
     """Return an order of nodes (new to old) with little fill, by approximate minimum degree.
 
-    Each subtree of the elimination is a run (postorder).
+    Each subtree of the elimination is a contiguous run (postorder).
 
     Args:
         graph: Symmetric pattern of the nodes, [n, n].

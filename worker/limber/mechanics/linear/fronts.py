@@ -1,9 +1,9 @@
 """Symbolic part of the supernodal Cholesky factor: elimination tree, supernodes, fronts.
 
-Everything is found on nodes, three rows and columns each. A supernode is a run of columns that
-are eliminated together; its front is a dense matrix of those columns' rows: first the columns'
-own, then those below, each part padded to whole vectors. What a front leaves for later (its
-update matrix) is added into its parent's front (Duff and Reid 1983, Liu 1992).
+The structure is found on nodes, with three rows and columns each. A supernode is a run of columns
+that are eliminated together; its front is a dense matrix of those columns' rows: first the columns'
+own, then those below, each part padded to whole vectors. The remainder of a front (its update
+matrix) is added into its parent's front (Duff and Reid 1983, Liu 1992).
 """
 
 from dataclasses import dataclass
@@ -14,29 +14,30 @@ import scipy.sparse as sp
 from limber.core.numerics.compiled import compiled
 
 PAD = 8
-"""Rows are padded to multiples of this: no loop over rows has a remainder."""
+"""Rows are padded to multiples of this, so loops over rows have no remainder."""
 
 _RELAX = ((24, 0.4), (72, 0.1), (200, 0.05))
-"""A child is joined to its parent if so many columns together have less than this part of zeros.
-Chosen along with the kernels on 2,752 quadratic tetrahedra; not measured one by one."""
+"""Limits for joining a child to its parent: joint columns and largest fraction of zeros. Chosen
+along with the kernels on 2,752 quadratic tetrahedra; not measured one by one.
+"""
 
 
 @dataclass(frozen=True)
 class Fronts:
-    """Where everything of a factor is.
+    """Layout of a factor in memory.
 
     Attributes:
         first: First node of each supernode, and the node count at the end, shape [count + 1].
-        row_start: Where each supernode's nodes below begin in ``rows``, shape [count + 1].
+        row_start: Start of each supernode's nodes below in ``rows``, shape [count + 1].
         rows: Node numbers below, ascending.
         places: Position of each of ``rows`` in the parent's front, counted in nodes.
-        panel: Where each supernode's columns begin in the factor, shape [count + 1].
+        panel: Start of each supernode's columns in the factor, shape [count + 1].
         children, child_start: Children of each supernode.
-        work: Where each update matrix begins in its work space, one for even depths in the tree
-            and one for odd; depth: which.
-        work_size: Sizes of the two, shape [2].
-        value_start: Where the values of each supernode's columns begin, shape [count + 1].
-        targets: Where each value goes in its supernode's columns.
+        work: Start of each update matrix in its work space; there is one work space for even depths
+            of the tree and one for odd depths. depth: selects the work space.
+        work_size: Sizes of the two work spaces, shape [2].
+        value_start: Start of the values of each supernode's columns, shape [count + 1].
+        targets: Position of each value in its supernode's columns.
         flops: Multiplications and additions of a factorisation.
     """
 
@@ -56,7 +57,7 @@ class Fronts:
 
 
 def postordered(graph: sp.csr_matrix, order: np.ndarray) -> np.ndarray:
-    """Return an order of elimination with the same fill in which each subtree is a run.
+    """Return an elimination order with the same fill in which each subtree is a contiguous run.
 
     Args:
         graph: Symmetric pattern of the nodes, [n, n].
@@ -112,7 +113,7 @@ def _padded(rows: np.ndarray) -> np.ndarray:
 
 
 def _runs(begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return the numbers of several runs, one run after the other."""
+    """Return the numbers of several runs, concatenated."""
     shift = np.repeat(begins - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
     return np.arange(lengths.sum()) + shift
 
@@ -202,20 +203,20 @@ def _column_structure(starts, rows, parent):
 def _supernodes(parent, lengths, widest, zeros_allowed):
     """Return the first node of each supernode, and the node count."""
     count = len(parent)
-    # A stack of supernodes: first node, last node, entries that are zeros.
+    # A stack of supernodes: first node, last node, number of zero entries.
     first, last = np.empty(count, np.int64), np.empty(count, np.int64)
     zeros = np.empty(count)
     top = -1
     for j in range(count):
         if top >= 0 and parent[j - 1] == j and lengths[j - 1] == lengths[j] + 1:
-            # Rows of the run so far and of this column agree.
+            # The rows of the current run and of this column agree.
             last[top] = j
         else:
             top += 1
             first[top], last[top], zeros[top] = j, j, 0.0
         if j + 1 < count and parent[j] == j + 1 and lengths[j] == lengths[j + 1] + 1:
             continue
-        # The run is complete: take in the last child as long as that adds few zeros.
+        # The run is complete: join the last child as long as that adds few zeros.
         while top > 0 and parent[last[top - 1]] >= 0 and parent[last[top - 1]] <= last[top]:
             own = last[top] - first[top] + 1
             others = last[top - 1] - first[top - 1] + 1
@@ -240,10 +241,10 @@ def _supernodes(parent, lengths, widest, zeros_allowed):
 
 @compiled
 def _work_places(parents, sizes, children, child_start):
-    """Return depth modulo 2, begin of each update matrix, and the work spaces' sizes.
+    """Return depth modulo 2, the start of each update matrix, and the sizes of the work spaces.
 
-    Supernodes are in postorder, so the update matrices of one parity of depth come and go like
-    the sheets of a stack: a parent's is laid down after its grandchildren's have been taken.
+    Supernodes are in postorder, so the update matrices of one parity of depth form a stack: a
+    parent's matrix is pushed after its grandchildren's have been popped.
     """
     count = len(parents)
     depth = np.zeros(count, np.int64)
@@ -280,7 +281,7 @@ def _places(first, row_start, rows, parents):
 
 @compiled
 def _targets(starts, rows, first, row_start, front_rows, owner):
-    """Return where each value (lower triangle by columns) goes in its supernode's columns."""
+    """Return the position of each value (lower triangle by columns) in its supernode's columns."""
     count = len(starts) - 1
     targets = np.empty(9 * len(rows) - 3 * count, np.int32)
     where = np.empty(count, np.int64)

@@ -1,4 +1,4 @@
-"""Where each element's stiffness goes: elimination order, sparsity pattern, vector layout."""
+"""Elimination order, sparsity pattern and vector layout of the elements' stiffness."""
 
 from collections.abc import Sequence
 
@@ -10,22 +10,22 @@ from limber.mechanics.elements.stiffness_pairs import LANES
 from limber.mechanics.linear.factor import elimination_order
 
 _SCRATCH = 9
-"""Numbers behind the values into which entries of constrained nodes go."""
+"""Length of the scratch space behind the values for entries of constrained nodes."""
 
 
 class Pattern:
-    """Lower triangle by columns of the free nodes' stiffness, three rows and columns a node.
+    """Lower triangle by columns of the free nodes' stiffness, three rows and columns per node.
 
     Args:
         tets: Node indices, shape [tet_count, n].
         node_count: Nodes of the mesh.
         free: Whether a node is free, shape [node_count].
-        cliques: Further groups of nodes that are coupled with each other (pinned patches).
+        cliques: Further groups of coupled nodes (pinned patches).
 
     Attributes:
-        order: Free nodes in elimination order; position: its inverse, -1 where constrained.
+        order: Free nodes in elimination order; position: its inverse, -1 if constrained.
         node_starts, node_rows: The same triangle on nodes, by columns.
-        diagonal: Where the diagonal is, shape [3 free nodes].
+        diagonal: Positions of the diagonal, shape [3 free nodes].
     """
 
     def __init__(self, tets: np.ndarray, node_count: int, free: np.ndarray,
@@ -53,11 +53,11 @@ class Pattern:
         return 3 * len(self.order)
 
     def scratch_values(self) -> np.ndarray:
-        """Return zeros for the values, with the scratch behind them."""
+        """Return zeros for the values, including the scratch space behind them."""
         return np.zeros(self.value_count + _SCRATCH)
 
     def slots(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return, for pairs of nodes, where their block starts and that column's length."""
+        """Return, for pairs of nodes, the start of their block and that column's length."""
         one, two = self.position[first], self.position[second]
         row, column = np.maximum(one, two), np.minimum(one, two)
         inside = column >= 0
@@ -69,7 +69,7 @@ class Pattern:
                 np.where(inside, self.length[safe], 4))
 
     def scalar_entries(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Return where entries xx, yy and zz of pairs of nodes are, shape [..., 3]."""
+        """Return the positions of entries xx, yy and zz of pairs of nodes, shape [..., 3]."""
         slot, length = self.slots(first, second)
         return np.stack([slot, slot + length, slot + 2 * length - 1], axis=-1)
 
@@ -90,18 +90,18 @@ class Pattern:
 
 
 class LaneLayout:
-    """Elements of a pattern in batches, the element the last axis, earlier eliminated nodes first.
+    """Elements of a pattern in batches; element as last axis, earlier eliminated nodes first.
 
     Attributes:
-        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES],
-        slots and lengths [batch, pairs, LANES]: what the stiffness kernel takes.
+        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES], slots
+        and lengths [batch, pairs, LANES]: the arguments of the stiffness kernel.
     """
 
     def __init__(self, pattern: Pattern, tets: np.ndarray, gradients: np.ndarray,
                  weights: np.ndarray):
         position = pattern.position[tets]
         turn = np.argsort(position, axis=1, kind="stable")
-        # Neighbours in the elimination are neighbours in memory.
+        # Neighbours in the elimination order are neighbours in memory.
         order = np.argsort(position.max(axis=1), kind="stable")
         padding = -len(order) % LANES
         self._order = np.concatenate([order, np.repeat(order[-1:], padding)])
@@ -120,7 +120,7 @@ class LaneLayout:
         self.lengths = lanes_last(lengths.astype(np.int32))
 
     def per_element(self, values: np.ndarray) -> np.ndarray:
-        """Return one number a tetrahedron in this layout, shape [batch, LANES]."""
+        """Return one number per tetrahedron in this layout, shape [batch, LANES]."""
         return values[self._order].reshape(-1, LANES)
 
     def per_point(self, values: np.ndarray) -> np.ndarray:

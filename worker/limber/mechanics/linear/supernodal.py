@@ -1,8 +1,8 @@
 """Supernodal Cholesky factor of a branch, by fronts.
 
-A branch is slender: its fronts are small, and a general library spends most of its time around
-them (CHOLMOD through cvxopt: a third on transposing the matrix, a quarter in BLAS). Here the
-matrix goes straight to its place, and all loops run over rows in whole vectors.
+The fronts of a slender branch are small, so a general library spends most of its time on overhead
+(CHOLMOD through cvxopt: a third on transposing the matrix, a quarter in BLAS). Here the values are
+scattered directly to their positions, and all loops run over rows in whole vectors.
 """
 
 import copy
@@ -15,11 +15,11 @@ from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.mechanics.linear.fronts import PAD, Fronts
 
 _COUNT = np.uint64
-"""Indices of the inner loops: numba looks whether a signed index counts from the end."""
+"""Type of the indices of inner loops: numba checks whether a signed index counts from the end."""
 
 
 class SupernodalFactor:
-    """Factor of a matrix whose pattern stays.
+    """Factor of a matrix with a fixed pattern.
 
     Args:
         fronts: From limber.mechanics.linear.fronts.
@@ -50,17 +50,17 @@ class SupernodalFactor:
             raise NotPositiveDefiniteError("a pivot is not positive")
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return the solution for right sides of shape [size] or [size, k].
+        """Return the solution for right-hand sides of shape [size] or [size, k].
 
-        Three are solved in the time of one: it goes into reading the factor; if they are 0 but in
-        few places, in four fifths of that.
+        Three are solved in the time of one, which is spent on reading the factor; if they are
+        mostly 0, in four fifths of that.
         """
         return self.up(self.down(right))
 
     def down(self, right: np.ndarray) -> np.ndarray:
-        """Return the first half of a solution: that with the factor alone, of the same shape.
+        """Return the first half of a solution (forward substitution), of the same shape.
 
-        Where right sides are 0 but in few places that takes next to no time.
+        If the right sides are mostly 0, this takes almost no time.
         """
         return self._halved(right, _down_one, _down_three)
 
@@ -115,7 +115,7 @@ def _factorise(values, value_start, targets, first, row_start, panel, places, ch
 
 @compiled
 def _extend(source, size, places, width, pivots, padded, columns, update):
-    """Add a child's update matrix into the front."""
+    """Add a child's update matrix to the front."""
     three, height = _COUNT(3), _COUNT(pivots + padded)
     nodes, count = _COUNT(width) // three, _COUNT(len(places))
     size, gap, padded = _COUNT(size), _COUNT(pivots) - three * nodes, _COUNT(padded)
@@ -131,7 +131,7 @@ def _extend(source, size, places, width, pivots, padded, columns, update):
                 _add_rows(source, at, places, kj, inner, columns, base)
                 _add_rows(source, at, places, inner, count, columns, base + gap)
             else:
-                # Rows of the update matrix are counted from its first.
+                # Rows of the update matrix are counted from its first row.
                 base = (three * (place - nodes) + jj) * padded - three * nodes
                 _add_rows(source, at, places, kj, count, update, base)
 
@@ -147,7 +147,7 @@ def _add_rows(source, at, places, begin, end, target, base):
 
 @compiled
 def _eliminate(columns, width, height, inverse):
-    """Factorise a front's columns, three at a time; return False at a pivot not positive."""
+    """Factorise a front's columns, three at a time; return False if a pivot is not positive."""
     for j in range(0, width, 3):
         begin = j // PAD * PAD
         runs = (height - begin) // PAD
@@ -186,12 +186,12 @@ def _eliminate(columns, width, height, inverse):
 
 @compiled
 def _subtract(columns, width, height, row, begin, runs, target, stride, at):
-    """Subtract from three columns of ``target`` what the first ``width`` ``columns`` give.
+    """Subtract the first ``width`` ``columns``' contribution from three columns of ``target``.
 
     Args:
         row: Row of ``columns`` that belongs to the first of the three.
-        begin: Row of ``columns`` that belongs to where the target begins; runs: rows / PAD.
-        stride, at: Height of the target and where its first number is.
+        begin: Row of ``columns`` that belongs to the start of the target; runs: rows / PAD.
+        stride, at: Height of the target and position of its first number.
     """
     h, r, z, n = _COUNT(height), _COUNT(row), _COUNT(begin), _COUNT(runs)
     t0 = _COUNT(at)
@@ -242,7 +242,7 @@ def _subtract_six(columns, a, height, row, begin, runs, target, t0, t1, t2):
 
 @compiled
 def _sizes(first, row_start, s):
-    """Of a front: its first unknown, its pivots, padded, its rows below, padded, and the height."""
+    """Return a front's first unknown, pivots, padded pivots, rows below, padded rows, height."""
     width, below = 3 * (first[s + 1] - first[s]), row_start[s + 1] - row_start[s]
     pivots = (width + PAD - 1) // PAD * PAD
     padded = (3 * below + PAD - 1) // PAD * PAD
@@ -291,7 +291,7 @@ def _down_one(first, row_start, rows, panel, factor, inverse, x):
 
 @compiled
 def _up_one(first, row_start, rows, panel, factor, inverse, x):
-    """Solve in place with its transpose: up again."""
+    """Solve in place with its transpose: up through the fronts."""
     t = _room(row_start)
     for s in range(len(first) - 2, -1, -1):
         start, width, pivots, below, padded, height = _sizes(first, row_start, s)
@@ -318,7 +318,7 @@ def _up_one(first, row_start, rows, panel, factor, inverse, x):
 
 @compiled
 def _down_three(first, row_start, rows, panel, factor, inverse, x, y, z):
-    """As ``_down_one``, of three right sides at once."""
+    """As ``_down_one``, for three right sides at once."""
     t, u, v = _room(row_start), _room(row_start), _room(row_start)
     for s in range(len(first) - 1):
         start, width, pivots, below, padded, height = _sizes(first, row_start, s)
@@ -355,7 +355,7 @@ def _down_three(first, row_start, rows, panel, factor, inverse, x, y, z):
 
 @compiled
 def _up_three(first, row_start, rows, panel, factor, inverse, x, y, z):
-    """As ``_up_one``, of three at once."""
+    """As ``_up_one``, for three at once."""
     t, u, v = _room(row_start), _room(row_start), _room(row_start)
     for s in range(len(first) - 2, -1, -1):
         start, width, pivots, below, padded, height = _sizes(first, row_start, s)
@@ -415,7 +415,7 @@ def _down(x, at, one, two, j, inverse):
 
 @compiled
 def _up(own, j, s0, s1, s2, one, two, inverse, start):
-    """The same on the way up."""
+    """Solve for a node's three unknowns on the way up, in place."""
     x2 = s2 * inverse[start + j + 2]
     x1 = (s1 - two[j + 2] * x2) * inverse[start + j + 1]
     x0 = (s0 - one[j + 1] * x1 - one[j + 2] * x2) * inverse[start + j]

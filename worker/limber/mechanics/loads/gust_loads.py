@@ -1,4 +1,4 @@
-"""A wind with gusts on a branch: their spectrum or a record, and the load at their peak."""
+"""A gusty wind on a branch: a spectrum or a record, and the load at the peak of the gusts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +14,19 @@ from limber.mechanics.loads.outdoor import LoadedOutdoors
 from limber.mechanics.materials.materials import RayleighDamping
 
 LEAST_RECORD = 16
-"""Rows that a record of the wind has at least."""
+"""Fewest rows of a wind record."""
 FASTEST = 150.0
-"""Winds [m/s] from which on a unit is wrong."""
+"""Winds [m/s] above this indicate a wrong unit."""
 _MOST_STEPS = 2e6
 
 
 @dataclass(frozen=True)
 class WindRecord:
-    """A wind as it was measured.
+    """A measured wind.
 
     Attributes:
         times: [s], ascending, shape [n].
-        speeds: Along its mean direction [m/s], shape [n].
+        speeds: Speeds along the mean direction [m/s], shape [n].
     """
 
     times: np.ndarray
@@ -37,17 +37,17 @@ class WindRecord:
         """Read a CSV file with ``time_s`` and ``speed_m_s``.
 
         Raises:
-            InputError: it cannot be read, is too short, or does not blow forward on average.
+            InputError: it cannot be read, is too short, or has no forward mean speed.
         """
         columns = read_columns(path, ("time_s", "speed_m_s"), "a wind record")
         return cls.checked(columns["time_s"], columns["speed_m_s"], str(path))
 
     @classmethod
     def checked(cls, times: np.ndarray, speeds: np.ndarray, what: str) -> "WindRecord":
-        """Make a record of numbers from outside; ``what`` they are, for errors.
+        """Make a record of external numbers; ``what`` names them in error messages.
 
         Raises:
-            InputError: as :meth:`read`.
+            InputError: as for :meth:`read`.
         """
         if len(times) != len(speeds) or len(times) < LEAST_RECORD or not (
                 np.diff(times) > 0).all() or not speeds.mean() > 0 or (
@@ -63,13 +63,13 @@ class WindRecord:
         return cls(times, speeds)
 
     def even_wind(self, direction: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the even wind [m/s] that pushes as hard as this one does on average.
+        """Return the steady wind [m/s] with the same mean pressure as this one.
 
         Args:
-            direction: Of the wind; its length counts no more.
+            direction: Direction of the wind; its length is ignored.
 
         Raises:
-            InputError: it pushes backwards.
+            InputError: the mean pressure is backwards.
         """
         push = float((self.speeds * np.abs(self.speeds)).mean())
         if not push > 0:
@@ -81,12 +81,12 @@ class WindRecord:
 
 @dataclass(frozen=True)
 class Turbulence:
-    """Gusts by their spectrum; see :func:`~limber.mechanics.loads.gust_response.turbulent`.
+    """Gusts given by their spectrum; see :func:`~limber.mechanics.loads.gust_response.turbulent`.
 
     Attributes:
         intensity: Standard deviation of the speed over its mean.
         length: Turbulent length scale [m].
-        seconds: For which the peak is expected.
+        seconds: Duration for which the peak is expected.
     """
 
     intensity: float
@@ -99,7 +99,7 @@ Gusts = WindRecord | Turbulence
 
 def blown(direction: tuple[float, float, float], gusts: Gusts | None,
           ) -> tuple[float, float, float]:
-    """Return the even wind [m/s] about which gusts swing: of a record its own.
+    """Return the steady wind [m/s] about which the gusts vary; a record has its own.
 
     Raises:
         InputError: gusts without a wind, or a record against it.
@@ -113,20 +113,20 @@ def blown(direction: tuple[float, float, float], gusts: Gusts | None,
 
 def with_peak(outdoors: LoadedOutdoors, gusts: Gusts, damping: RayleighDamping,
               ) -> tuple[LoadedOutdoors, dict[str, Any]]:
-    """Return the loads at the peak of gusts, by how the tip sways, and what is told of them.
+    """Return the loads at the peak of gusts, from the sway of the tip, and the reported values.
 
     Args:
-        outdoors: The branch under the even wind, see :func:`blown`.
-        gusts: Of that wind.
-        damping: Of the wood.
+        outdoors: The branch under the steady wind, see :func:`blown`.
+        gusts: Gusts of that wind.
+        damping: Damping of the wood.
 
     Returns:
         The loads, and ``factor`` (peak load over mean load), ``deviation``, ``peak_factor``,
-        ``crossing_hz``, ``dynamic`` (over a branch that follows at once), ``damping`` of the
-        first mode, ``first_frequency_hz``, ``mean_speed_m_s`` and ``mean_tip_displacement_m``.
+        ``crossing_hz``, ``dynamic`` (relative to a quasi-static branch), ``damping`` of the first
+        mode, ``first_frequency_hz``, ``mean_speed_m_s`` and ``mean_tip_displacement_m``.
 
     Raises:
-        WorkError: the branch finds no rest under the even wind.
+        WorkError: the branch finds no equilibrium under the steady wind.
     """
     mean, tip = required_rest(outdoors), tip_node(outdoors)
     sway = outdoors.sways(mean, tip, damping)

@@ -1,8 +1,8 @@
-"""Gusts: how far beyond its mean the wind's unevenness swings a branch.
+"""Gusts: how far turbulence moves a branch beyond its mean displacement.
 
 Turbulence is the same along the whole branch, which is shorter than a gust; across the wind it is
-left out. The branch answers by its lowest modes about where the mean wind holds it, and the rest
-of it at once, as if it were slow.
+left out. The branch responds with its lowest modes about its equilibrium in the mean wind; the rest
+of its response is quasi-static.
 
 Sources: A. G. Davenport, *Note on the distribution of the largest value of a random function with
 application to gust loading*, 1964; EN 1991-1-4:2005, annex B, for spectrum (B.1), peak factor
@@ -27,12 +27,13 @@ _POINTS = 6000
 
 @dataclass(frozen=True)
 class Swaying:
-    """How one displacement of a branch answers a force that grows and shrinks as a whole.
+    """The response of one displacement of a branch to a force that varies as a whole.
 
     Attributes:
-        frequencies: Of the modes [Hz], shape [k].
-        damping: Shares of critical damping, the air's included, shape [k].
-        shares: Of each mode in the static answer; what is left to 1 follows at once, shape [k].
+        frequencies: Frequencies of the modes [Hz], shape [k].
+        damping: Damping ratios, including aerodynamic damping, shape [k].
+        shares: Fraction of each mode in the static response; the remainder to 1 is quasi-static,
+        shape [k].
     """
 
     frequencies: np.ndarray
@@ -40,7 +41,7 @@ class Swaying:
     shares: np.ndarray
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the answer over the static one at frequencies [Hz], complex."""
+        """Return the response over the static one at frequencies [Hz], complex."""
         ratio = np.asarray(frequency, float)[:, None] / self.frequencies
         modes = self.shares / (1 - ratio**2 + 2j * self.damping * ratio)
         return 1 - self.shares.sum() + modes.sum(axis=1)
@@ -51,12 +52,12 @@ class GustResponse:
     """The effect of gusts on a mean load.
 
     Attributes:
-        factor: The load that, at rest, bends the branch as far as the peak of its swaying does,
-            over the mean load.
+        factor: The load that statically bends the branch as far as the peak of its sway, over the
+            mean load.
         deviation: Standard deviation of the displacement over its mean.
         peak_factor: Standard deviations from mean to peak.
-        crossing: How often the displacement crosses its mean upwards [Hz].
-        dynamic: Standard deviation over that of a branch that follows at once.
+        crossing: Rate at which the displacement crosses its mean upwards [Hz].
+        dynamic: Standard deviation over that of a quasi-static branch.
     """
 
     factor: float
@@ -68,15 +69,15 @@ class GustResponse:
 
 def swaying(model: BranchModel, displacement: np.ndarray, force: np.ndarray, tip: int,
             damping: RayleighDamping, air: np.ndarray | None = None) -> Swaying:
-    """Return how a node's displacement answers a force about an equilibrium.
+    """Return the response of a node's displacement to a force about an equilibrium.
 
     Args:
         model: The branch.
-        displacement: Of the equilibrium [m], shape [node_count, 3].
-        force: What grows and shrinks [N], shape [node_count, 3].
-        tip: The node; along the direction in which the force moves it.
-        damping: Of the wood.
-        air: Force of the air on a velocity [N s/m], shape [3 node_count, 3 node_count] or as a
+        displacement: Displacement of the equilibrium [m], shape [node_count, 3].
+        force: The varying force [N], shape [node_count, 3].
+        tip: The node; its displacement is taken in the direction in which the force moves it.
+        damping: Damping of the wood.
+        air: Aerodynamic force per velocity [N s/m], shape [3 node_count, 3 node_count] or as a
             product with it; None: none.
     """
     tangent = model.equations(()).tangent(model, displacement)
@@ -110,14 +111,14 @@ def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seco
     """Return the effect of turbulence with a spectrum on a branch.
 
     Args:
-        sway: Of the displacement that is asked for.
-        speed: Mean of the wind [m/s].
+        sway: Response of the displacement in question.
+        speed: Mean speed of the wind [m/s].
         intensity: Standard deviation of the speed over its mean.
         length: Turbulent length scale [m].
-        seconds: For which the peak is expected.
+        seconds: Duration for which the peak is expected.
     """
     at = _frequencies(sway, speed / length)
-    # What resonance adds; without it the branch follows all of the turbulence.
+    # The contribution of resonance; without it the branch follows all of the turbulence.
     added = np.abs(sway.transfer(at)) ** 2 - 1
     resonance = float(scipy.integrate.trapezoid(added * wind_spectrum(at, speed, length), at))
     power = max(1 + resonance, 0.0)
@@ -130,12 +131,12 @@ def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seco
 
 
 def recorded(sway: Swaying, times: np.ndarray, speeds: np.ndarray) -> GustResponse:
-    """Return what a recorded wind does to a branch; the load goes with the square of its speed.
+    """Return the effect of a recorded wind on a branch; the load goes with the square of its speed.
 
     Args:
-        sway: Of the displacement that is asked for.
+        sway: Response of the displacement in question.
         times: [s], ascending, shape [n].
-        speeds: Along the mean wind [m/s], shape [n].
+        speeds: Speeds along the mean wind [m/s], shape [n].
     """
     step = float(np.median(np.diff(times)))
     even = np.arange(times[0], times[-1] + step / 2, step)
@@ -153,7 +154,7 @@ def recorded(sway: Swaying, times: np.ndarray, speeds: np.ndarray) -> GustRespon
 
 
 def _frequencies(sway: Swaying, corner: float) -> np.ndarray:
-    """Frequencies [Hz] that are dense where the spectrum bends and where the branch resonates."""
+    """Frequencies [Hz], dense where the spectrum bends and where the branch resonates."""
     top = 20 * max(float(sway.frequencies[-1]), corner)
     wide = np.concatenate([[0.0], np.geomspace(1e-4 * min(corner, sway.frequencies[0]), top,
                                                _POINTS)])

@@ -1,5 +1,6 @@
-"""What loads outdoors do to a branch, with what is not known of its moduli: sag, strain over
-strength, frequencies, and how many times these loads it bears."""
+"""Effects of outdoor loads on a branch and their uncertainty from its moduli: sag, strain over
+strength, frequencies, and the factor on these loads that it bears.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,25 +15,25 @@ from limber.mechanics.statics.result import StaticResult
 _NORMAL_95 = 1.96
 _BISECTIONS = 7
 _STEP = 1.3
-"""Factor by which a softer or stiffer branch is looked for around where it is thought to end."""
+"""Factor around the estimated limit within which that of a softer or stiffer branch is sought."""
 _LEAST = 1e-3
-"""Share of the loads below which no limit is looked for more closely."""
+"""Fraction of the loads below which the limit is not refined."""
 _NOT_KNOWN = {"sag_interval_m": None, "greatest_strain_interval": None,
               "first_frequency_interval_hz": None, "bears_times_interval": None}
 
 
 def tip_node(outdoors: LoadedOutdoors) -> int:
-    """Return the mesh's node at the outermost place of the main path that is not cut off."""
+    """Return the mesh's node at the end of the main path that is not cut off."""
     skeleton, nodes = outdoors.skeleton, outdoors.prestress.mesh.nodes
     path = [node for node in skeleton.main_path() if not outdoors.gone[node]]
     return int(np.linalg.norm(nodes - skeleton.nodes[path[-1]], axis=1).argmin())
 
 
 def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
-    """Return where the branch comes to rest under all of its loads.
+    """Return the equilibrium of the branch under all of its loads.
 
     Raises:
-        WorkError: it finds none.
+        WorkError: no equilibrium was found.
     """
     found = outdoors.rest()
     if not found.converged:
@@ -46,27 +47,27 @@ def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
 def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: float | None,
                  most: float | None = None, progress: Progress = SILENT,
                  ) -> tuple[Bent, dict[str, Any]]:
-    """Return the branch at rest under its loads, and what is told of it.
+    """Return the branch in equilibrium under its loads, and the reported values.
 
-    Intervals (95 %) are those of a branch softer and stiffer throughout, which are the widest.
+    Intervals (95 %) are those of a branch that is softer or stiffer throughout, which are the
+    widest.
 
     Args:
         outdoors: The branch with its loads.
-        strain_limit: Strain at which the wood is taken to fail.
-        deviation: Standard deviation of log E, taken as one for all moduli; None leaves
-            intervals out.
-        most: Also find how many times these loads the branch bears, up to so many.
-        progress: Told how far it is.
+        strain_limit: Strain at which the wood is assumed to fail.
+        deviation: Standard deviation of log E, assumed equal for all moduli; None: no intervals.
+        most: Also find the factor on these loads that the branch bears, up to this factor.
+        progress: Receives the progress.
 
     Returns:
         The state, and ``tip_displacement_m`` [3], ``sag_m`` (of the tip, along gravity),
-        ``greatest_strain``, ``strain_over_limit``, ``along``, ``frequencies_hz``,
-        ``wind_force_n``, ``added_mass_kg``, ``cut_mass_kg``, ``young_deviation``; with ``most``
-        ``bears_times`` and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``); and for sag,
-        greatest strain, first frequency and times borne their intervals or None.
+        ``greatest_strain``, ``strain_over_limit``, ``along``, ``frequencies_hz``, ``wind_force_n``,
+        ``added_mass_kg``, ``cut_mass_kg``, ``young_deviation``; with ``most`` also ``bears_times``
+        and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``); and the intervals, or None,
+        for sag, greatest strain, first frequency and the factor borne.
 
     Raises:
-        WorkError: it finds no rest under them.
+        WorkError: no equilibrium was found under the loads.
     """
     gravity = outdoors.prestress.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
@@ -103,7 +104,7 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
 
 def _limits(outdoors: LoadedOutdoors, others: dict[float, LoadedOutdoors], strain_limit: float,
             most: float, progress: Progress) -> dict[str, Any]:
-    """How many times the loads the branch bears, and a softer and a stiffer one would."""
+    """The factor on the loads that the branch bears, and that of a softer and a stiffer one."""
     def trouble_of(loaded: LoadedOutdoors) -> Callable[[float], str]:
         def trouble(share: float) -> str:
             progress(0.5, "limit load")
@@ -115,7 +116,7 @@ def _limits(outdoors: LoadedOutdoors, others: dict[float, LoadedOutdoors], strai
     times, why = _limit(trouble_of(outdoors), 1.0, 2.0, most)
     result: dict[str, Any] = {"bears_times": times, "held_by": why or "nothing"}
     if others:
-        # Under the same share strain goes about with 1/E.
+        # At the same fraction of the loads, strain is about proportional to 1/E.
         result["bears_times_interval"] = sorted(
             _limit(trouble_of(other), min(times * factor, most), _STEP, most)[0]
             for factor, other in others.items())
@@ -124,8 +125,9 @@ def _limits(outdoors: LoadedOutdoors, others: dict[float, LoadedOutdoors], strai
 
 def _limit(trouble: Callable[[float], str], guess: float, step: float, most: float,
            ) -> tuple[float, str]:
-    """Bisect the share of the loads from which on there is trouble, and say which; up to ``most``
-    there may be none."""
+    """Bisect the fraction of the loads at which failure begins, and return its kind; below ``most``
+    there may be none.
+    """
     low = high = guess
     why = trouble(guess)
     if why:

@@ -1,14 +1,14 @@
-"""The loaded branch: the one state of a branch that everything computes on.
+"""The loaded branch: the one state of a branch on which all computations are based.
 
-It hangs as it was scanned, under its own weight and what hangs on it, with named targets (a flower,
-a fruit) that are followed wherever it is moved. ::
+It hangs as scanned, under its own weight and added masses, with named targets (a flower, a fruit)
+that are followed wherever it moves. ::
 
     branch = hang(model, targets)
     state = branch.equilibrium(grasp, pose)
     state.energy, state.reaction_force, branch.target_positions(state.displacement)
 
-Energies are potentials of strain and weight above the hanging state, which has energy 0: what a
-gripper has to do, slowly, to bring the branch there. Its gradient to the pose is the force that
+Energies are potentials of strain and weight above the hanging state, which has energy 0. They are
+the work of a gripper that moves the branch there slowly. The gradient to the pose is the force that
 the gripper exerts; that of the strain energy alone is not, since the gripper also lifts. How
 weight acts: :mod:`limber.mechanics.prestress`.
 """
@@ -33,12 +33,12 @@ from limber.mechanics.statics.solve import solve_static
 
 @dataclass(frozen=True)
 class NamedTarget:
-    """A place on the branch that matters: a flower, a fruit, a leaf.
+    """A point of interest on the branch: a flower, a fruit, a leaf.
 
     Attributes:
-        name: What it is called.
-        position: On the hanging branch [m].
-        mass: What it weighs beside the scanned branch [kg]; it hung there when it was scanned.
+        name: Name of the target.
+        position: Position on the hanging branch [m].
+        mass: Mass in addition to the scanned branch [kg]; it hung there when it was scanned.
     """
 
     name: str
@@ -53,12 +53,12 @@ def target_masses(targets: tuple[NamedTarget, ...]) -> tuple[PointMass, ...]:
 
 @dataclass(frozen=True)
 class LoadedBranch:
-    """A branch as it hangs; see the module.
+    """A branch as it hangs; see the module's docstring.
 
     Attributes:
-        model: Of the scan, which its weight has bent already; weightless where it was asked for.
-        targets: Named places on it.
-        grasp_point: The place of the grasp that the mesh marks [m]; None: the patch's own centre.
+        model: Model of the scan, which includes the bending by its weight; weightless if requested.
+        targets: Named points on it.
+        grasp_point: Position of the grasp that the mesh marks [m]; None: the patch's centre.
     """
 
     model: BranchModel
@@ -71,7 +71,7 @@ class LoadedBranch:
         return self.model.mesh
 
     def with_young(self, young: float | np.ndarray) -> "LoadedBranch":
-        """Return it with other moduli [Pa]; it hangs as it does."""
+        """Return it with other moduli [Pa]; the hanging shape is unchanged."""
         return replace(self, model=self.model.with_young(young))
 
     def marked_grasp(self, mode: Literal["clamped", "pinned"]) -> Grasp:
@@ -86,15 +86,17 @@ class LoadedBranch:
                     start: StaticResult | np.ndarray | None = None) -> StaticResult:
         """Return the state with the grasp at a pose [m, rad]; without one the hanging state.
 
-        Energy and force are the module's; it never raises for want of convergence.
+        Energy and force are those of the module's docstring. It does not raise if it does not
+        converge.
         """
         return solve_static(self.model, grasp=grasp, pose=pose, start=start)
 
     def target_positions(self, displacement: np.ndarray) -> np.ndarray:
-        """Return where the targets are [m], shape [targets, 3].
+        """Return the positions of the targets [m], shape [targets, 3].
 
         Args:
-            displacement: Of all nodes from the hanging state [m], shape [node_count, 3].
+            displacement: Displacement of all nodes from the hanging state [m], shape [node_count,
+            3].
         """
         if not self.targets:
             return np.zeros((0, 3))
@@ -110,12 +112,12 @@ def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
          progress: Progress = SILENT) -> LoadedBranch:
     """Return a model's branch as it hangs in its mesh's shape.
 
-    Where that shape would fall or roll over, since the branch is too soft to carry itself, its
-    weight is left out, everywhere alike, and a warning says so.
+    If the branch is too soft to be stable in that shape, all of its weight is left out, and a
+    warning is given.
 
     Args:
-        model: Its gravity is that of the scan; zero for a branch without weight. What targets
-            weigh is among its masses already.
+        model: Its gravity is that of the scan; zero for a branch without weight. Its masses include
+            those of the targets.
     """
     if not model.gravity.any():
         return LoadedBranch(model, targets)
@@ -129,7 +131,7 @@ def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
 
 
 def is_stable(model: BranchModel) -> bool:
-    """Whether a branch that hangs in its mesh's shape stays there by itself."""
+    """Whether a branch that hangs in its mesh's shape is stable there."""
     try:
         tangent = model.equations().tangent(model, np.zeros_like(model.mesh.nodes))
     except NotPositiveDefiniteError:

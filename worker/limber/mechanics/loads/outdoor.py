@@ -23,10 +23,10 @@ from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.strain import carried_strain
 
 AIR_DENSITY = 1.225
-"""At sea level and 15 degrees [kg/m^3]."""
+"""Air density at sea level and 15 degrees [kg/m^3]."""
 _MODES = 3
 _REMAINS = 1e-3
-"""Share of its density that cut-off wood keeps: none of its own would have no modes."""
+"""Fraction of its density that cut-off wood keeps: without mass it would have no modes."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Outdoors:
     """Loads on a branch in addition to its weight as scanned.
 
     Attributes:
-        wind: Velocity of the air, even along the branch [m/s], shape [3].
-        drag: Coefficient of a cylinder across the wind.
-        snow: Mass on the shadow of the branch, as seen from above [kg/m^2].
-        fruit: Places [m] and masses [kg].
-        cuts: Places on the branch [m]; what lies beyond them is cut off.
+        wind: Velocity of the air, uniform along the branch [m/s], shape [3].
+        drag: Drag coefficient of a cylinder across the wind.
+        snow: Mass per area of the branch projected on the ground [kg/m^2].
+        fruit: Positions [m] and masses [kg].
+        cuts: Positions on the branch [m]; the part beyond them is cut off.
     """
 
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -50,12 +50,12 @@ class Outdoors:
 
 @dataclass(frozen=True)
 class Bent:
-    """A branch at rest under a load.
+    """A branch in equilibrium under a load.
 
     Attributes:
         displacement: From the hanging state [m], shape [node_count, 3].
-        strains: Largest principal strain of each tetrahedron, that of its weight included, [t].
-        frequencies: The lowest, about this state [Hz], shape [3].
+        strains: Largest principal strain of each tetrahedron, including that of its weight, [t].
+        frequencies: Lowest frequencies about this state [Hz], shape [3].
     """
 
     displacement: np.ndarray
@@ -64,18 +64,18 @@ class Bent:
 
 
 class LoadedOutdoors:
-    """A branch with its loads; each is taken up by a share of all of them."""
+    """A branch with its loads; each is scaled by one fraction."""
 
     def __init__(self, model: BranchModel, skeleton: Skeleton, loads: Outdoors):
-        """Work out forces and masses.
+        """Compute forces and masses.
 
         Args:
             model: The branch as it hangs.
             skeleton: Its axes.
-            loads: What acts.
+            loads: The loads.
 
         Raises:
-            InputError: a cut leaves nothing, or lies at the base.
+            InputError: a cut leaves nothing, or is at the base.
         """
         self.skeleton = skeleton
         self.gone = _beyond(skeleton, loads.cuts)
@@ -95,7 +95,8 @@ class LoadedOutdoors:
         self._forces = self._wind.copy()
         self.wind_force = self._wind.sum(axis=0)
         self._model = self._cut(model)
-        # The scan's shape carries the weight of what is cut off: without it, it springs up.
+        # The scanned shape carries the weight of the cut-off part: without it, the branch springs
+        # up.
         lost = model.mass_load - self._model.mass_load
         if model.prestress is not None:
             self._forces -= lost[:, None] * model.gravity
@@ -108,12 +109,12 @@ class LoadedOutdoors:
 
     @property
     def wind(self) -> tuple[float, float, float]:
-        """Velocity of the even wind [m/s]."""
+        """Velocity of the steady wind [m/s]."""
         return self._loads.wind
 
     @property
     def dead_forces(self) -> np.ndarray:
-        """All of it as forces on the nodes that keep their direction [N], shape [node_count, 3]."""
+        """All loads as forces on the nodes with constant direction [N], shape [node_count, 3]."""
         added = self._model_under(1.0).mass_load - self._model.mass_load
         return self._forces + added[:, None] * self._plain.gravity
 
@@ -125,7 +126,7 @@ class LoadedOutdoors:
         return other
 
     def with_gusts(self, factor: float) -> "LoadedOutdoors":
-        """Return the same loads with a wind that pushes ``factor`` times as hard."""
+        """Return the same loads with a wind of ``factor`` times the pressure."""
         other = copy.copy(self)
         other._forces = self._forces + (factor - 1) * self._wind
         other._wind = factor * self._wind
@@ -133,25 +134,25 @@ class LoadedOutdoors:
         return other
 
     def sways(self, result: StaticResult, tip: int, damping: RayleighDamping) -> Swaying:
-        """Return how node ``tip`` answers when the wind grows and shrinks about a state."""
+        """Return the response of node ``tip`` to a varying wind about a state."""
         middle, ways, radius = self._cylinders
         at = point_operator(self._plain.mesh, middle)
         air = at.T @ _air_damping(ways, radius, np.array(self._loads.wind), self._loads.drag) @ at
         return swaying(self._model_under(1.0), result.displacement, self._wind, tip, damping, air)
 
     def rest(self, share: float = 1.0) -> StaticResult:
-        """Return where it comes to rest under ``share`` of all loads."""
+        """Return the equilibrium under the fraction ``share`` of all loads."""
         return solve_static(self._model_under(share), nodal_forces=share * self._forces)
 
     def bent(self, result: StaticResult, share: float = 1.0) -> Bent:
-        """Return what a state does to the wood, and how it swings about it."""
+        """Return the strains of the wood in a state, and its frequencies."""
         model = self._model_under(share)
         strains = model.largest_principal_strains(result.displacement, carried_strain(self._plain))
         modes = lowest_modes(model, _MODES, result.displacement)
         return Bent(result.displacement, np.where(self.is_gone, 0.0, strains), modes.frequencies)
 
     def greatest_strain(self, result: StaticResult) -> float:
-        """Return the largest principal strain of what is left of the branch."""
+        """Return the largest principal strain of the part that is not cut off."""
         strains = self._plain.largest_principal_strains(result.displacement,
                                                         carried_strain(self._plain))
         return float(strains[~self.is_gone].max())
@@ -188,13 +189,13 @@ class LoadedOutdoors:
 
 def wind_forces(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
                 ) -> np.ndarray:
-    """Return the drag on cylinders [N], shape [n, 3]: by the flow across each, as in Morison's.
+    """Return the drag on cylinders [N], shape [n, 3], from the flow across each (Morison).
 
     Args:
-        ways: From start to end [m], shape [n, 3].
+        ways: Vectors from start to end [m], shape [n, 3].
         radius: [m], shape [n].
         wind: [m/s], shape [3].
-        drag: Coefficient of a cylinder across the flow.
+        drag: Drag coefficient of a cylinder across the flow.
     """
     length = np.linalg.norm(ways, axis=1)
     tangent = ways / np.maximum(length, 1e-300)[:, None]
@@ -205,7 +206,7 @@ def wind_forces(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: fl
 
 def _air_damping(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
                  ) -> sp.spmatrix:
-    """Return by how much the drag on cylinders changes with the wind [N s/m], block diagonal."""
+    """Return the derivative of the drag on cylinders to the wind [N s/m], block diagonal."""
     length = np.linalg.norm(ways, axis=1)
     tangent = ways / np.maximum(length, 1e-300)[:, None]
     across = wind - (tangent @ wind)[:, None] * tangent

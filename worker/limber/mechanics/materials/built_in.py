@@ -15,7 +15,7 @@ from limber.mechanics.materials.law import (
 
 
 class StVenantKirchhoff(MaterialLaw):
-    """The paper's, eq. (5): quadratic in the Green-Lagrange strain."""
+    """The paper's law, eq. (5): quadratic in the Green-Lagrange strain."""
 
     name = "st_venant_kirchhoff"
     is_compiled = is_hookean = has_cubic_force = True
@@ -50,7 +50,7 @@ class Linear(StVenantKirchhoff):
 
 
 class StableNeoHookean(MaterialLaw):
-    """Smith, de Goes and Kim (2018) without the logarithmic barrier; withstands strong compression.
+    """Smith, de Goes and Kim (2018) without the logarithmic barrier; stable in strong compression.
 
     Its energy is mu/2 (I_C - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2.
     """

@@ -10,7 +10,7 @@ A law is a subclass of :class:`MaterialLaw` with a name and an energy density:
 ...         squares = (strain**2 @ [1.0, 1, 1, 2, 2, 2])
 ...         return 0.5 * lame_lambda * (trace**2 + trace**3) + lame_mu * squares
 
-:func:`~limber.mechanics.materials.material_registry.register_material` makes it known by its name.
+:func:`~limber.mechanics.materials.material_registry.register_material` registers it by its name.
 Tensors are written in one row, 00 11 22 01 02 12.
 """
 
@@ -21,17 +21,18 @@ import numpy as np
 from limber.core.errors import InputError
 
 GREEN_STRAIN, NEO_HOOKE, SMALL_STRAIN = 0, 1, 2
-"""What the compiled kernels tell apart: Hooke's stress of the Green-Lagrange strain, the stable
-neo-Hookean stress, Hooke's stress of the small strain."""
+"""Laws that the compiled kernels distinguish: Hooke's stress of the Green-Lagrange strain, the
+stable neo-Hookean stress, Hooke's stress of the small strain.
+"""
 
 UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 MULTIPLICITY = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-"""How often a number of the row stands in the tensor; a shear angle is twice its strain."""
+"""Multiplicity of each number of the row in the tensor; a shear angle is twice its strain."""
 _ONE_EACH = np.diag(1 / MULTIPLICITY)
-"""Strains that change by one each, or by one shear angle."""
+"""Strains in which one component, or one shear angle, is 1."""
 _IMAGINARY = 1e-30
 _STEP = 1e-6
-"""Of central differences: its square is as far below 1 as a difference's round-off."""
+"""Step of central differences: its square is as far below 1 as the round-off of a difference."""
 _TRIED = 0.02
 """Size of the strains at which a new law is checked."""
 
@@ -39,21 +40,21 @@ _TRIED = 0.02
 class MaterialLaw:
     """A hyperelastic law of the Green-Lagrange strain.
 
-    The energy must be linear in both Lamé coefficients together, so that all stiffness grows with
-    Young's modulus: estimates and sensitivities rest on that. A law's own constants are therefore
-    numbers without a unit. Arrays: ``strain`` has shape [..., 6]; ``lame_lambda`` and ``lame_mu``
-    [Pa] broadcast to [...].
+    The energy must be linear in both Lamé coefficients together, so that all stiffness is
+    proportional to Young's modulus: estimates and sensitivities depend on that. A law's own
+    constants are therefore dimensionless. Arrays: ``strain`` has shape [..., 6]; ``lame_lambda``
+    and ``lame_mu`` [Pa] broadcast to [...].
 
     Attributes:
-        name: How settings and commands call it.
-        is_linear: Small strains: a carried weight has no effect, nothing snaps.
+        name: Name in settings and commands.
+        is_linear: Small strains: a carried weight has no effect, and there are no snaps.
         is_hookean: The stress is lambda tr(E) 1 + 2 mu E of the law's strain.
-        has_cubic_force: The force is a cubic polynomial of the displacement; mixed-point Newton
-            and the reduced model rest on that.
+        has_cubic_force: The force is a cubic polynomial of the displacement; mixed-point Newton and
+            the reduced model depend on that.
         is_compiled: The kernels compute it themselves. All others are computed by the methods
             here, and Hooke's kernel takes their stress.
-        kernel: What the kernels compute: for a law that is not compiled, what takes its stress.
-        softening: What to tell a user who has compressed it too far; empty: nothing.
+        kernel: Law that the kernels compute; if not compiled, the one that takes its stress.
+        softening: Message to a user who has compressed it too far; empty: none.
     """
 
     name: str
@@ -68,9 +69,9 @@ class MaterialLaw:
                lame_mu: np.ndarray) -> np.ndarray:
         """Return the energy density [J/m^3], shape [...].
 
-        Where :meth:`stress` is not given too, it is differentiated by a complex step: the formula
-        must take complex strain and be analytic (no ``abs``, no comparison). A law that gives its
-        stress, too, is several times as fast.
+        If :meth:`stress` is not overridden, the energy is differentiated by a complex step: the
+        formula must accept complex strain and be analytic (no ``abs``, no comparison). A law that
+        also defines its stress is several times as fast.
         """
         raise NotImplementedError
 
@@ -83,9 +84,9 @@ class MaterialLaw:
 
     def stress_change(self, strain: np.ndarray, change: np.ndarray, lame_lambda: np.ndarray,
                       lame_mu: np.ndarray) -> np.ndarray:
-        """Return the stress' derivative as the strain changes by ``change``, shapes [..., 6].
+        """Return the derivative of the stress along ``change`` of the strain, shapes [..., 6].
 
-        By default a difference of the stress, to about ten digits.
+        Default: a difference of the stress, to about ten digits.
         """
         size = np.abs(change).max(axis=-1, keepdims=True)
         step = _STEP * change / np.where(size > 0, size, 1.0)
@@ -94,9 +95,9 @@ class MaterialLaw:
 
     def moduli(self, strain: np.ndarray, lame_lambda: np.ndarray,
                lame_mu: np.ndarray) -> np.ndarray:
-        """Return the stress' derivative to 00 11 22 and the shear angles 01 02 12 [Pa].
+        """Return the derivative of the stress to 00 11 22 and the shear angles 01 02 12 [Pa].
 
-        Shape [..., 6, 6]. By default those of :meth:`stress_change`.
+        Shape [..., 6, 6]. Default: from :meth:`stress_change`.
         """
         changes = np.stack([self.stress_change(strain, step, lame_lambda, lame_mu)
                             for step in _ONE_EACH], axis=-1)
@@ -109,21 +110,21 @@ class MaterialLaw:
         green = 0.5 * (turned @ gradient - np.eye(3))
         row = self.stress(green[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
                           lame_lambda, lame_mu)
-        # The order in memory decides how products are summed, hence the last digits.
+        # The memory order determines the summation order of products, hence the last digits.
         stress = np.ascontiguousarray(row[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]])
         return gradient @ stress @ turned / np.linalg.det(gradient)[..., None, None]
 
 
 def hooke_stress(strain: np.ndarray, lame_lambda: np.ndarray,
                  lame_mu: np.ndarray) -> np.ndarray:
-    """Return Hooke's stress lambda tr(E) 1 + 2 mu E [Pa]; arguments as a law's."""
+    """Return Hooke's stress lambda tr(E) 1 + 2 mu E [Pa]; arguments as for a law."""
     trace = strain[..., :3].sum(axis=-1, keepdims=True)
     return lame_lambda[..., None] * trace * UNIT + 2 * lame_mu[..., None] * strain
 
 
 def hooke_strain(stress: np.ndarray, lame_lambda: np.ndarray,
                  lame_mu: np.ndarray) -> np.ndarray:
-    """Return the strain whose Hooke's stress [Pa] this is; arguments as a law's."""
+    """Return the strain for which this is Hooke's stress [Pa]; arguments as for a law."""
     trace = stress[..., :3].sum(axis=-1, keepdims=True)
     spread = (lame_lambda / (3 * lame_lambda + 2 * lame_mu))[..., None] * trace
     return (stress - spread * UNIT) / (2 * lame_mu[..., None])
@@ -153,7 +154,7 @@ def determinant(c: np.ndarray) -> np.ndarray:
 
 
 def is_hookean_at_rest(law: MaterialLaw) -> bool:
-    """Whether the law's moduli without strain are those of Young's modulus and Poisson's ratio."""
+    """Whether the law's moduli at zero strain are those of Young's modulus and Poisson's ratio."""
     lam, mu = np.array(1.5), np.array(1.0)
     hooke = np.stack([hooke_stress(step, lam, mu) for step in _ONE_EACH], axis=-1)
     return bool(np.abs(law.moduli(np.zeros(6), lam, mu) - hooke).max() < 1e-6)
@@ -168,11 +169,11 @@ def law_digest(law: MaterialLaw) -> str:
 
 
 def check_law(law: MaterialLaw) -> None:
-    """Try a law from outside at a few strains.
+    """Check an external law at a few strains.
 
     Raises:
-        InputError: it is stressed at rest, its derivatives are not those of its energy, it is
-            not linear in the Lamé coefficients, or it is unstable at rest.
+        InputError: it has stress at rest, its derivatives are not those of its energy, it is not
+            linear in the Lamé coefficients, or it is unstable at rest.
     """
     strain, lam, mu = _tried()
     other = lam[::-1]
@@ -206,7 +207,7 @@ def check_law(law: MaterialLaw) -> None:
 
 
 def _tried() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Strains [8, 6] and Lamé coefficients [8] at which laws from outside are looked at."""
+    """Strains [8, 6] and Lamé coefficients [8] at which external laws are checked."""
     rng = np.random.default_rng(0)
     lam, mu = rng.uniform(1.0, 3.0, (2, 8))
     return _TRIED * rng.standard_normal((8, 6)), lam, mu

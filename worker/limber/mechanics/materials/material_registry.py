@@ -1,9 +1,9 @@
-"""Material laws by their names: those built in, and those from outside.
+"""Material laws by name: built-in and external.
 
-A law from outside is known to a program that calls :func:`register_material`. An installed package
-makes its laws known to every command by the entry point group ``limber.materials``: a name, and
-where an object or class of :class:`~limber.mechanics.materials.law.MaterialLaw` stands. Nothing
-here is heavy before a law is asked for.
+An external law is known to a program that calls :func:`register_material`. An installed package
+registers its laws for every command by the entry point group ``limber.materials``: a name, and the
+location of an object or class of :class:`~limber.mechanics.materials.law.MaterialLaw`. Heavy
+imports are delayed until a law is requested.
 """
 
 import re
@@ -21,11 +21,11 @@ _registered: dict[str, "MaterialLaw"] = {}
 
 
 def register_material(law: "MaterialLaw") -> "MaterialLaw":
-    """Register a law under its name, in place of an earlier one from outside; return it.
+    """Register a law under its name, replacing an earlier external one; return it.
 
     Raises:
-        InputError: the name cannot be an option's value or is a built-in law's, the law says of
-            itself what only a built-in one is, or its methods do not fit together (see
+        InputError: the name cannot be an option's value or is a built-in law's, the law claims a
+            property reserved for built-in laws, or its methods are inconsistent (see
             :func:`limber.mechanics.materials.law.check_law`).
     """
     from limber.mechanics.materials.law import check_law
@@ -50,10 +50,10 @@ def material_names() -> tuple[str, ...]:
 
 
 def material_named(name: "str | MaterialLaw") -> "MaterialLaw":
-    """Return the law of that name; a law is returned as it is.
+    """Return the law of that name; a law is returned unchanged.
 
     Raises:
-        InputError: there is none of that name, or a package's cannot be used.
+        InputError: there is no law of that name, or a package's law cannot be used.
     """
     if not isinstance(name, str):
         return name

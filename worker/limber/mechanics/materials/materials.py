@@ -1,4 +1,4 @@
-"""Lamé coefficients, what is allowed of a material's numbers, damping."""
+"""Lamé coefficients, valid ranges of material values, damping."""
 
 from dataclasses import dataclass
 from typing import overload
@@ -8,15 +8,15 @@ import numpy as np
 from limber.core.errors import InputError
 
 MAX_POISSON = 0.495
-"""Above this the tetrahedra lock; at 0.5 the Lamé coefficients are infinite."""
+"""Above this, the tetrahedra lock; at 0.5, the Lamé coefficients are infinite."""
 
 
 @dataclass(frozen=True)
 class RayleighDamping:
     """Damping: ``mass`` [1/s] times the mass matrix, ``stiffness`` [s] times the stiffness.
 
-    The stiffness part acts on the rate of the Green-Lagrange strain (Kelvin-Voigt), so that a
-    turning branch is not braked; at small strain it is the usual Rayleigh term.
+    The stiffness part acts on the rate of the Green-Lagrange strain (Kelvin-Voigt), so that it does
+    not damp a rotating branch; at small strain it is the usual Rayleigh term.
     """
 
     mass: float = 0.5
@@ -50,7 +50,7 @@ def per_tet(name: str, value: float | np.ndarray, tet_count: int) -> np.ndarray:
     """Return ``value`` for each tetrahedron, shape [tet_count].
 
     Raises:
-        InputError: neither a number nor one number a tetrahedron, or not finite.
+        InputError: neither one number nor one per tetrahedron, or not finite.
     """
     array = np.asarray(value, float)
     if array.ndim > 1 or (array.ndim == 1 and len(array) != tet_count):

@@ -1,4 +1,4 @@
-"""Species presets: stiffness, strength, density and allowed strain of green wood.
+"""Species presets: stiffness, strength, density and allowable strain of green wood.
 
 Wood Handbook, FPL-GTR-190 (Forest Products Laboratory, 2010): clear, straight-grained green stem
 wood in bending. Branches are often softer.
@@ -12,12 +12,12 @@ SOURCE = ("Wood Handbook 2010, tables 5-3a and 4-1: green stem wood. Branches ar
           "so estimate Young's modulus")
 
 STRENGTH_OVER_YOUNG = 0.006
-"""Modulus of rupture over Young's modulus of green wood where no strength is known. Table 5-3 has
-0.0049 (Douglas fir) to 0.0067 (white ash), 0.006 in the middle."""
+"""Modulus of rupture over Young's modulus of green wood if no strength is known. Table 5-3 has
+0.0049 (Douglas fir) to 0.0067 (white ash), 0.006 in the middle.
+"""
 
 SAFETY = 2.0
-"""How many times the strain that is allowed a species is said to bear: a branch has knots, forks
-and younger wood."""
+"""Rupture strain over allowable strain of a species: a branch has knots, forks and younger wood."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,14 @@ class Species:
 
     Attributes:
         title: Its name in the handbook.
-        young, strength: Young's modulus and modulus of rupture [Pa], table 5-3a; of cherry and red
+        young, strength: Young's modulus and modulus of rupture [Pa], table 5-3a; for cherry and red
             maple table 5-3b, converted from psi.
-        density: Of green wood [kg/m^3]: specific gravity of table 5-3a and moisture of table 4-1,
-            heartwood and sapwood in equal parts; None where the latter has none.
+        density: Density of green wood [kg/m^3], from the specific gravity of table 5-3a and the
+            moisture of table 4-1, heartwood and sapwood in equal parts; None if the latter has
+            none.
         rupture_strain: Modulus of rupture over Young's modulus in table 5-3b, which has more
-            digits; None where no limit is offered. It would be the strain at rupture if wood
-            stayed linear; it yields before and bears more, so that the ratio is on the safe side.
+            digits; None if no limit is offered. It would be the strain at rupture if wood stayed
+            linear. Wood yields earlier and bears more strain, so the ratio is on the safe side.
     """
 
     title: str
@@ -56,10 +57,10 @@ SPECIES = {
 
 
 def strain_limit(name: str) -> float:
-    """Return the largest principal strain that a branch of a species is allowed.
+    """Return the largest allowable principal strain for a branch of a species.
 
     Raises:
-        KeyError: nothing is known of such a species.
+        KeyError: no limit is known for this species.
     """
     strain = SPECIES[name].rupture_strain
     if strain is None:

@@ -1,4 +1,4 @@
-"""Young's modulus from a few control points to all tetrahedra."""
+"""Interpolation of Young's modulus from a few control points to all tetrahedra."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from limber.geometry.tets.tet_mesh import TetMesh
 def young_weights(mesh: TetMesh, control_points: np.ndarray, power: float = 2) -> np.ndarray:
     """Return W so that Young's modulus of the tetrahedra is ``W @ young_at_control_points``.
 
-    Inverse-distance weighting (Shepard) from control points to centroids, the paper's mapping;
-    linear in Young's modulus, rows sum to 1.
+    Inverse-distance weighting (Shepard) from control points to centroids, as in the paper. It is
+    linear in Young's modulus; rows sum to 1.
 
     Args:
         control_points: Positions [m], shape [K, 3].
@@ -27,7 +27,8 @@ def young_weights(mesh: TetMesh, control_points: np.ndarray, power: float = 2) -
         raise InputError(f"The control points have shape {points.shape}.",
                          "At least one finite position is needed.", "Give an array [K, 3].")
     distance = np.linalg.norm(mesh.centroids[:, None] - points[None], axis=2)
-    # Relative to the nearest, so that no power overflows; a centroid on a point takes it alone.
+    # Relative to the nearest, so that no power overflows; a centroid on a control point has that
+    # point's weight 1.
     nearest = np.maximum(distance.min(axis=1, keepdims=True), np.finfo(float).tiny)
     weights = (nearest / np.maximum(distance, nearest)) ** power
     return weights / weights.sum(axis=1, keepdims=True)

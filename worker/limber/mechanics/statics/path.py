@@ -1,4 +1,4 @@
-"""The path from an equilibrium to the wanted one, in steps of adapted length."""
+"""The path from an equilibrium to the target, in steps of adapted length."""
 
 import time
 
@@ -21,19 +21,21 @@ from limber.mechanics.statics.static_problem import (
 from limber.mechanics.strain import principal_stretch
 
 _SOFT_DET_F = 0.75
-"""Volume under which St. Venant-Kirchhoff is named as what gave way. Pressed without going aside
-it bears most at a stretch of 1 / sqrt(3) = 0.58; a branch goes aside before: chosen, not measured.
+"""Relative volume below which St. Venant-Kirchhoff itself is taken to have collapsed. In pure
+compression it carries most at a stretch of 1 / sqrt(3) = 0.58; a branch buckles before. Chosen, not
+measured.
 """
 _LOST = 0.25
-"""Part of the potential's change in a step that its work may leave open before the step is taken
-for a jump, where tangents in it were not positive definite. Of 250 such steps of far pulls of a
-forked branch, 1 % are above; a bow that turns over loses 0.74.
+"""Largest fraction of the change of the potential in a step that the work may not account for. A
+step above it counts as a jump if its tangents were not positive definite. Of 250 such steps of far
+pulls of a forked branch, 1 % are above; a bow that turns over loses 0.74.
 """
 _SNAP = 1 / 64
-"""Part of the way taken when the branch has to snap: chosen, not measured."""
+"""Fraction of the path of a step in which the branch snaps. Chosen, not measured."""
 _FALLS = 0.3
-"""Part of the imbalance that a step with a factor of before may leave. A factor of its own costs
-six times as much and takes off more: chosen, not measured."""
+"""Fraction of the imbalance that a step with an old factorisation may leave. A new one costs six
+times as much and reduces it further. Chosen, not measured.
+"""
 
 
 class Path:
@@ -47,14 +49,14 @@ class Path:
         self.started = time.perf_counter()
         self.begin, self.displacement = begin, begin.copy()
         self.state: InternalState = self.model.internal(begin)
-        # Imbalance of the start under the wanted loads: let go along the way.
+        # Imbalance of the start under the target loads; it is released along the path.
         self.imbalance = self.equations.free_part(goal.load - self.state.force)
         self._begin_constraint(begin)
         self.history: list[float] = []
         self.iterations = 0
         self.reached = 0.0
         self.trouble = ""
-        # Where the branch had to snap, as part of the way, and whether it buckled there.
+        # Where the branch snapped, as a fraction of the path, and whether it buckled there.
         self.snaps: list[tuple[float, bool]] = []
         self.status = Status.stalled
 
@@ -68,11 +70,12 @@ class Path:
             self.end_poses = problem.poses(self.pose)
             self.begin_poses = [g.pose_of(nodes, begin) for g in problem.grasps]
             rigid, _ = problem.constraint(self.begin_poses)
-            # What of the start is not rigid goes away along the way as well.
+            # The part of the start that is not rigid is released along the path as well.
             self.begin_rest = self.begin_rest - rigid
 
     def constraint_at(self, part: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return displacements of held nodes and pinned means at ``part`` of the way."""
+        """Return displacements of held nodes and pinned means at the fraction ``part`` of the path.
+        """
         pins = self.begin_pins + part * (self.goal.pins - self.begin_pins)
         if part >= 1.0:
             return self.goal.held, self.goal.pins
@@ -84,9 +87,9 @@ class Path:
 
     def run(self, progress: Progress, guess: np.ndarray | None = None,
             strain: np.ndarray | None = None) -> StaticResult:
-        """Go the way; where there is a ``guess`` of its end [node_count, 3], from that first.
+        """Follow the path; start from a ``guess`` of its end [node_count, 3] if there is one.
 
-        ``strain`` [tet_count, q, 6] is what goes with it, where that is known.
+        ``strain`` [tet_count, q, 6] belongs to the guess, if known.
         """
         step = 1.0
         if guess is not None and not self._leap(guess, strain):
@@ -119,7 +122,7 @@ class Path:
         return self._result()
 
     def _step(self, part: float) -> float | None:
-        """Try a step to ``part`` of the way; return the length taken, None if it failed."""
+        """Try a step to the fraction ``part`` of the path; return its length, None if it failed."""
         settings, equations, held = self.settings, self.equations, self.equations.held
         try:
             tangent = equations.exact_tangent(self.model, self.displacement)
@@ -139,18 +142,18 @@ class Path:
         diagonal_norm, steady = tangent.diagonal_norm, tangent.is_positive_definite
         if settings.keeps_factor and steady:
             trial, increment = self._gone_on(trial, increment, tangent, self.load_at(part))
-        # Its memory serves the tangents on the way.
+        # Its memory is reused by the tangents along the path.
         del tangent
         return self.correct(trial, increment, part, diagonal_norm, steady)
 
     def _leap(self, guess: np.ndarray, strain: np.ndarray | None) -> bool:
-        """Try to reach the end from near it; return whether that was it."""
+        """Try to reach the end from nearby; return whether it was reached."""
         begin = self.displacement
         trial = np.where(self.equations.held[:, None], self.goal.held, guess)
         for grasp, pin in zip(self.equations.pinned, self.goal.pins, strict=True):
             trial[grasp.nodes] += pin - grasp.weights @ trial[grasp.nodes]
         longest = np.linalg.norm(trial - begin, axis=1).max()
-        # No linear step leads there, whose spurious strains mixed points would take off.
+        # No linear step leads there, so mixed points have no spurious strain to remove.
         if longest <= self.settings.max_step * self.model.extent and self.correct(
                 trial, np.zeros_like(trial), 1.0, 0.0, True, strain) is not None:
             self.reached = 1.0
@@ -174,16 +177,16 @@ class Path:
     def correct(self, trial: np.ndarray, increment: np.ndarray, part: float,
                 diagonal_norm: float, steady: bool, strain: np.ndarray | None = None,
                 ) -> float | None:
-        """Iterate from ``trial`` to equilibrium at ``part`` of the way.
+        """Iterate from ``trial`` to equilibrium at the fraction ``part`` of the path.
 
         Args:
             trial: Displacement [m], shape [node_count, 3], after ``increment``.
-            diagonal_norm: Of a tangent near it [N/m]: tells the floor that round-off sets.
+            diagonal_norm: Of a nearby tangent [N/m]; it gives the floor set by round-off.
             steady: Whether that tangent is positive definite.
-            strain: Where known better than ``trial`` says it, shape [tet_count, q, 6].
+            strain: Shape [tet_count, q, 6]; given if it is known better than from ``trial``.
 
         Returns:
-            The length taken, None if none was found.
+            Length of the step; None if there is none.
         """
         settings, load = self.settings, self.load_at(part)
         best, worse = np.inf, 0
@@ -214,10 +217,10 @@ class Path:
     def _newton_step(self, trial: np.ndarray, increment: np.ndarray, strain: np.ndarray | None,
                      load: np.ndarray, residual: np.ndarray,
                      ) -> tuple[np.ndarray, np.ndarray, bool, float] | None:
-        """Return the state after a step and its increment, and of the tangent whether it is stable
-        and its norm.
+        """Return the state after a step, its increment, and whether the tangent is stable and its
+        norm.
 
-        The tangent itself is freed: there is never more than one of a large mesh in memory.
+        The tangent itself is freed, so at most one of a large mesh is in memory.
         """
         mixed = self.problem.mixed
         try:
@@ -237,9 +240,9 @@ class Path:
 
     def _gone_on(self, trial: np.ndarray, increment: np.ndarray, tangent: Tangent,
                  load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the state that more steps with the same factor lead to, and the last increment.
+        """Return the state after further steps with the same factorisation, and the last increment.
 
-        As long as each takes off most of the imbalance; one that does not is not taken.
+        A step is taken only if it removes most of the imbalance.
         """
         _, residual, norm, reference = self._imbalance(trial, load)
         while norm > self._enough(reference, tangent.diagonal_norm):
@@ -252,8 +255,9 @@ class Path:
 
     def _imbalance(self, trial: np.ndarray, load: np.ndarray,
                    ) -> tuple[InternalState, np.ndarray, float, float]:
-        """Return the state at ``trial``, what is out of balance [N], its norm, and that of loads
-        and reactions."""
+        """Return the state at ``trial``, the imbalance [N], its norm, and the norm of loads and
+        reactions.
+        """
         state = self.model.internal(trial)
         out = load - state.force
         residual = self.equations.free_part(out)
@@ -265,7 +269,7 @@ class Path:
 
     def _searched(self, trial: np.ndarray, increment: np.ndarray, load: np.ndarray,
                   residual: np.ndarray) -> np.ndarray:
-        """Return the increment, shortened until the work of the residual along it has fallen."""
+        """Return the increment, shortened until the work of the residual along it has decreased."""
         slope = float((residual * increment).sum())
         length = 1.0
         for _ in range(8):
@@ -277,7 +281,7 @@ class Path:
         return length * increment
 
     def _floor(self, diagonal_norm: float) -> float:
-        # Differences of displacements in an element carry round-off of about one unit each.
+        # Differences of displacements in an element carry a round-off error of about one unit each.
         return 8 * float(np.finfo(float).eps) * diagonal_norm * self.model.mean_edge
 
     def _accept(self, trial: np.ndarray, state: InternalState, part: float,
@@ -285,7 +289,8 @@ class Path:
         if state.min_det_f <= 0:
             self.status, self.trouble = Status.inverted, "an element would turn inside out"
             return None
-        # The iteration's tangents are of states on the way; of the last the exact one decides.
+        # The iteration's tangents belong to intermediate states; the exact one of the last state
+        # decides.
         asked = part >= 1.0 or not stable or self.settings.keeps_factor
         if asked and not self._is_stable(trial):
             self.status, self.trouble = Status.unstable, "the equilibrium found is not stable"
@@ -303,10 +308,10 @@ class Path:
         return taken
 
     def _lost(self, trial: np.ndarray, state: InternalState, part: float) -> float:
-        """Return how much more the potential would fall in a step than forces and loads work.
+        """Return by how much the potential falls in a step beyond the work of forces and loads.
 
-        Relative to both; the work by the trapezium of what they are at its ends. Equilibria that
-        follow on each other lose nothing but the curvature of that.
+        Relative to both. The work is integrated by the trapezium rule. Between neighbouring
+        equilibria the difference is only the error of that rule.
         """
         before, now = self.load_at(self.reached), self.load_at(part)
         moved = trial - self.displacement
@@ -335,7 +340,7 @@ class Path:
                            snapped_at=[part for part, _ in self.snaps])
 
     def _softening(self) -> str:
-        """Say so where the material, not the branch, is what gives way."""
+        """Warn if the material law collapses rather than the branch."""
         told = self.model.material.softening
         if not told or self.state.min_det_f > _SOFT_DET_F:
             return ""
@@ -343,7 +348,7 @@ class Path:
 
 
 def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:
-    """Return a warning if the branch left a saddle on the path, else nothing."""
+    """Return a warning if the branch left a saddle along the path, else an empty tuple."""
     where = [f"{100 * part:.0f} %" for part, buckled in snaps if buckled]
     if not where:
         return []

@@ -1,11 +1,11 @@
 """The stress-free shape of a branch that was scanned while it sagged (inverse statics).
 
-In the scanned shape x the load must balance the stress, and what is sought is the rest shape X
-that it is strained from (Govindjee and Mihalic 1996). At fixed x a change e of X changes the
-strain alone, not the geometry, so the derivative of the imbalance has no geometric stiffness:
-the inverse problem is a benign one however far the branch sags, where turning the miss of loaded
-candidates back (a fixed point) diverges. Newton's step solves K_material d = imbalance on x, and
-d is pulled back to X through its gradient: grad e = -F^-1 grad d in least squares.
+In the scanned shape x the stress balances the load. The unknown is the stress-free shape X
+(Govindjee and Mihalic 1996). At fixed x a change e of X changes the strain alone, not the geometry,
+so the derivative of the imbalance has no geometric stiffness. The inverse problem is therefore well
+behaved however far the branch sags; a fixed-point iteration on loaded candidates diverges there.
+Newton's step solves K_material d = imbalance on x, and d is pulled back to X through its gradient:
+grad e = -F^-1 grad d in least squares.
 """
 
 from dataclasses import replace
@@ -21,35 +21,37 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.mechanics.strain import deformation_gradients, gradient_metric
 
-# Bounds and thresholds: chosen, not measured; tests/mechanics/statics sags beyond 90 % with them.
+# Limits are chosen, not measured; in tests/mechanics/statics branches sag beyond 90 % with them.
 _MAX_ITERATIONS = 40
-"""Of meeting the scan by the loaded shape, at most."""
+"""Most iterations that fit the loaded shape to the scan."""
 _MAX_UNLOADING = 100
-"""Newton steps of taking the load off, at most."""
+"""Most Newton steps that remove the load."""
 _LARGEST_TURN = 0.15
-"""Largest gradient of a Newton step: more load is taken off in several."""
+"""Largest gradient of a Newton step; a larger load is removed in several steps."""
 _AWAY = 0.02
-"""Way of a loaded candidate off the scan, as part of the extent, that stability is doubted at."""
+"""Distance of a loaded candidate from the scan, as a fraction of the extent, above which stability
+is checked.
+"""
 _BALANCED = 1e-4
-"""Largest gradient of a step after which the part that is off counts as balanced."""
+"""Largest gradient of a step after which the load removed so far counts as balanced."""
 
 
 def unloaded_rest_shape(model: BranchModel, *, tolerance: float = 1e-6,
                         start: np.ndarray | None = None,
                         progress: Progress = SILENT) -> TetMesh:
-    """Return the mesh without load, such that the model's loads bend it to the model's mesh.
+    """Return the unloaded mesh that the model's loads bend into the model's mesh.
 
-    Sides stay straight, so middle nodes meet the scan but for the curvature within an element
-    (micrometres); corner nodes meet it within the tolerance.
+    Edges stay straight. Corner nodes match the scan within the tolerance, mid-edge nodes up to the
+    curvature within an element (micrometres).
 
     Args:
         model: Its mesh is the scanned, loaded shape; gravity and added masses are the loads.
-        tolerance: Largest miss of a corner node [m].
-        start: Rest positions to begin with [m], shape [node_count, 3]: those found with another
-            Young's modulus, for example.
+        tolerance: Largest distance of a corner node from the scan [m].
+        start: Initial rest positions [m], shape [node_count, 3], for example those of another
+            Young's modulus.
 
     Raises:
-        ConvergenceError: no rest shape; the branch may be too soft to carry itself.
+        ConvergenceError: there is no rest shape; the branch may be too soft to carry its weight.
     """
     search = _Search(model, progress)
     rest = search.unloaded(model.mesh.nodes.copy() if start is None else np.array(start, float))
@@ -57,7 +59,7 @@ def unloaded_rest_shape(model: BranchModel, *, tolerance: float = 1e-6,
 
 
 class _Search:
-    """Seeks the rest positions of one scan."""
+    """Finds the rest positions of one scan."""
 
     def __init__(self, model: BranchModel, progress: Progress):
         self.model, self.progress = model, progress
@@ -65,7 +67,7 @@ class _Search:
         self.corners = np.unique(model.mesh.tets[:, :4])
 
     def unloaded(self, rest: np.ndarray) -> np.ndarray:
-        """Return rest positions in balance with the scan, taking the load on bit by bit."""
+        """Return rest positions in balance with the scan, applying the load in steps."""
         for number in range(_MAX_UNLOADING):
             self.progress(min(0.7, number / 40), "finding the rest shape", step=number)
             step = self._step(rest, self.scan)
@@ -80,7 +82,8 @@ class _Search:
             "Check Young's modulus, density and gravity.")
 
     def refined(self, rest: np.ndarray, tolerance: float) -> np.ndarray:
-        """Return rest positions that the load bends to the scan, by solving the loaded shape."""
+        """Return rest positions that the load bends into the scan, by solving for the loaded shape.
+        """
         target, misses = self.scan.copy(), []
         settings = StaticSettings()
         for number in range(_MAX_ITERATIONS):
@@ -95,7 +98,7 @@ class _Search:
                 return rest
             if len(misses) > 5 and misses[-1] > 0.95 * misses[-4]:
                 break
-            # Corners belong on the scan; middle nodes keep the bow of the loaded shape.
+            # Corners lie on the scan; mid-edge nodes keep the curvature of the loaded shape.
             target = reached - _straight(self.model.mesh, miss)
             rest = rest + self._step(rest, target)
         raise ConvergenceError(
@@ -105,11 +108,12 @@ class _Search:
             "Check Young's modulus, density and gravity.")
 
     def _step(self, rest: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Return Newton's change of the rest positions [m], sides kept straight."""
+        """Return Newton's change of the rest positions [m] with straight edges."""
         candidate = self._at(rest)
         u = target - rest
         equations = candidate.equations()
-        # Minus the strain itself as a constant part: stress 0, so no geometric stiffness.
+        # The constant part is minus the strain itself: the stress is 0, so there is no geometric
+        # stiffness.
         no_stress = Viscous(1.0, -candidate.strains(u))
         try:
             tangent = equations.tangent(candidate, u, viscous=no_stress)
@@ -159,7 +163,7 @@ def _gradients(model: BranchModel, field: np.ndarray) -> np.ndarray:
 
 
 def _integrated(model: BranchModel, gradient: np.ndarray) -> np.ndarray:
-    """Return the field, 0 at fixed nodes, whose gradient is nearest in least squares."""
+    """Return the field, 0 at fixed nodes, whose gradient fits best in least squares."""
     from scipy.sparse.linalg import splu
 
     mesh = model.mesh

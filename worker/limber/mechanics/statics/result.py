@@ -13,21 +13,20 @@ class StaticSettings:
     """Settings of the search for equilibrium.
 
     Attributes:
-        tolerance: Residual force relative to the loads and reactions. The floor that round-off
-            sets is respected.
-        max_iterations: Newton iterations a step.
-        max_step: Longest predicted motion a step, as part of the branch's extent.
-        min_step: Smallest part of the whole way that is tried before giving up.
-        total_iterations: Newton iterations in all before giving up.
-        stretch_limit: Principal stretch at which the branch is taken as torn.
+        tolerance: Residual force relative to the loads and reactions, but not below round-off.
+        max_iterations: Most Newton iterations per step.
+        max_step: Longest predicted motion per step, as a fraction of the branch's extent.
+        min_step: Smallest step, as a fraction of the path, before the solve fails.
+        total_iterations: Most Newton iterations in all before the solve fails.
+        stretch_limit: Principal stretch above which the branch counts as torn.
         mixed: Mixed-integration-point Newton (St. Venant-Kirchhoff only); else Newton with
             line search.
         verify: Solve again from rest in small steps and compare energies; a difference is
             reported as a false equilibrium.
-        snap: Where a path of stable equilibria ends, let the branch snap to another one.
-        way_back: Where it snapped, walk back and say whether it ends elsewhere.
-        keeps_factor: Take further steps with a factor that is at hand, as long as each takes off
-            most of the imbalance; every state that is passed is then asked whether it is stable.
+        snap: Whether the branch snaps to another equilibrium where a path of stable ones ends.
+        way_back: Whether a snapped branch is followed back, to report if it ends elsewhere.
+        keeps_factor: Whether an existing factorisation is used for further steps while each removes
+            most of the imbalance. The stability of every state along the path is then checked.
     """
 
     tolerance: float = 1e-7
@@ -51,25 +50,27 @@ class StaticResult:
     """A static state, and how it was found.
 
     Attributes:
-        status: How the solve ended. If not converged, the state is the last good one on the way.
+        status: How the solve ended. If it has not converged, the state is the last equilibrium
+        along the path.
         displacement: [m], shape [node_count, 3].
         pose: Pose of the grasp in this state [m, rad], shape [6] ([g, 6] for several), or None.
-        strain_energy: Of the strain since the model's mesh [J].
-        energy: Potential of strain and weight above the model's mesh [J]: above the hanging state
-            of a branch that hangs as it was scanned (BranchModel.as_scanned). Its gradient to the
-            pose is what the gripper exerts.
-        reaction_force, reaction_torque: What the gripper exerts on the branch [N, Nm], the
+        strain_energy: Energy of the strain relative to the model's mesh [J].
+        energy: Potential of strain and weight relative to the model's mesh [J]; for a branch
+            prestressed by its weight (BranchModel.as_scanned), relative to that state. Its gradient
+            with respect to the pose is the gripper's wrench.
+        reaction_force, reaction_torque: Force and torque of the gripper on the branch [N, Nm], the
             torque about the pose's position; shape [3] ([g, 3] for several grasps).
-        base_force, base_torque: What the base exerts on the branch; the torque about the origin.
+        base_force, base_torque: Force and torque of the base on the branch; the torque about the
+        origin.
         min_det_f: Smallest determinant of the deformation gradient.
-        iterations, residual_history: Newton iterations in all, relative residuals.
-        reached: Part of the way that was covered.
-        snapped_at: Parts of the way at which no stable equilibrium was near and the branch
+        iterations, residual_history: Total Newton iterations, relative residuals.
+        reached: Fraction of the path that was covered.
+        snapped_at: Fractions of the path at which no stable equilibrium was near and the branch
             snapped to another one.
-        message: What happened, where.
-        warnings: What a user should know.
-        doubt: Why it may not be the only stable state of its hold, empty where nothing speaks for
-            that; found by walking the way back where the branch snapped.
+        message: What happened and where.
+        warnings: Warnings for the user.
+        doubt: Why the state may not be the only stable one of this grasp; empty if there is no sign
+            of another. Found by following the path back after a snap.
     """
 
     status: Status
@@ -93,14 +94,14 @@ class StaticResult:
 
     @property
     def converged(self) -> bool:
-        """Whether it is a stable equilibrium under the wanted loads, with no element inverted."""
+        """Whether it is a stable equilibrium under the target loads with no inverted element."""
         return self.status is Status.converged
 
     def require(self) -> "StaticResult":
         """Return the result itself.
 
         Raises:
-            ConvergenceError: it has not converged.
+            ConvergenceError: the result has not converged.
         """
         if not self.converged:
             raise ConvergenceError(

@@ -1,8 +1,7 @@
 """Whether a branch that snapped would return: the same path, followed backwards.
 
-A straight part that buckles straightens again. A bow that turned over stays turned over: the start
-and what it snapped to are two stable states of one and the same hold, and which one is real depends
-on what was done to the branch before.
+A straight part that buckles straightens again. A bow that turned over stays so: start and end are
+two stable states of one grasp, and the history of the branch decides which one is real.
 """
 
 import numpy as np
@@ -13,13 +12,13 @@ from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.static_problem import Target
 
 _SAME = 1e-3
-"""How near to the start, as part of the branch's extent, is the start."""
+"""Distance, as a fraction of the branch's extent, below which the start counts as reached."""
 
 
 def uncertainty_of(path: Path, result: StaticResult) -> str:
     """Return why a converged result may not be the only state of its grasp, or an empty string.
 
-    Costs nothing unless the branch snapped; else as much as the way there.
+    Free unless the branch snapped; then it costs as much as the path itself.
     """
     if not path.snaps:
         return ""

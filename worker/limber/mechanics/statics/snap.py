@@ -1,8 +1,8 @@
-"""Where a path of stable equilibria ends: a column buckles, a bow turns over.
+"""The end of a path of stable equilibria: a column buckles, a bow turns over.
 
-No small step leads on there. The branch creeps, as through honey, to where it comes to rest; if
-that is a saddle (a straight column under too much load) it is pushed off along the mode in which
-the tangent stiffness is negative, and creeps on down to the bent state.
+No small step continues the path there. The branch moves as in a viscous fluid until it is at rest.
+If that state is a saddle (a straight column under too much load), it is perturbed along the mode of
+negative tangent stiffness and moves on to the bent state.
 """
 
 from typing import TYPE_CHECKING
@@ -16,28 +16,28 @@ from limber.mechanics.model import BranchModel
 if TYPE_CHECKING:
     from limber.mechanics.statics.path import Path
 
-# All chosen on the columns and bows of tests/mechanics/statics, none measured in a series.
+# Chosen on the columns and bows of tests/mechanics/statics; none was measured in a series.
 _FIRST_DRAG = 1e-5
-"""Drag of the first creep, as part of the mean diagonal of the stiffness."""
+"""Drag of the first creep step, as a fraction of the mean diagonal of the stiffness."""
 _CREEPS = 60
-"""At most so many on the way down."""
+"""Most creep steps to the equilibrium."""
 _CREEP_ITERATIONS = 9
-"""Newton iterations of one; a creep that takes more is tried again with more drag."""
+"""Most Newton iterations per creep step; if it takes more, it is repeated with more drag."""
 _RESTING = 1e-2
-"""Imbalance over loads and reactions under which the branch is at rest, or on a saddle."""
+"""Imbalance relative to loads and reactions below which the branch is at rest or on a saddle."""
 _PUSHES = 3
-"""At most so many off saddles."""
+"""Most perturbations off saddles."""
 _PUSH = 2e-3
-"""How far a column is pushed off its saddle, as part of the branch's extent."""
+"""Size of the perturbation off a saddle, as a fraction of the branch's extent."""
 _MODE_ITERATIONS = 30
-"""Of inverse iteration for the mode that a saddle gives way in."""
+"""Inverse iterations for the unstable mode of a saddle."""
 
 
 def settle(path: "Path", part: float) -> float | None:
-    """Let the branch snap to its equilibrium at ``part`` of the path.
+    """Let the branch snap to its equilibrium at the fraction ``part`` of the path.
 
-    Each creep is a step of implicit Euler on the gradient flow of the potential, so it only ever
-    goes down. Return the length taken; None where the branch does not come to rest.
+    Each creep step is an implicit Euler step of the gradient flow of the potential, so the
+    potential only falls. Return the length of the step; None if the branch does not come to rest.
     """
     if path.model.material.is_linear:
         return None
@@ -71,9 +71,9 @@ def settle(path: "Path", part: float) -> float | None:
 def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray,
            load: np.ndarray, drag: float,
            ) -> tuple[np.ndarray, bool, float, bool, float] | None:
-    """Return the state after one creep, whether it was quick, and its imbalance.
+    """Return the state after one creep step, whether it converged quickly, and its imbalance.
 
-    And of its tangent, whether it is positive definite and the norm of its diagonal [N/m].
+    And whether its tangent is positive definite and the norm of its diagonal [N/m].
     """
     model, equations, held = path.model, path.equations, path.equations.held
     moved = np.where(held[:, None], target - start, 0.0)
@@ -89,7 +89,7 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
             return None
         if increment is not None and norm <= 1e-4 * reference:
             left = float(np.linalg.norm(equations.free_part(out)))
-            # Unloaded there is nothing that the imbalance could be a part of.
+            # Without load there is no scale for the imbalance.
             part = left / max(reference, 1e-300)
             tangent = equations.tangent(model, trial)
             return (trial, count <= 4, part, tangent.is_positive_definite,
@@ -107,7 +107,7 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
             increment = tangent.solve(right, pins - now) + moved
         else:
             increment = tangent.solve(pull)
-        # Its memory serves the next one.
+        # Its memory is reused by the next one.
         del tangent
         trial = trial + increment
     return None
@@ -115,7 +115,7 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
 
 def pushed_off(model: BranchModel, equations: Equations, state: np.ndarray,
                load: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return a state pushed off a saddle, to the side where the potential falls more.
+    """Return a state perturbed off a saddle to the side where the potential falls more.
 
     And whether there was a mode to push it along.
     """
@@ -133,8 +133,8 @@ def lowest_mode(model: BranchModel, equations: Equations, state: np.ndarray,
                 ) -> tuple[np.ndarray, float]:
     """Return the mode of least tangent stiffness [node_count, 3] and its stiffness [N/m].
 
-    Inverse iteration on the tangent whose diagonal was raised until it could be factorised:
-    raising moves no eigenvector. Its Rayleigh quotient is of the tangent itself.
+    Inverse iteration on the tangent whose diagonal was raised until it could be factorised: raising
+    does not change the eigenvectors. The Rayleigh quotient is that of the tangent itself.
     """
     tangent = equations.tangent(model, state)
     mode = np.random.default_rng(0).normal(size=state.shape)

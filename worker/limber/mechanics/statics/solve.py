@@ -1,10 +1,10 @@
 """Static equilibrium: mixed-integration-point Newton along a path of small steps.
 
-The path leads from a state in balance to the wanted one: prescribed poses move, and the imbalance
-that the start has under the wanted loads is let go in proportion. Each step starts with a linear
-solve of the whole increment (tangent predictor); then Newton, whose geometric stiffness uses the
-stress that the last linearisation predicted (Magisano, Leonetti and Garcea 2017), which lets a
-slender branch take steps several times as long. A step that fails is halved.
+The path leads from an equilibrium to the target state: prescribed poses move, and the imbalance of
+the start under the target loads is released in proportion. Each step starts with a linear solve of
+the whole increment (tangent predictor); then Newton, whose geometric stiffness uses the stress that
+the last linearisation predicted (Magisano, Leonetti and Garcea 2017), which allows several times
+longer steps for a slender branch. A step that fails is halved.
 """
 
 from collections.abc import Sequence
@@ -28,18 +28,19 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
                  start: "StaticResult | np.ndarray | None" = None,
                  settings: StaticSettings = DEFAULT_SETTINGS,
                  progress: Progress = SILENT) -> StaticResult:
-    """Find the equilibrium of a branch; never raises for want of convergence.
+    """Find the equilibrium of a branch; a failure to converge is a status, not an exception.
 
     Args:
-        grasp: The grasp, or several.
-        pose: Pose of the grasp [m, rad], shape [6] ([g, 6] for several). None: it is not held.
+        grasp: The grasp, or several grasps.
+        pose: Pose of the grasp [m, rad], shape [6] ([g, 6] for several). None: the grasp is not
+        held at a pose.
         grasp_force: Force [N] of the gripper on the branch instead, spread over the patch,
             shape [3] ([g, 3]).
-        nodal_forces: Dead loads [N], shape [node_count, 3], besides gravity.
+        nodal_forces: Dead loads [N], shape [node_count, 3], in addition to gravity.
         start: State to start from; default the rest shape.
 
     Raises:
-        InputError: arguments that do not fit each other.
+        InputError: the arguments contradict each other.
     """
     problem = StaticProblem(model, grasp, pose is not None, settings)
     goal = problem.target(pose, grasp_force, nodal_forces)
@@ -56,13 +57,13 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
                  settings: StaticSettings = DEFAULT_SETTINGS) -> list[StaticResult]:
     """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
 
-    After a pose that fails the next starts from the last converged state.
+    After a pose that fails, the next solve starts from the last converged state.
 
     Args:
-        guess: Displacement [m] that the first pose may have, shape [node_count, 3]: sought from
-            there first, and by the way from ``start`` if no stable equilibrium is near.
-        guess_strain: Strain that the branch may have there, shape [tet_count, q, 6], where that is
-            better known: a guess between states has strain of its own, which is not theirs.
+        guess: Possible displacement [m] at the first pose, shape [node_count, 3]. The solve starts
+            from it first, and follows the path from ``start`` if no stable equilibrium is near.
+        guess_strain: Possible strain there, shape [tet_count, q, 6], if it is known better: the
+            strain of a guess between states differs from theirs.
     """
     problem = StaticProblem(model, grasp, True, settings)
     displacement = problem.displacement_of(start)
@@ -81,7 +82,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
 
 def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
             strain: np.ndarray | None = None) -> StaticResult:
-    """Return the end of a path, with a warning where it is uncertain."""
+    """Return the end of a path, with a warning if it is uncertain."""
     result = path.run(progress, guess, strain)
     asked = result.converged and path.settings.way_back
     uncertainty = uncertainty_of(path, result) if asked else ""
@@ -98,7 +99,7 @@ def _capital(text: str) -> str:
 
 def _verified(problem: StaticProblem, result: StaticResult, goal: Target, pose: np.ndarray | None,
               progress: Progress) -> StaticResult:
-    """Return the result, or, if a path from rest in small steps ends lower, a refusal."""
+    """Return the result, or a refusal if a path from rest in small steps ends at lower energy."""
     careful = replace(problem.settings, max_step=problem.settings.max_step / 4, verify=False)
     other = StaticProblem(problem.model, problem.grasps or None, problem.is_held, careful)
     other.single = problem.single

@@ -97,7 +97,7 @@ class StaticProblem:
 
 
 def strain_warnings(stretch: Place) -> list[str]:
-    """Return a warning if the largest stretch exceeds what wood withstands, else nothing."""
+    """Return a warning if the largest stretch exceeds the strength of wood, else an empty tuple."""
     if stretch.value <= 1.5:
         return []
     return [f"The strain reaches {100 * (stretch.value - 1):.0f} % {stretch.at}, far more than "
@@ -105,7 +105,7 @@ def strain_warnings(stretch: Place) -> list[str]:
 
 
 class HowFound(TypedDict, total=False):
-    """The fields of a result that tell how it was found; see StaticResult."""
+    """The fields of a result that state how it was found; see StaticResult."""
 
     status: Required[Status]
     iterations: Required[int]
@@ -142,7 +142,7 @@ def make_result(problem: StaticProblem, displacement: np.ndarray, state: Interna
 
 
 def base_forces(model: BranchModel, out: np.ndarray) -> np.ndarray:
-    """Return what the base exerts on its nodes [N], 0 elsewhere, shape [node_count, 3].
+    """Return the force of the base on its nodes [N], 0 elsewhere, shape [node_count, 3].
 
     Args:
         out: Internal and inertial force less loads on all nodes [N], shape [node_count, 3].
@@ -172,7 +172,7 @@ def checked_forces(values: np.ndarray, shape: tuple[int, ...],
     """Return a nodal field as floats.
 
     Raises:
-        InputError: wrong shape or not finite.
+        InputError: the shape is wrong, or a value is not finite.
     """
     values = np.asarray(values, float)
     if values.shape != shape or not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""What the cells of a grid know of the goal: its position and the cost of the path left to it."""
+"""Goal data on the cells of a grid: its position and the cost from there to it."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,12 @@ _BEYOND = 1.2  # on the steepest measured growth of the goal's distance
 
 @dataclass(frozen=True)
 class AboutGoal:
-    """A signed cost of the path left, negative inside the goal, and where it is known.
+    """A signed cost to the goal, negative inside it, and the cells where it is known.
 
-    Every point of the goal lies in a cell that has all its coefficients among those ``known``;
-    there the spline of the ``cost`` is at most ``slack``. ``inside`` are cells of the goal alone.
-    ``meets``: whether any open cell may have a point of the goal. ``near``: where the cells of the
-    next grid that are asked lie.
+    Every point of the goal is in a cell that has all its coefficients among those ``known``; there
+    the spline of the ``cost`` is at most ``slack``. ``inside``: cells entirely inside the goal.
+    ``meets``: whether any open cell may contain a point of the goal. ``near``: where the queried
+    cells of the next grid are.
     """
 
     known: np.ndarray
@@ -32,10 +32,10 @@ class AboutGoal:
 
 
 def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal:
-    """Return what is known about the goal.
+    """Return the goal data.
 
-    A spline whose coefficients are a function's values differs from it by
-    ``h^2 / 8 sum_i max |second derivative|``.
+    A spline with a function's values as coefficients differs from it by ``h^2 / 8 sum_i max |second
+    derivative|``.
     """
     h, shape = ground.spacing, ground.open_cells.shape
     cells = np.argwhere(ground.active & grid.about_goal)
@@ -44,7 +44,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
         return AboutGoal(nothing, np.zeros(shape), nothing, 0.0, False, nothing)
     away = (problem.goal.distance(problem.energy_field, grid.points(cells + 0.5))
             - problem.goal.tolerance)
-    # In the box about them alone, with a layer in which nothing is known.
+    # In the bounding box of these cells only, with a margin layer of unknown values.
     low, high = np.maximum(cells.min(axis=0) - 1, 0), cells.max(axis=0) + 2
     box = tuple(map(slice, low, high))
     open_cells = ground.open_cells[box]
@@ -67,18 +67,20 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
         out = np.zeros(shape, part.dtype)
         out[box] = part
         return out
-    # A next cell asks up to 4 of its edges away; its centre lies within ``half`` of this one's.
+    # A cell of the next grid queries up to 4 of its edges away; its centre is within ``half`` of
+    # this one's.
     return AboutGoal(whole(filled <= growth * 3.0 * half), whole(np.nan_to_num(cost)),
                       whole(inside), slack, bool(touching.any()),
                       whole(filled <= growth * (half + 6.0 * h * COARSEST)))
 
 
 def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:
-    """Return what a ``length`` [m] to the goal costs, at the ``rate`` half-way, of cells with an
+    """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with an
     edge of ``h`` [m]; nan where not known.
 
-    One rate for all sides of the goal would be the least of them. Inside, where nothing is asked,
-    the length flattens out to a goal's middle ``depth`` [m] below its outside: it has no tip there.
+    A single rate for all sides of the goal would be the smallest of them. Inside, where no
+    condition holds, the length flattens out to a goal's middle ``depth`` [m] below its surface: it
+    has no tip there.
     """
     flat = np.maximum(length, -depth)
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
@@ -89,12 +91,13 @@ def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> n
 
 
 def _growth(distance: np.ndarray, near: np.ndarray, h: float) -> float:
-    """Return the most that the goal's distance grows a metre, among cells ``near`` it."""
+    """Return the largest growth of the goal's distance per metre, among cells ``near`` it."""
     growth = 1.0
     for axis in range(3):
         step = np.abs(np.diff(distance, axis=axis)) / h
         first, second = (np.take(near, range(k, near.shape[axis] - 1 + k), axis=axis)
                          for k in (0, 1))
         growth = max(growth, float(np.max(step, where=first & second, initial=0.0)))
-    # A grasp's distance grows by a metre at most; a target's by what the field says, and more.
+    # A grasp's distance grows by at most a metre per metre; a target's by the field's rate plus a
+    # reserve.
     return growth if growth <= 1.0 + 1e-9 else growth * _BEYOND * np.sqrt(3.0)

@@ -2,16 +2,16 @@
 
 A smooth function leaves the trilinear interpolation of its corners by at most
 
-    sum_i M_i h^2 / 8,   M_i the most that d^2 f / dx_i^2 is there,
+    sum_i M_i h^2 / 8,   M_i the maximum of d^2 f / dx_i^2 there,
 
-and second differences at the corners, times ``CURVATURE_FACTOR``, say how large that is. In the
-valley that a grasp follows they do not: its floor may lie inside a cell, a hundred times as narrow,
-and no corner sees it. What corners do see is on which side of it they are:
+and second differences at the corners, times ``CURVATURE_FACTOR``, estimate this maximum. In the
+valley that a grasp follows they do not: its floor may be inside a cell, a hundred times as narrow,
+and no corner sees it. The corners do show on which side of it they are:
 
-- The energy has slopes to both sides. A convex function lies above its tangents at both ends of an
+- The energy rises on both sides. A convex function is above its tangents at both ends of an
   edge, and so above the chord less ``x_i (h - x_i) / 2`` times ``2 / h`` times the change of slope:
   exact for a kink, twice what a parabola needs.
-- The force turns round. As a vector it lies between those at the corners, up to its own bend: its
+- The force reverses. As a vector it is between those at the corners, up to its own curvature: its
   size is at least the distance of zero from their convex hull.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from limber.core.numerics.compiled import compiled
 
 CURVATURE_FACTOR = 2.0
-"""What second differences at a cell's corners are multiplied by to bound derivatives inside."""
+"""Factor on second differences at a cell's corners that bounds derivatives inside."""
 
 _NEARER = 12  # steps towards the point of a hull that is nearest to zero
 
@@ -50,10 +50,10 @@ def turns(slopes, cells):
 
 @compiled
 def least_between(values, slopes, cells):
-    """Return what functions of ``values`` [nx + 1, ny + 1, nz + 1] and ``slopes`` at the corners,
-    as in :func:`turns`, are at least in ``cells`` [nx, ny, nz], -inf where not known.
+    """Return lower bounds in ``cells`` [nx, ny, nz] of functions with ``values`` [nx + 1, ny + 1,
+    nz + 1] and ``slopes`` at the corners, as in :func:`turns`; -inf where not known.
 
-    A second difference with a value that is not known, nan, counts as 0.
+    A second difference that includes an unknown value, nan, counts as 0.
     """
     out = np.full(cells.shape, -np.inf)
     turned = turns(slopes, cells)
@@ -83,8 +83,9 @@ def least_between(values, slopes, cells):
 
 @compiled
 def least_size(vectors, cells):
-    """Return how long a vector with values ``vectors`` [nx + 1, ny + 1, nz + 1, 3] at the corners
-    is at least in ``cells`` [nx, ny, nz], 0 where not known."""
+    """Return the least length in ``cells`` [nx, ny, nz] of a vector with values ``vectors`` [nx +
+    1, ny + 1, nz + 1, 3] at the corners; 0 where not known.
+    """
     out = np.zeros(cells.shape)
     places = np.argwhere(cells)
     corners, curved, step = np.empty((8, 3)), np.empty(3), np.empty(3, np.int64)
@@ -126,7 +127,7 @@ def off_zero(corners):
 
 @compiled
 def _off_zero(corners):
-    """Gilbert's steps: whatever the direction, the hull lies beyond its least corner along it."""
+    """Gilbert's steps: along any direction, the hull is beyond its least corner."""
     best, least = np.zeros(3), np.inf
     for n in range(len(corners)):
         size = corners[n, 0]**2 + corners[n, 1]**2 + corners[n, 2]**2

@@ -1,8 +1,9 @@
-"""Fast marching on a masked grid: arrival costs from a set of nodes, second order where it can be.
+"""Fast marching on a masked grid: arrival costs from a set of nodes, second order where possible.
 
-Solves |grad u| = rate on the nodes of a regular grid (Sethian 1999, "Fast marching methods",
-SIAM Review 41, sections 5 and 6). The result is a candidate only: what a proof needs is checked
-by :mod:`limber.planning.certificate.subsolution`, however the candidate was found.
+Solves |grad u| = rate on the nodes of a regular grid (Sethian 1999, "Fast marching methods", SIAM
+Review 41, sections 5 and 6). The result is only a candidate:
+:mod:`limber.planning.certificate.subsolution` checks what a proof needs, however the candidate was
+found.
 """
 
 import numpy as np
@@ -12,8 +13,9 @@ from limber.core.numerics.compiled import compiled
 
 @compiled
 def neighbours(active):
-    """Return numbers of the nodes ``active`` [nx, ny, nz], -1 elsewhere, their places in the flat
-    grid [n], and the numbers of their neighbours below and above along each axis [n, 6]."""
+    """Return numbers of the nodes ``active`` [nx, ny, nz], -1 elsewhere, their indices in the flat
+    grid [n], and the numbers of their neighbours below and above along each axis [n, 6].
+    """
     shape = np.array(active.shape)
     steps = np.array([shape[1] * shape[2], shape[2], 1])
     flat = active.ravel()
@@ -34,7 +36,7 @@ def neighbours(active):
 
 @compiled
 def march(rate, near, known, values, spacing):
-    """Return arrival costs ``u`` [n]; infinite where no node leads.
+    """Return arrival costs ``u`` [n]; infinite at unreachable nodes.
 
     Args:
         rate: Cost per metre at the nodes [1/m], shape [n].
@@ -92,7 +94,7 @@ def _arrival(node, u, done, step, near, used):
         if far >= 0 and done[far] and u[far] <= value:
             used[0, count], used[1, count] = (4.0 * value - u[far]) / 3.0, 2.25
         count += 1
-    # Drop the axis whose neighbour lies highest until the solution lies above all that are used.
+    # Drop the axis with the highest neighbour until the solution exceeds all used neighbours.
     while count > 0:
         a, b, c, top = 0.0, 0.0, -step * step, -np.inf
         last = 0

@@ -1,17 +1,16 @@
 """Whether a path exists, decided on cells along the low-energy surface.
 
-Off the shell a force grows a hundred times as fast as along it, so cells as long as they are wide
-must be tiny before they tell that a limit is broken in all of them. Here they are cut in the
-chart's coordinates (:mod:`limber.planning.field.chart`), along those axes by which there is doubt,
-and only where they are open. If what is open does not lead from the start's cell to one that may
-hold a point of the goal, no path does. If cells that keep all limits at their corners do, there
-mostly is one.
+Off the shell, a force grows a hundred times as fast as along it. Cubic cells must therefore be tiny
+before they show that a limit is broken in all of them. Here cells are cut in the chart's
+coordinates (:mod:`limber.planning.field.chart`), along the undecided axes, and only where they are
+open. If open cells do not connect the start's cell to one that may contain a point of the goal, no
+path exists. If cells that keep all limits at their corners do, a path usually exists.
 
-What a limit is on is at least in a cell what its values and slopes at the corners say
-(:mod:`limber.planning.certificate.cell_bounds`). That is said of the field. The branch itself may
-keep a limit where the field does not: for a proof a cell is closed only where the field is over
-the limit
-by more than its error, and may hold a point of the goal where a target is as near as its error.
+Values and slopes at a cell's corners bound the limited quantity from below in the cell
+(:mod:`limber.planning.certificate.cell_bounds`). This holds for the field. The branch itself may
+keep a limit where the field does not. For a proof a cell is therefore closed only where the field
+exceeds the limit by more than its error, and may contain a point of the goal where a target is as
+near as its error.
 """
 
 from collections.abc import Iterator
@@ -53,7 +52,7 @@ _BESIDE = np.array([[[_column(corner - step), _column(corner + step)] for corner
 
 @dataclass(frozen=True)
 class _Cells:
-    """Cells ``numbers`` [n, 3]; corner ``k`` [3] lies at ``low + k * edges`` in the plain chart."""
+    """Cells ``numbers`` [n, 3]; corner ``k`` [3] is at ``low + k * edges`` in the plain chart."""
 
     problem: GentleProblem
     low: np.ndarray
@@ -83,7 +82,7 @@ class _Cells:
                 where.reshape(len(self.numbers), -1))
 
     def holding(self, place: np.ndarray) -> np.ndarray:
-        """Return which cells touch the one that ``place`` [3] lies in, or are it, bool [n]."""
+        """Return which cells contain ``place`` [3] or touch the cell that does, bool [n]."""
         number = np.floor((self.chart.map(place)[0] - self.low) / self.edges)
         return (np.abs(self.numbers - number) <= 1).all(axis=1)
 
@@ -93,8 +92,9 @@ class _Cells:
         return np.isin(together, together[some])
 
     def way(self, begin: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
-        """Return the cells [k] of the shortest way from any of ``begin`` to any of ``ends``; None
-        where they do not hang together."""
+        """Return the cells [k] of the shortest path from ``begin`` to ``ends``; None if not
+        connected.
+        """
         if not begin.any() or not ends.any():
             return None
         away, before, _ = dijkstra(self._neighbours(), directed=False, min_only=True,
@@ -124,15 +124,16 @@ class _Cells:
 
     @property
     def chart(self) -> Chart:
-        """The plain one of the field's region."""
+        """The plain chart of the field's region."""
         return self.problem.energy_field.region.chart.plain
 
 
 @dataclass(frozen=True)
 class Verdict:
     """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
-    there is no path; a ``way`` [k, 3] by cells that keep all limits at their corners, if any; and
-    the ``wall`` [k, 3], middles of the cells that close the way, those least over a limit first.
+    there is no path; a ``way`` [k, 3] through cells that keep all limits at their corners, if any;
+    and the ``wall`` [k, 3], middles of the cells that block the path, those least over a limit
+    first.
     """
 
     edges: np.ndarray
@@ -142,8 +143,9 @@ class Verdict:
 
 
 def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
-    """Return a path on the field, or whether it is proven that none exists; undecided where that
-    would take more than ``most_cells`` at once."""
+    """Return a path on the field, or whether it is proven that none exists; undecided if that would
+    take more than ``most_cells`` at once.
+    """
     most = most_cells or _MOST_CELLS
     exact = replace(problem, beyond=problem.limits, errors={})
     on_field = _judged(exact, 0.0, most)
@@ -154,7 +156,8 @@ def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
 
 def _judged(problem: GentleProblem, goal_uncertainty: float, most_cells: int) -> Verdict:
     """Cut cells until they prove that no path keeps the sure limits and comes as near as
-    ``goal_uncertainty`` [m] to the goal, or a way leads by them, or there are too many."""
+    ``goal_uncertainty`` [m] to the goal, or contain a path, or become too many.
+    """
     cells, wall = _first(problem), _Wall(problem)
     while True:
         cells = cells.take(~_surely_outside(cells))
@@ -182,7 +185,7 @@ def _judged(problem: GentleProblem, goal_uncertainty: float, most_cells: int) ->
             chart = inner.chart
             flat = np.concatenate([chart.map(problem.start), inner.middles()[0][way],
                                    chart.map(positions[end])])
-            # Along the shell: the chord of a curved cell may lie well off it.
+            # Along the shell: the chord of a curved cell may be well off it.
             return Verdict(cells.edges, way=chart.curved(resample(flat, _FINE)))
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
                            (bends / tolerance)[open_cells][ends].sum(axis=0))
@@ -231,7 +234,7 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
     region, limits = cells.problem.energy_field.region, cells.problem.limits
     middles, points = cells.middles()
     outside = region.plane_least(middles, 0.5 * cells.edges) > 0.0
-    # Bent back a length grows by (R + w) / R at most.
+    # Mapped back, a length grows by (R + w) / R at most.
     radius = region.chart.radius
     grown = 1.0 if radius == 0.0 else np.maximum(
         1.0, 1.0 + (middles[:, 2] + 0.5 * cells.edges[2]) / radius)
@@ -246,8 +249,8 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
 
 def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Return in which cells no point keeps the sure limits, bool [n], and how much in doubt each
-    axis leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3].
+    """Return in which cells no point keeps the sure limits, bool [n], and the uncertainty of this
+    due to each axis, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3].
     """
     over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
     for values, slopes, limits in _limited(cells.problem, positions):
@@ -262,7 +265,7 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
         force = cells.problem.energy_field.force(positions)[nodes]
         bends = _bends(force)
         over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit - spare
-        # Between corners it may be anything that lies between theirs.
+        # Between corners it may be any value between theirs.
         apart = force[:, _AT].reshape(-1, 2, 2, 2, 3)
         apart = np.stack([np.linalg.norm(np.diff(apart, axis=axis), axis=-1).max(axis=(1, 2, 3))
                           for axis in (1, 2, 3)], axis=1)
@@ -272,8 +275,9 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
 
 def _limited(problem: GentleProblem, positions: np.ndarray,
              ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield what is limited at ``positions`` [m, 3] besides the force, smooth, shape [m], its slope
-    to the position, [m, 3], and its sure limit there, [m]."""
+    """Yield the limited quantities at ``positions`` [m, 3] besides the force, smooth, shape [m],
+    their slopes to the position, [m, 3], and their sure limits there, [m].
+    """
     field, limits = problem.energy_field, problem.sure_limits
     if limits.max_energy < np.inf:
         yield (field.energy(positions), field.force(positions),
@@ -286,9 +290,10 @@ def _limited(problem: GentleProblem, positions: np.ndarray,
 
 
 def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a function with ``values`` [n, 32] at ``_STENCIL``, and ``slopes`` [n, 32, 3]
-    there along the edges, times their lengths, is at least in each cell, [n], and by how much less
-    for what it bends along each axis, [n, 3]."""
+    """Return the lower bound in each cell, [n], of a function with ``values`` [n, 32] at
+    ``_STENCIL``, and ``slopes`` [n, 32, 3] there along the edges, times their lengths; and the part
+    of the reduction due to curvature along each axis, [n, 3].
+    """
     corners = values[:, _AT]
     bends = _bends(values[..., None])
     if slopes is not None:
@@ -300,8 +305,10 @@ def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.nda
 
 
 def _bends(values: np.ndarray) -> np.ndarray:
-    """Return how far a function with ``values`` [n, 32, c] at ``_STENCIL`` may leave the trilinear
-    interpolation of the corners for its second differences along each axis, [n, 3]."""
+    """Return the largest deviation of a function with ``values`` [n, 32, c] at ``_STENCIL`` from
+    the trilinear interpolation of the corners due to its second differences along each axis, [n,
+    3].
+    """
     beside = values[:, _BESIDE]
     second = beside[..., 0, :] - 2.0 * values[:, None, _AT] + beside[..., 1, :]
     return CURVATURE_FACTOR / 8.0 * np.linalg.norm(second, axis=-1).max(axis=2)

@@ -1,4 +1,4 @@
-"""The grid of the bound: turned so that its first axis runs from the start to the goal."""
+"""The grid of the bound, rotated so that its first axis runs from the start to the goal."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from limber.planning.path_problem import GentleProblem
 
 _FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
 FINEST, COARSEST = 1.0 / 3.0, 0.75
-"""Of a cell's edge, from one grid to the next: at least and at most."""
+"""Ratio of cell edges from one grid to the next: least and greatest."""
 _ROUND_OFF = 1e-9  # of a cell
 _PAD = RIM + 1  # closed cells about the grid, for the coefficients and second differences there
 
 
 @dataclass
 class Grid:
-    """Cells in the turned frame; corner ``(i, j, k)`` lies at ``origin + (i, j, k) h``.
+    """Cells in the rotated frame; corner ``(i, j, k)`` is at ``origin + (i, j, k) h``.
 
-    How far the goal is need not be asked but in the cells ``about_goal``.
+    The distance to the goal is only needed in the cells ``about_goal``.
     """
 
     origin: np.ndarray
@@ -42,14 +42,14 @@ class Grid:
 
 
 def spread(shape: tuple[int, ...], places: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return ``values`` [n, ...] at ``places`` [n, 3] of an array of a shape, nan elsewhere."""
+    """Return ``values`` [n, ...] at ``places`` [n, 3] in an array of a shape, nan elsewhere."""
     whole = np.full((*shape, *values.shape[1:]), np.nan)
     whole[tuple(places.T)] = values
     return whole
 
 
 def first_grid(problem: GentleProblem) -> tuple[Grid, np.ndarray]:
-    """Return a grid over the sampled region, and the cell in whose centre the start lies."""
+    """Return a grid over the sampled region, and the cell with the start at its centre."""
     region, start = problem.energy_field.region, problem.start
     axes = _axes(problem.goal.centre(problem.energy_field) - start)
     corners = (region.outline - start) @ axes.T
@@ -104,7 +104,7 @@ def refined(grid: Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarr
 
 
 def descent(grid: Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Return the way downhill from the start by cells' centres [n, 3]: the course of a path."""
+    """Return the descent from the start through the cells' centres [n, 3]: an approximate path."""
     reach = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     reach = reach[np.abs(reach).sum(axis=1) > 0]
     length = np.linalg.norm(reach, axis=1)

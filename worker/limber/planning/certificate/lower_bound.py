@@ -1,14 +1,14 @@
-"""How close to the best a path is: a proven lower bound on the cost of every path.
+"""Optimality gap of a path: a proven lower bound on the cost of every path.
 
-On the field in three coordinates the gentlest path is a shortest path in a metric that stretches
-by c = a_def E / (E0 L0) + a_dis / L0. A sub-solution on a grid
+On the field in three coordinates the gentlest path is a shortest path in a metric that stretches by
+c = a_def E / (E0 L0) + a_dis / L0. A sub-solution on a grid
 (:mod:`limber.planning.certificate.subsolution`) bounds its cost from below. The grid is refined
-where a better path than the known one could still run: a cell through which even the bounds say no
-path is as cheap drops out, and what is left is a thin tube.
+where a better path than the known one could still run. A cell is dropped if the bounds show that no
+path through it is as cheap; a thin tube remains.
 
-Limits: a cell where motion is surely not allowed, the field's error counted, is closed; a cell in
-doubt stays open, so the bound stays one. If closed cells separate start and goal, that proves that
-no path exists.
+Limits: a cell where motion is surely not allowed, including the field's error, is closed; an
+undecided cell stays open, so the bound stays valid. If closed cells separate start and goal, this
+proves that no path exists.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ _RESERVE = 0.8  # of the edge that would do
 ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
 COST, ENERGY = "cost", "energy_integral_jm"
-"""What a certificate bounds: the planner's cost, or the integral of energy [J m]."""
+"""Quantity that a certificate bounds: the planner's cost, or the integral of energy [J m]."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ class Certificate:
     """A lower bound and how it was reached.
 
     Attributes:
-        lower: No path that keeps the limits, on the field or on the branch, costs less to where
-            the goal is on the field.
-        upper: Cost of the best path known, infinite without one.
+        lower: No path that keeps the limits, on the field or on the branch, costs less to the
+            field's position of the goal.
+        upper: Cost of the best known path, infinite without one.
         levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
-        field_error_j: What was subtracted from the energy before bounding [J].
-        to_go: The bound from anywhere, on the first grid.
-        stopped: It was cancelled before it was close enough.
-        quantity: What is bounded, ``COST`` or ``ENERGY``.
+        field_error_j: Subtracted from the energy before bounding [J].
+        to_go: The bound from any position, on the first grid.
+        stopped: Whether it was cancelled before the gap was small enough.
+        quantity: Bounded quantity, ``COST`` or ``ENERGY``.
     """
 
     lower: float
@@ -77,7 +77,7 @@ class Certificate:
 
     @property
     def gap(self) -> float:
-        """How far above the best the known path can be at most: upper / lower - 1."""
+        """Largest possible excess of the known path over the best: upper / lower - 1."""
         if self.upper == 0.0:
             return 0.0
         return self.upper / self.lower - 1.0 if self.lower > 0.0 else np.inf
@@ -93,14 +93,14 @@ class Certificate:
 
 
 Improve = Callable[[np.ndarray | None], float]
-"""Takes a rough path [n, 3] along the cheapest way of a grid; returns the best known cost."""
+"""Takes a rough path [n, 3] along the cheapest path of a grid; returns the best known cost."""
 
 
 def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
             progress: Progress = SILENT) -> Certificate:
     """Return a lower bound on the cost of every path, refined until it is close to the known one.
 
-    Cancelled (or by Ctrl-C) once a path is known, it returns what there is.
+    If cancelled (or by Ctrl-C) once a path is known, it returns the current result.
 
     Raises:
         NoPathError: closed cells separate start and goal; it is proven that no path exists.
@@ -142,13 +142,13 @@ class _Search:
             found = _bound(self.problem, self.grid, self.cell)
         except NoPathError:
             if level == 0:
-                # Corners so far apart say too little of what lies in a narrow valley.
+                # Corners this far apart do not resolve a narrow valley.
                 self.grid, self.cell = refined(self.grid, self.grid.open_cells,
                                                self.grid.about_goal, self.cell)
                 self.upper = self.improve(None)
                 return False
             if self.upper < np.inf:
-                # A path that keeps the limits is the better proof.
+                # A path that keeps the limits is the stronger proof.
                 self._note(0)
                 return True
             raise
@@ -169,8 +169,9 @@ class _Search:
         return False
 
     def _ratio(self) -> float:
-        """Return the edge of the next grid's cells over this one's: as fine as it takes to close
-        the gap, which goes as the square of the edge."""
+        """Return the ratio of the next grid's cell edge to this one's: as fine as needed to close
+        the gap, which is proportional to the square of the edge.
+        """
         gap = self.upper / self.lower - 1.0 if self.lower > 0.0 else np.inf
         if not np.isfinite(gap):
             return FINEST
@@ -184,7 +185,7 @@ class _Search:
 
 @dataclass(frozen=True)
 class _Bounds:
-    """The sub-solution of the goal on one grid, and what it says."""
+    """The sub-solution of the goal on one grid, and its bound."""
 
     lower: float
     ground: Terrain
@@ -222,7 +223,7 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     open_cells &= ~over
     if not open_cells[tuple(cell)]:
         raise _separated(problem, grid, open_cells, grid.points(cell[None] + 0.5))
-    # Only what hangs together with the start, also by an edge or a corner of a cell.
+    # Only cells connected to the start, also by an edge or a corner of a cell.
     together = scipy.ndimage.label(open_cells, _NEAR)[0]
     open_cells = together == together[tuple(cell)]
     raw = energy - problem.field_error
@@ -253,7 +254,7 @@ def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, ne
     start and the cells ``near`` the goal."""
     offsets = np.moveaxis(np.indices(open_cells.shape), 0, -1) - cell
     away = np.linalg.norm(offsets, axis=-1) + scipy.ndimage.distance_transform_edt(~near)
-    # Half a diagonal in the cell itself, as much in the goal's and at both ends of the way there.
+    # Half a diagonal in the cell itself, as much in the goal's, and at both ends of the path there.
     within = open_cells & (grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest)
     within[tuple(cell)] = True
     together = scipy.ndimage.label(within, _NEAR)[0]
@@ -268,7 +269,7 @@ def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a blunt tip: no kink
     nothing = np.zeros(ground.open_cells.shape, bool)
     u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)
-    # The spline lies above its blunt tip's zero at the start by at most its error there.
+    # At the start, the spline exceeds the zero of its blunt tip by at most its error there.
     return u - factor * CURVATURE_FACTOR * 3.0 * h / 16.0
 
 
@@ -285,8 +286,9 @@ def _surely_outside(problem: GentleProblem, grid: Grid) -> np.ndarray:
 
 def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: np.ndarray,
                  force: np.ndarray) -> np.ndarray:
-    """Return those of ``cells`` in which no point keeps the limits, the field's error counted;
-    ``energy`` and ``force`` at their corners and next to them."""
+    """Return those of ``cells`` in which no point keeps the limits, including the field's error;
+    ``energy`` and ``force`` at their corners and next to them.
+    """
     limits, field, over = problem.sure_limits, problem.energy_field, np.zeros(cells.shape, bool)
     nodes = np.argwhere(corners_of(cells))
 

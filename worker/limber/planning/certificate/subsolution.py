@@ -1,8 +1,8 @@
 """A function on a grid that no path can beat: the proof of a lower bound.
 
-A path's cost is the integral of c over its length. If |grad u| <= c wherever the path runs, its
-cost is at least u(start) - u(end): integrate grad u along it. So any u that keeps the inequality
-proves a bound; how u was found does not matter.
+A path's cost is the integral of c over its length. If |grad u| <= c along the path, its cost is at
+least u(start) - u(end): integrate grad u along it. So any u that satisfies the inequality proves a
+bound; how u was found does not matter.
 
 Here u is a quadratic B-spline (its gradient is continuous, so that the loss is of second order in
 the edge h of a cell; with trilinear u it was of first order, 8 % instead of 2 % on one grid), one
@@ -12,20 +12,20 @@ coefficient a cell. In a cell
   point grad u is a mean of the 27 Bernstein coefficients with the basis as weights, so |grad u| is
   at most the same mean of their magnitudes;
 - c is at least the trilinear interpolation of its values at the corners, less
-  ``sum_i M_i x_i (h - x_i) / 2`` with ``M_i`` the most that d^2 c / dx_i^2 is there. The Bernstein
-  coefficients of the one are its values at the 27 points, those of the other ``M_i h^2 / 4`` where
-  the point lies half-way along axis i, else 0.
+  ``sum_i M_i x_i (h - x_i) / 2`` with ``M_i`` the maximum of d^2 c / dx_i^2 there. The Bernstein
+  coefficients of the former are its values at the 27 points, those of the latter ``M_i h^2 / 4``
+  where the point is half-way along axis i, else 0.
 
-So |g_m| at most the difference of the two at the 27 points of an open cell is enough; or at most
-the first less all that the second ever is, ``sum_i M_i h^2 / 8``; or at most the least that c is
-anywhere, the cost of length alone. (With the squares of both the slope of c would count as well:
-four times as much about a narrow valley.) The second derivatives are the one thing that is not
-proven: they are taken as at most the largest second difference of c at the cell's corners and the
-next ones along the axis, and as much more as these differ; or as ``CURVATURE_FACTOR`` times the
-largest size of those at its corners, if that is less; never as less than 0, nor than the change of
-slope between the corners says (:mod:`limber.planning.certificate.cell_bounds`): the floor of a
-valley may lie between them. Where c has a kink of the other kind inside a cell (the energy is cut
-off at zero) the cost of length counts.
+So it is enough that |g_m| is at most the difference of the two at the 27 points of an open cell; or
+at most the former less the maximum of the latter, ``sum_i M_i h^2 / 8``; or at most the minimum of
+c anywhere, the cost of length alone. (With the squares of both, the slope of c would count as well:
+four times as much about a narrow valley.) Only the second derivatives are not proven. They are
+taken as at most the largest second difference of c at the cell's corners and the next ones along
+the axis, plus the difference between these; or as ``CURVATURE_FACTOR`` times the largest size of
+those at its corners, if that is less. They are never less than 0, nor than the change of slope
+between the corners requires (:mod:`limber.planning.certificate.cell_bounds`): the floor of a valley
+may be between them. Where c has a kink of the other kind inside a cell (the energy is cut off at
+zero), the cost of length counts.
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, turns
 from limber.planning.certificate.fast_marching import march, neighbours
 
 RIM = 2
-"""Closed cells about the open ones that have coefficients as well."""
+"""Closed cells around the open ones that have coefficients as well."""
 
 _ROUNDS = 8  # of local reweighting; ends when nothing is over by more than _CLOSE
 _CLOSE = 1.0005
@@ -47,15 +47,15 @@ _LARGE = 100_000  # one alone where so many cells are asked: it takes a third of
 
 
 class Terrain(NamedTuple):
-    """A grid of cells, which of them are open, and what a metre costs there.
+    """A grid of cells, which of them are open, and the cost per metre there.
 
     Attributes:
         spacing: Edge of a cell [m].
         open_cells: Cells that a path may enter, bool [nx, ny, nz]; none at the grid's border.
         rate: c at the corners [1/m], shape [nx + 1, ny + 1, nz + 1].
-        bends: What is subtracted from it half-way along each axis, [3, *shape of open_cells].
-        level: Cells where the floor alone counts, shape of ``open_cells``.
-        floor: What c never falls below [1/m].
+        bends: Subtracted from it half-way along each axis, [3, *shape of open_cells].
+        level: Cells where only the floor counts, shape of ``open_cells``.
+        floor: Lower bound of c [1/m].
     """
 
     spacing: float
@@ -67,16 +67,16 @@ class Terrain(NamedTuple):
 
     @property
     def active(self) -> np.ndarray:
-        """Cells that have coefficients: open cells and those about them, ``RIM`` deep.
+        """Cells that have coefficients: open cells and ``RIM`` layers around them.
 
-        Open cells need those of their neighbours. The others let a cost arrive along a slanting
-        border as if there were none: about each of its steps it would bend, and be too steep.
+        Open cells need those of their neighbours. The others let a cost arrive along an oblique
+        border as if there were none: at each of its steps it would bend and be too steep.
         """
         return widened(self.open_cells, RIM)
 
 
 def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
-    """Return ``cells`` and all that touch them, ``times`` deep."""
+    """Return ``cells`` and ``times`` layers of cells around them."""
     out = cells.copy()
     for _ in range(times):
         for axis in range(3):
@@ -91,9 +91,9 @@ def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cel
             spacing: float, floor: float) -> Terrain:
     """Return the terrain of ``rate`` at the corners, nowhere below ``floor`` [1/m].
 
-    ``slopes`` [..., 3] are what it grows by a cell's edge there, along each; ``positive`` says at
-    which corners the energy is not cut off; corners that were not evaluated hold nan in ``rate``
-    and are no neighbours of an open cell's.
+    ``slopes`` [..., 3] are its growth per cell edge there, along each axis; ``positive`` marks the
+    corners where the energy is not cut off; corners that were not evaluated are nan in ``rate`` and
+    are not neighbours of an open cell's.
     """
     bends = np.maximum(_bends(rate, open_cells), 0.25 * turns(slopes, open_cells))
     level = with_corner(positive) & with_corner(~positive)
@@ -186,11 +186,11 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     Args:
         ground: The terrain.
         known: Cells on and about the source, bool [nx, ny, nz].
-        shape: A length [m] there that grows by about a metre a metre: a signed distance.
-        free_cells: Cells where nothing is asked: those wholly inside the source.
-        rounds: Of local reweighting; fewer give a lower ``u``, never a wrong one.
+        shape: A length [m] there that grows by about a metre per metre: a signed distance.
+        free_cells: Cells without a condition: those entirely inside the source.
+        rounds: Number of local reweightings; fewer give a lower ``u``, never an invalid one.
 
-    The coefficients are ``factor * shape`` on ``known``; infinite where nothing leads from there.
+    The coefficients are ``factor * shape`` on ``known``; infinite where unreachable from there.
     """
     active = ground.active
     around = known & active
@@ -222,16 +222,16 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
         factor /= float(over[beside].max())
         beside = about
         over[held] = 1.0
-        # The largest of the neighbours: cell by cell stirs up a chequerboard.
+        # The largest of the neighbours: cell by cell would cause a chequerboard pattern.
         rate = rate / _most_about(over, numbers, places)
-    # The rescaling is what makes it a proof; the rounds before only keep it small.
+    # The rescaling makes it a proof; the rounds before only keep it small.
     u.ravel()[places] = best / least
     return u, of_best / least
 
 
 @compiled
 def _middles(values, places, shape):
-    """Return the mean of the values at the corners of the cells at ``places`` [n] of a grid."""
+    """Return the mean of the values at the corners of the cells ``places`` [n] of a grid."""
     out = np.empty(len(places))
     for n in range(len(places)):
         i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
@@ -337,8 +337,9 @@ def _slope_first(source, out):
 
 @compiled
 def _excess(u, spacing, open_cells, rate, bends, level, floor, asked):
-    """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| over what is allowed
-    there, else 0."""
+    """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| relative to the
+    allowed value there, else 0.
+    """
     over = np.zeros(len(asked))
     along, down = np.empty((3, 3, 3)), np.empty((3, 3, 3))
     one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))

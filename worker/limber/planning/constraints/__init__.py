@@ -1,1 +1,1 @@
-"""What a path must keep: limits, obstacles, and their checks on the full model and in motion."""
+"""Conditions on a path: limits, obstacles, and their checks on the full model and in motion."""

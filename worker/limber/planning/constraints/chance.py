@@ -1,15 +1,15 @@
 """The effect of an uncertain Young's modulus on the limits of a plan.
 
-A pose of the gripper is kept whatever the modulus is; energy, force and stress there are not. The
-moduli are log-normal. Of what a limit is on, with its sign or its direction, a quadratic response
-surface in the logs is laid through the full model's values at two standard deviations along each
-axis of the posterior and between the axes (Box and Wilson 1951; for reliability Bucher and Bourgund
-1990). Not of a magnitude or its log: a force is a difference of what bends the branch and what it
-weighs, may be small or turn, and its log bends without end. Forces, energies and stresses grow
-with the moduli if all grow and weight is little: the surface is of what they are over the mean
-growth. What the values of all poses are together is drawn from the surfaces: other poses break
-their limit under other moduli, and the motion is to keep it at each. Several limits share the
-probability that is left (Bonferroni).
+A pose of the gripper is kept for any modulus; energy, force and stress there are not. The moduli
+are log-normal. For each limited quantity, with its sign or direction, a quadratic response surface
+in the logs is fitted to the full model's values at two standard deviations along each axis of the
+posterior and between the axes (Box and Wilson 1951; for reliability Bucher and Bourgund 1990). It
+is not fitted to a magnitude or its log: a force is the difference between the bending force and the
+weight, may be small or change direction, and the curvature of its log is unbounded. Forces,
+energies and stresses grow with the moduli if all grow and weight is small: the surface is fitted to
+their ratio to the mean growth. The values of all poses are drawn jointly from the surfaces:
+different poses break their limit under different moduli, and the motion must keep it at each.
+Several limits share the remaining probability (Bonferroni).
 """
 
 from dataclasses import dataclass, replace
@@ -34,12 +34,12 @@ _DRAWS_LOG2 = 14  # quasi-random draws: the chance of 0.95 is off by some 0.0005
 
 @dataclass(frozen=True)
 class Risk:
-    """How well limits hold with uncertain moduli.
+    """Probability that limits hold with uncertain moduli.
 
     Attributes:
-        kept: Probability that all are kept along the motion, at least.
-        factors: By limit: how many times its peak on the estimate it may be, with the confidence.
-        excess: By limit: that over what is allowed.
+        kept: Lower bound of the probability that all are kept along the motion.
+        factors: By limit: possible peak over its peak on the estimate, at the given confidence.
+        excess: By limit: possible peak over the allowed value.
     """
 
     kept: float
@@ -47,9 +47,10 @@ class Risk:
     excess: dict[str, float]
 
     def left(self, limits: Limits, path: ResolvedPath) -> Limits:
-        """Return what the estimate's branch may reach in motion where the motion keeps limits.
+        """Return the limits on the estimate's branch in motion with which the motion keeps
+        ``limits``.
 
-        As far below them as standing still, at the pose where each is nearest.
+        As far below the limits as at standstill, at the pose nearest to each.
         """
         standing = sizes(path.ahead)
         return limits.tightened({
@@ -57,7 +58,7 @@ class Risk:
             for name, share in self.excess.items()})
 
     def told(self) -> list[str]:
-        """Describe the limits that do not hold at the confidence."""
+        """Describe the limits that do not hold at the given confidence."""
         return [f"at the requested confidence, {name.replace('_', ' ')} may reach "
                 f"{100 * share:.0f} % of its limit"
                 for name, share in self.excess.items() if share > 1.0]
@@ -69,9 +70,9 @@ class Surface:
 
     Attributes:
         whitening: From changes of log E [K] to standard deviations along the axes, shape [r, K].
-        pairs: Axes whose products count, shape [p, 2].
-        weights: Of 1, the axes and the products, shape [1 + r + p, n, parts]; a size is that of
-            the parts together.
+        pairs: Axes with product terms, shape [p, 2].
+        weights: Of 1, the axes and the products, shape [1 + r + p, n, parts]; a size is the norm
+            over the parts.
         degree: Power of the mean growth.
     """
 
@@ -83,8 +84,9 @@ class Surface:
     @classmethod
     def through(cls, axes: np.ndarray, pairs: np.ndarray, places: np.ndarray, values: np.ndarray,
                 degree: float) -> "Surface":
-        """Lay it through ``values`` [m, n, parts] at ``places`` [m, r] in standard deviations along
-        ``axes`` [K, r]; as many places as there are weights."""
+        """Fit it to ``values`` [m, n, parts] at ``places`` [m, r] in standard deviations along
+        ``axes`` [K, r]; as many places as weights.
+        """
         grown = _growth(places @ axes.T, degree)
         right = (values / grown[:, None, None]).reshape(len(places), -1)
         weights = np.linalg.solve(_features(places, pairs), right)
@@ -108,18 +110,18 @@ def _features(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Exposure:
-    """What limits are on, at poses of a motion that come near to them.
+    """Limited quantities at poses of a motion that come near their limits.
 
     Attributes:
         asked: The limits, by name.
-        surfaces: What each is on; none where no pose comes near.
+        surfaces: Surface of each quantity; none if no pose comes near.
     """
 
     asked: dict[str, float]
     surfaces: dict[str, Surface]
 
     def risk(self, covariance: np.ndarray, confidence: float) -> Risk:
-        """Return how the motion keeps its limits where log E has this covariance [K, K]."""
+        """Return how well the motion keeps its limits if log E has this covariance [K, K]."""
         logs = _draws(covariance)
         kept, factors, excess = np.ones(len(logs), bool), {}, {}
         share = 1.0 - (1.0 - confidence) / max(len(self.asked), 1)
@@ -145,8 +147,9 @@ class YoungUncertainty:
     """Moduli at control points, log-normal about the estimate.
 
     Attributes:
-        shares: Of each control point in each tetrahedron's modulus, rows sum to 1, [tets, K].
-        deviations: Of log E at the control points, shape [K].
+        shares: Fraction of each control point in each tetrahedron's modulus, rows sum to 1, [tets,
+        K].
+        deviations: Standard deviations of log E at the control points, shape [K].
         correlation: Shape [K, K].
     """
 
@@ -167,7 +170,7 @@ class YoungUncertainty:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of log E at the control points, shape [K, K]."""
+        """Covariance of log E at the control points, shape [K, K]."""
         return self.correlation * np.outer(self.deviations, self.deviations)
 
     def risk(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits, confidence: float,
@@ -186,7 +189,7 @@ class YoungUncertainty:
         Raises:
             ConvergenceError: the branch with other moduli cannot be solved at a pose.
         """
-        # Where the branch is with its grasp at a place hardly depends on its modulus.
+        # With the grasp at a given position, the branch's shape hardly depends on its modulus.
         asked = limits.asked_loads()
         whole = path.approach.joined(path.solved)
         chosen = whole.take(_chosen(whole, asked))
@@ -233,8 +236,9 @@ class YoungUncertainty:
 
 
 def _axes(covariance: np.ndarray) -> np.ndarray:
-    """Return changes of log E by one standard deviation along the axes of the posterior that is
-    open at all, that of most variance first, shape [K, r]."""
+    """Return changes of log E by one standard deviation along the axes of the posterior that have
+    any variance, the largest first, shape [K, r].
+    """
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     order = np.argsort(-variances, kind="stable")
     order = order[variances[order] > 1e-12 * max(float(variances.max()), 1e-300)]
@@ -243,7 +247,8 @@ def _axes(covariance: np.ndarray) -> np.ndarray:
 
 def _design(count: int, far: float) -> tuple[np.ndarray, np.ndarray]:
     """Return places [m, r] along and between axes, the middle first, and the axes [p, 2] whose
-    products can be told from them."""
+    products they determine.
+    """
     crossed = [(k, other) for k in range(min(count, _CROSSED)) for other in range(k)]
     unit = far * np.eye(count)
     between = [(unit[k] + unit[other]) / np.sqrt(2.0) for k, other in crossed]
@@ -252,7 +257,7 @@ def _design(count: int, far: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parts(states: SolvedPoses, name: str) -> np.ndarray:
-    """Return what a limit is on with its sign or direction, shape [n, parts]."""
+    """Return a limited quantity with its sign or direction, shape [n, parts]."""
     vectors = {"force": states.forces, "torque": states.torques}
     if name in vectors:
         return vectors[name]
@@ -260,8 +265,9 @@ def _parts(states: SolvedPoses, name: str) -> np.ndarray:
 
 
 def _chosen(states: SolvedPoses, asked: dict[str, float]) -> np.ndarray:
-    """Return the poses to ask: some of those that may break a limit under some moduli, evenly along
-    the motion, and where each limit is nearest."""
+    """Return the poses to solve: some of those that may break a limit under some moduli, evenly
+    along the motion, and the pose nearest to each limit.
+    """
     known = sizes(states)
     high = np.flatnonzero(np.any([known[name] > max(_HIGH * known[name].max(), _NEAR * limit)
                                   for name, limit in asked.items()], axis=0))

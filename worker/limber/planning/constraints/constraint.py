@@ -1,8 +1,8 @@
 """Constraints on a plan in addition to the limits on energy, force and loads.
 
-A constraint says what it is on in a state of the full model. The energy field learns that at its
-samples (:func:`~limber.planning.field.energy_field.knowing`), and with it the gradient and the
-error that margins and proofs count on. One from outside is made from settings by a function in
+A constraint returns its limited quantity for a state of the full model. The energy field learns it
+at its samples (:func:`~limber.planning.field.energy_field.knowing`), and with it the gradient and
+the error that margins and proofs use. An external constraint is made from settings by a function in
 :data:`~limber.planning.constraints.limits.CONSTRAINTS`.
 """
 
@@ -17,9 +17,9 @@ class Broken:
     """A limit that a state of the full model breaks.
 
     Attributes:
-        name: Which, with its unit.
-        value, limit: The state's and what was asked.
-        position: Of the grasp there [m], shape [3].
+        name: Name of the limit, with its unit.
+        value, limit: The state's value and the requested limit.
+        position: Position of the grasp there [m], shape [3].
     """
 
     name: str
@@ -33,19 +33,20 @@ class Broken:
 
 
 class Constraint(Protocol):
-    """A limit on the grasp's place and the branch's shape.
+    """A limit on the grasp's position and the branch's shape.
 
     Attributes:
-        name: No other's, in small letters and underscores.
-        limit: What its value may not exceed, above 0.
+        name: Unique, in small letters and underscores.
+        limit: Largest allowed value, above 0.
     """
 
     name: str
     limit: float
 
     def values(self, grasps: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return what is limited in states with the grasp at ``grasps`` [k, 3] and the nodes at
-        ``nodes`` [k, n, 3], both in m: never below 0, and smooth, shape [k]."""
+        """Return the limited quantity of states with the grasp at ``grasps`` [k, 3] and the nodes
+        at ``nodes`` [k, n, 3], both in m: never below 0, and smooth, shape [k].
+        """
         ...
 
     def tightened(self, factor: float) -> "Constraint":
@@ -53,7 +54,7 @@ class Constraint(Protocol):
         ...
 
     def broken(self, grasps: np.ndarray, nodes: np.ndarray) -> str | None:
-        """Describe where states break it most; None where they keep it."""
+        """Describe where states break it most; None if they keep it."""
         values = self.values(grasps, nodes)
         worst = int(values.argmax())
         return str(Broken(self.name.replace("_", " "), float(values[worst]), self.limit,

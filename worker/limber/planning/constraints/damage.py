@@ -1,11 +1,11 @@
-"""The probability that a branch breaks, by the strain at which such branches broke.
+"""The probability that a branch breaks, from the strains at which similar branches broke.
 
-A branch breaks where its largest strain exceeds what it bears: a Weibull variable, as the strength
-of brittle and fibrous parts is (Weibull 1951). Its shape and scale come from the user's own break
-tests, or from a species. Of few tests they are not known well: with shape k and scale s fitted by
-maximum likelihood, ``k_fit / k`` and ``k_fit log(s_fit / s)`` have distributions that do not depend
-on the truth (Thoman, Bain and Antle 1969). Drawn from samples of the fit, they give shapes and
-scales as likely as the tests leave them, and the probability of damage is the mean over those.
+A branch breaks where its largest strain exceeds its strain at break: a Weibull variable, as is the
+strength of brittle and fibrous parts (Weibull 1951). Its shape and scale come from the user's
+own break tests, or from a species. A few tests do not determine them well: with shape k and scale s
+fitted by maximum likelihood, ``k_fit / k`` and ``k_fit log(s_fit / s)`` have distributions that do
+not depend on the truth (Thoman, Bain and Antle 1969). Samples of these distributions give shapes
+and scales consistent with the tests. The probability of damage is the mean over them.
 
 The gripper prescribes the pose: the strain there hardly depends on the stiffness, and grows with
 the branch's radius.
@@ -29,19 +29,21 @@ _COLUMN = "strain_at_break"
 _STEPS = 60  # of Newton's method, at most
 _SPREAD = 0.27
 """Coefficient of variation of a species' strain at rupture: those of modulus of rupture, 16 %, and
-of elasticity, 22 %, together (Wood Handbook, FPL-GTR-190, table 5-6)."""
+of elasticity, 22 %, combined (Wood Handbook, FPL-GTR-190, table 5-6).
+"""
 _RADII = np.array([-1.8, -1.1, -0.4, 0.4, 1.1, 1.8])  # deviations of the radius, evenly likely
 
 
 @dataclass(frozen=True)
 class Strength:
-    """The strain that branches like this one bear.
+    """The strain at break of branches like this one.
 
     Attributes:
-        shapes, scales: Of Weibull distributions, all as likely, shapes [d]; scales are strains.
-        radius_deviation: Of the branch's radius, relative.
-        source: Where it is from, in words.
-        tests: How many break tests; 0: none.
+        shapes, scales: Parameters of equally likely Weibull distributions, shapes [d]; scales are
+        strains.
+        radius_deviation: Relative deviation of the branch's radius.
+        source: Origin of the data, in words.
+        tests: Number of break tests; 0: none.
     """
 
     shapes: np.ndarray
@@ -53,10 +55,10 @@ class Strength:
     @classmethod
     def of_tests(cls, strains: np.ndarray, source: str, radius_deviation: float = 0.0,
                  ) -> "Strength":
-        """Return what break tests at ``strains`` [n] say.
+        """Return the strength from break tests at ``strains`` [n].
 
         Raises:
-            InputError: they are too few, or all the same.
+            InputError: there are too few, or all are equal.
         """
         if len(strains) < _FEWEST:
             raise InputError(f"{source} has {len(strains)} break tests.",
@@ -75,7 +77,7 @@ class Strength:
 
     @classmethod
     def of_species(cls, name: str, radius_deviation: float = 0.0) -> "Strength":
-        """Return that of green wood of a species with a known strain at rupture."""
+        """Return the strength of green wood of a species with a known strain at rupture."""
         mean = SPECIES[name].rupture_strain
         if mean is None:
             raise KeyError(name)
@@ -85,12 +87,12 @@ class Strength:
                    f"green wood of {name} (Wood Handbook)")
 
     def damage(self, strain: float) -> float:
-        """Return the probability that a branch breaks which is strained so much."""
+        """Return the probability that a branch with this strain breaks."""
         felt = max(strain, 0.0) * np.exp(self.radius_deviation * _RADII)
         return float(-np.expm1(-(felt[:, None] / self.scales) ** self.shapes).mean())
 
     def strain_limit(self, damage: float) -> float:
-        """Return the strain at which the probability is ``damage``, between 0 and 1."""
+        """Return the strain at which the probability of damage is ``damage``, between 0 and 1."""
         high = 10.0 * float(self.scales.max())
         return float(np.exp(scipy.optimize.brentq(
             lambda log: self.damage(np.exp(log)) - damage, np.log(1e-9 * high), np.log(high))))
@@ -101,13 +103,13 @@ class Strength:
         return self.strain_limit(0.5)
 
     def describe(self, strain: float) -> dict[str, Any]:
-        """Return as plain data what this says of a largest ``strain``."""
+        """Return the assessment of a largest ``strain`` as plain data."""
         return {"source": self.source, "tests": self.tests, "median_strain": self.median,
                 "peak_strain": strain, "damage_probability": self.damage(strain)}
 
 
 def assumed(strain: float) -> dict[str, Any]:
-    """Return as plain data what is said of a largest ``strain`` where no strength is known."""
+    """Return the assessment of a largest ``strain`` without a known strength, as plain data."""
     return {"source": "green wood, assumed", "tests": 0, "median_strain": STRENGTH_OVER_YOUNG,
             "peak_strain": strain, "damage_probability": None}
 
@@ -116,7 +118,7 @@ def read_break_tests(path: Path) -> np.ndarray:
     """Return strains at break [n] of a CSV with a column ``strain_at_break``.
 
     Raises:
-        InputError: there is no such file or column, or a value that is no strain.
+        InputError: there is no such file or column, or a value is not a strain.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -150,7 +152,7 @@ def _variation(shape: float) -> float:
 
 @compiled
 def _fitted(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return shapes and scales [d] of most likelihood for ``logs`` [d, n] of Weibull variables."""
+    """Return maximum-likelihood shapes and scales [d] for ``logs`` [d, n] of Weibull variables."""
     shapes, scales = np.empty(len(logs)), np.empty(len(logs))
     for d in range(len(logs)):
         row = logs[d]

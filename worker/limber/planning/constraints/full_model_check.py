@@ -1,4 +1,4 @@
-"""Check of a planned motion on the full model, and the samples gained where it fails."""
+"""Check of a planned motion on the full model, and the samples gained if it fails."""
 
 from dataclasses import replace
 
@@ -18,16 +18,16 @@ _SLACK = 1e-3  # share of the goal's tolerance that is round-off
 
 def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: np.ndarray,
                          ) -> list[str]:
-    """Return what is wrong with a motion, each with its position; empty if it is allowed.
+    """Return the violations of a motion, each with its position; empty if it is allowed.
 
-    Every pose of approach and path must have an acceptable solution within the limits, keep the
-    constraints, and its end must be in the goal region. The way back takes the same states.
+    Every pose of approach and path must have an acceptable solution within the limits and keep the
+    constraints, and the end must be in the goal region. The return path takes the same states.
 
     Args:
         path: Solved on the full model.
-        limits: As asked, without margins.
+        limits: As requested, without margins.
         goal: Where it must end.
-        nodes: Of the mesh at rest [m], shape [n, 3].
+        nodes: Nodes of the mesh at rest [m], shape [n, 3].
     """
     told = []
     for position, reason in zip(path.unsolved, path.reasons, strict=True):
@@ -44,18 +44,19 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
 
 
 def field_error(field: EnergyField, states: SolvedPoses) -> float:
-    """Return how far the field's energy is from that of states, root mean square over theirs."""
+    """Return the error of the field's energy against states, relative root mean square."""
     size = float(np.sqrt(np.mean(states.energies**2)))
     off = field.energy(states.poses[:, :3]) - np.maximum(states.energies, 0.0)
-    # At rest there is nothing but round-off.
+    # At rest there is only round-off.
     felt = size > _ROUND_OFF * field.samples.energies.max()
     return float(np.sqrt(np.mean(off**2))) / size if felt else 0.0
 
 
 def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
            ) -> GraspSamples:
-    """Return states of a path that is not passed on as samples: its end, where limits are broken,
-    and where the field is off most; and poses that have no solution as rejected ones."""
+    """Return states of a rejected path as samples: its end, where limits are broken, and where the
+    field's error is largest; and poses without a solution as rejected ones.
+    """
     whole = path.approach.joined(path.solved)
     off = np.abs(field.energy(whole.poses[:, :3]) - whole.energies)
     added = limits.values(whole.poses[:, :3], grasp_model.mesh.nodes + whole.displacements)

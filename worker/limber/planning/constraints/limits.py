@@ -1,8 +1,8 @@
-"""What no pose of a motion may exceed, with margins for the field, and its check on the full model.
+"""Limits on every pose of a motion, with margins for the field, and their check on the full model.
 
 A planner sees the field, which is wrong by its measured error. It therefore plans with limits that
-are tighter by a margin: what 95 % of the samples near the limit, each left out of the fit in turn,
-are missed by at most. Whether a limit is kept is decided on the full model alone.
+are tighter by a margin: 95 % of the samples near the limit, each left out of the fit in turn, have
+an error of at most this margin. Whether a limit is kept is decided on the full model alone.
 """
 
 from collections.abc import Callable
@@ -27,21 +27,21 @@ _MOST = 0.3  # of the limit: where the field is worse, the check on the full mod
 
 
 CONSTRAINTS: list[Callable[[PlanSettings], Constraint | None]] = []
-"""What makes constraints from outside from a plan's settings, or None where none is asked for."""
+"""Makes external constraints from a plan's settings, or None if none is requested."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits as requested; infinite where none is.
+    """The limits as requested; infinite if none is.
 
     Attributes:
-        energy: Above the hanging state [J].
-        force: Magnitude of the gripper's [N].
-        strain, stress: Largest principal anywhere in the branch, stress in Pa.
-        axial_force: Of the gripper along the branch, pulling or pushing [N].
-        torque: Of the gripper [Nm].
+        energy: Energy above the hanging state [J].
+        force: Magnitude of the gripper's force [N].
+        strain, stress: Largest principal values anywhere in the branch, stress in Pa.
+        axial_force: Force of the gripper along the branch, pulling or pushing [N].
+        torque: Torque of the gripper [Nm].
         low, high: Box that the grasp stays in [m], shape [3].
-        constraints: What is forbidden besides.
+        constraints: Additional constraints.
     """
 
     energy: float = np.inf
@@ -56,11 +56,11 @@ class Limits:
 
     def with_cell(self, low: np.ndarray | None, high: np.ndarray | None, force: float,
                   obstacles: tuple[Obstacle, ...], clearance: float = 0.0) -> "Limits":
-        """Return the limits with those of a robot's cell besides; ``clearance`` [m] is kept from
-        its obstacles.
+        """Return the limits with those of a robot's cell added; ``clearance`` [m] is kept from its
+        obstacles.
 
         Raises:
-            InputError: the workspaces have nothing in common.
+            InputError: the workspaces do not intersect.
         """
         more = (Obstacles.keeping(obstacles, clearance),) if obstacles else ()
         both = replace(self, force=min(self.force, force),
@@ -74,8 +74,9 @@ class Limits:
         return both
 
     def values(self, grasps: np.ndarray, nodes: np.ndarray) -> dict[str, np.ndarray]:
-        """Return what the constraints are on in states with the grasp at ``grasps`` [k, 3] and the
-        nodes at ``nodes`` [k, n, 3], by name, shape [k] each."""
+        """Return the constraints' quantities of states with the grasp at ``grasps`` [k, 3] and the
+        nodes at ``nodes`` [k, n, 3], by name, shape [k] each.
+        """
         return {each.name: each.values(grasps, nodes) for each in self.constraints}
 
     def met(self, grasps: np.ndarray, nodes: np.ndarray) -> list[str]:
@@ -86,11 +87,11 @@ class Limits:
     def of(cls, settings: PlanSettings, stiffer: float = 1.0) -> "Limits":
         """Return the settings' limits.
 
-        ``stiffer`` is how many times Young's modulus may be what was estimated: so much more may
-        the stress be than what a model with the estimate says.
+        ``stiffer`` is the possible ratio of Young's modulus to its estimate: the stress may exceed
+        that of a model with the estimate by this factor.
 
         Raises:
-            InputError: the workspace is empty, or the strain limited twice.
+            InputError: the workspace is empty, or the strain is limited twice.
         """
         strain = settings.max_strain or np.inf
         if settings.wood is not None and settings.max_damage is None:
@@ -120,16 +121,16 @@ class Limits:
             for each in self.constraints))
 
     def asked_loads(self) -> dict[str, float]:
-        """Return the limits without constraints that were asked for, by the names of ``UNITS``."""
+        """Return the requested limits without constraints, by the names of ``UNITS``."""
         limits = {name: getattr(self, name, np.inf) for name in UNITS}
         return {name: limit for name, limit in limits.items() if limit < np.inf}
 
     def asked(self) -> dict[str, float]:
-        """Return the limits that were asked for, by the names of ``UNITS`` and of constraints."""
+        """Return the requested limits, by the names of ``UNITS`` and of constraints."""
         return self.asked_loads() | {each.name: each.limit for each in self.constraints}
 
     def margins(self, known: EnergyField) -> "dict[str, float]":
-        """Return how much tighter than asked to plan on a field: by limit, 0 for none asked."""
+        """Return how much tighter than requested to plan on a field: by limit, 0 without one."""
         missed = {"energy": known.missed[:, 0],
                   "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
                   **dict(zip(known.load_names, known.missed[:, 4:].T, strict=True))}
@@ -148,12 +149,12 @@ class Limits:
         return found
 
     def doubts(self, known: EnergyField) -> "dict[str, float]":
-        """Return by how much more than a limit the field may say of a pose that keeps it: by
-        limit, 0 for none asked, infinite where the field's error is not known.
+        """Return by how much the field may exceed a limit at a pose that keeps it: by limit, 0 if
+        not requested, infinite if the field's error is not known.
 
-        The most that the field, fitted without it, says too much of a sample that keeps the limit
-        or is not far over it. A proof that no path keeps the limits counts on that: margins, which
-        most poses keep, would do for a plan that is checked afterwards, and for no proof.
+        The largest overestimate of the field, fitted without it, at a sample that keeps the limit
+        or is not far over it. A proof that no path keeps the limits relies on this. Margins, which
+        most poses keep, are sufficient for a plan that is checked afterwards, but not for a proof.
         """
         found = dict.fromkeys(UNITS, 0.0)
         inner, values = ~known.region.is_face(), sampled_sizes(known.samples)
@@ -171,15 +172,16 @@ class Limits:
         return found
 
     def in_words(self) -> str:
-        """Describe the limits that were asked for, or return an empty string."""
+        """Describe the requested limits, or return an empty string."""
         kept = [f"{name.replace('_', ' ')} {limit:.3g} {UNITS.get(name, '')}".rstrip()
                 for name, limit in self.asked().items()]
         return (" at most " + " and ".join(kept)) if kept else ""
 
     @staticmethod
     def above(known: EnergyField) -> dict[str, np.ndarray]:
-        """Return by how much the field, fitted without it, says too much of each sample, by the
-        names of ``UNITS`` and of constraints, shape [m] each; nan where that is not known."""
+        """Return the field's overestimate at each sample, fitted without it, by the names of
+        ``UNITS`` and of constraints, shape [m] each; nan if not known.
+        """
         samples, missed = known.samples, known.missed
         size = np.linalg.norm(samples.forces, axis=1)
         above = {"energy": missed[:, 0],
@@ -189,15 +191,17 @@ class Limits:
         return above | dict(zip(known.load_names, more.T, strict=True))
 
     def errors(self, known: EnergyField) -> dict[str, LocalError]:
-        """Return by how much the field may say too much, as a function of the place in the plain
-        chart, by limit: at no sample left out it was more; nowhere more than :meth:`doubts`."""
+        """Return the field's possible overestimate as a function of the position in the plain
+        chart, by limit: no left-out sample exceeded it; nowhere more than :meth:`doubts`.
+        """
         doubts = self.doubts(known)
         return self._local(known, 1.0, 1.0, {name: doubts[name] for name in self.asked()
                                              if np.isfinite(doubts[name])})
 
     def within(self, known: EnergyField, share: float) -> FieldArrays:
-        """Return the field with these limits, tighter at each place by a ``share`` of what the
-        field may say too little there, which 95 % of the samples left out keep."""
+        """Return the field with these limits, tighter at each position by a ``share`` of the
+        field's possible underestimate there, which 95 % of the left-out samples keep.
+        """
         errors = self._local(known, -1.0, _COVERED, {name: _MOST * limit for name, limit
                                                      in self.asked().items()})
         names = ("energy", "force", *known.load_names)
@@ -208,8 +212,9 @@ class Limits:
 
     def _local(self, known: EnergyField, side: float, covered: float, most: dict[str, float],
                ) -> dict[str, LocalError]:
-        """Return the errors of the limits of ``most``; on the ``side`` of too much, 1, or too
-        little, -1."""
+        """Return the errors of the limits of ``most``; on the ``side`` of overestimates, 1, or
+        underestimates, -1.
+        """
         inner, above = ~known.region.is_face(), self.above(known)
         places = known.region.chart.plain.map(known.samples.positions)[inner]
         return {name: LocalError.of(places, side * above[name][inner], covered, limit)
@@ -227,7 +232,7 @@ class Limits:
                              low=self.low, high=self.high, **tighter)
 
     def broken(self, states: SolvedPoses) -> list[Broken]:
-        """Return the limits that states of the full model break, each where it is worst."""
+        """Return the limits that states of the full model break, each at its worst state."""
         places = states.poses[:, :3]
         outside = np.maximum(self.low - places, places - self.high).max(axis=1)
         asked = [(f"{name.replace('_', ' ')} [{UNITS[name]}]".replace(" []", ""), size,
@@ -246,7 +251,7 @@ class Limits:
 
 
 def sampled_sizes(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
-    """Return what limits are on at samples, by the names of ``UNITS``, shape [m] each."""
+    """Return the limited quantities at samples, by the names of ``UNITS``, shape [m] each."""
     return {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
             **samples.loads}
 
@@ -257,12 +262,12 @@ def with_unit(name: str) -> str:
 
 
 def limits_in_file(told: dict[str, dict[str, float]]) -> Limits:
-    """Return the limits that a plan's file tells, by the keys of :func:`with_unit`."""
+    """Return the limits in a plan's file, by the keys of :func:`with_unit`."""
     return Limits(**{name: float(told[with_unit(name)]["limit"]) for name in UNITS
                      if with_unit(name) in told})
 
 
 def sizes(states: SolvedPoses) -> dict[str, np.ndarray]:
-    """Return what limits are on, by the names of ``UNITS``, shape [n] each."""
+    """Return the limited quantities, by the names of ``UNITS``, shape [n] each."""
     return {"energy": states.energies, "force": states.force_sizes,
             **{name: np.abs(values) for name, values in states.loads.items()}}

@@ -1,10 +1,10 @@
-"""Whether a timed motion keeps its limits with inertia, and how slow it has to be for that.
+"""Whether a timed motion keeps its limits with inertia, and the pace at which it does.
 
 The full model is driven along approach and path as fast as the pace allows, by implicit Newmark
 steps, and back again from where the branch has come to rest at the path's end. Steps are short
-while the gripper gains or loses speed and until what that stirs up has passed its first peak; in
-between, where the branch merely follows, a step is as long as the way between the poses that the
-static check solves.
+while the gripper accelerates or decelerates and until the resulting vibration has passed its first
+peak. In between, where the branch merely follows, a step covers the distance between the poses that
+the static check solves.
 """
 
 from dataclasses import dataclass
@@ -37,12 +37,12 @@ class MotionCheck:
     """A motion on the full model in time.
 
     Attributes:
-        pace: The last that was tried; the one to go by if nothing is broken.
-        broken: What it breaks, each with its place; empty if it may be gone.
-        peaks, static_peaks: Largest values by limit that was asked for, with inertia and without.
-        slowings: How often it was slowed down.
-        excess: By limit: its peak over what is allowed.
-        step_count, seconds: Of all simulations.
+        pace: The last one tried; the one to use if nothing is broken.
+        broken: Limits that it breaks, each with its position; empty if the motion is allowed.
+        peaks, static_peaks: Largest values by requested limit, with inertia and without.
+        slowings: Number of times the motion was slowed down.
+        excess: By limit: its peak over the allowed value.
+        step_count, seconds: Totals of all simulations.
     """
 
     pace: Pace
@@ -68,8 +68,8 @@ def check_motion(grasp_model: GraspModel, path: ResolvedPath, limits: Limits, pa
     """Move the branch along approach and path and back; slow the motion until ``limits`` hold.
 
     Args:
-        path: That keeps the limits standing still at every pose.
-        slowings: How often at most to slow down and try again.
+        path: Keeps the limits at standstill at every pose.
+        slowings: Most times to slow down and try again.
     """
     there = path.ahead
     standing = {name: float(np.abs(size).max()) for name, size in sizes(there).items()}
@@ -98,7 +98,7 @@ def check_motion(grasp_model: GraspModel, path: ResolvedPath, limits: Limits, pa
 
 @dataclass(frozen=True)
 class _Moved:
-    """One way in time: largest values, what was broken, and whether the branch came along."""
+    """One path in time: largest values, broken limits, and whether the branch followed."""
 
     peaks: dict[str, float]
     broken: list[str]
@@ -128,7 +128,7 @@ def _moved(grasp_model: GraspModel, poses: np.ndarray, start: np.ndarray, pace: 
 
 
 def _drive(poses: np.ndarray, pace: Pace) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of the steps [s], [k], and where the grasp is then [m], [k, 3]."""
+    """Return the times of the steps [s], [k], and the grasp's positions then [m], [k, 3]."""
     law = time_law(poses[:, :3], pace)
     coarse = STEP / pace.speed
     fine = min(_FINE, pace.speed / pace.acceleration / _RAMP_STEPS, coarse)
@@ -141,13 +141,13 @@ def _drive(poses: np.ndarray, pace: Pace) -> tuple[np.ndarray, np.ndarray]:
     short = np.flatnonzero(cells) * fine
     times = np.unique(np.concatenate([np.arange(0.0, law.duration, coarse), short, [end]]))
     times = times[times <= end]
-    # Two instants of the two grids that nearly fall together would make a needlessly short step.
+    # Two nearly equal instants of the two grids would make a needlessly short step.
     times = times[np.concatenate([[True], np.diff(times) > 0.3 * fine])]
     return times, poses_at(poses, law, times)[:, :3]
 
 
 def _sizes(grasp_model: GraspModel, found: DynamicResult, limits: Limits) -> dict[str, np.ndarray]:
-    """Return at each instant what limits were asked on, by the names of ``UNITS``."""
+    """Return the limited quantities at each instant, by the names of ``UNITS``."""
     asked = limits.asked()
     values = {"energy": found.energy, "force": np.linalg.norm(found.reaction_force, axis=1),
               "torque": np.linalg.norm(found.reaction_torque, axis=1)}
@@ -164,9 +164,9 @@ def _sizes(grasp_model: GraspModel, found: DynamicResult, limits: Limits) -> dic
 
 def _slower(peaks: dict[str, float], standing: dict[str, float], limits: Limits,
             has_failed: bool) -> float | None:
-    """Return how many times slower to try; None where no pace keeps a limit.
+    """Return the factor by which to slow down next; None if no pace keeps a limit.
 
-    What inertia adds falls with the square of the pace.
+    The effect of inertia falls with the square of the pace.
     """
     needed = [_LEAST_SLOWING] if not has_failed else [2.0]
     for name, peak in peaks.items():

@@ -1,4 +1,4 @@
-"""Bodies in the way of branch and gripper: boxes and closed surfaces."""
+"""Obstacles to branch and gripper: boxes and closed surfaces."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -14,12 +14,12 @@ _CHUNK = 2_000_000  # point and face pairs whose solid angles are summed at a ti
 
 
 class Obstacle(Protocol):
-    """A body, branch frame."""
+    """A body in the branch frame."""
 
     name: str
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Return how far ``points`` [n, 3] are outside it [m], negative inside, shape [n]."""
+        """Return the distance of ``points`` [n, 3] outside it [m], negative inside, shape [n]."""
         ...
 
 
@@ -40,7 +40,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Solid:
-    """What a closed surface encloses."""
+    """The volume enclosed by a closed surface."""
 
     name: str
     surface: Surface
@@ -56,10 +56,10 @@ class Solid:
 
 @dataclass(frozen=True)
 class Obstacles(Constraint):
-    """Bodies that the branch must not meet.
+    """Bodies that the branch must not touch.
 
-    What is limited is the closeness, ``exp(-d / 0.1 m)`` of the clearance d: 1 where the branch
-    touches one, more inside; smooth for a planner's field.
+    The limited quantity is the closeness, ``exp(-d / 0.1 m)`` of the clearance d: 1 where the
+    branch touches a body, more inside; smooth for a planner's field.
     """
 
     @classmethod
@@ -69,7 +69,7 @@ class Obstacles(Constraint):
 
     @property
     def clearance(self) -> float:
-        """What is kept from the bodies [m]."""
+        """Clearance kept from the bodies [m]."""
         return -_SCALE * float(np.log(self.limit))
 
     bodies: tuple[Obstacle, ...]
@@ -97,8 +97,9 @@ class Obstacles(Constraint):
 
 def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,
             ) -> tuple[str, float, np.ndarray] | None:
-    """Return the obstacle that bodies of ``radius`` [m] at ``points`` [n, 3] are deepest in, how
-    deep [m] and where [m]; None if they are in none."""
+    """Return the obstacle that bodies of ``radius`` [m] at ``points`` [n, 3] penetrate deepest, the
+    depth [m] and its position [m]; None if they penetrate none.
+    """
     worst = None
     for obstacle in obstacles:
         depth = radius - obstacle.clearance(points)
@@ -109,7 +110,7 @@ def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float =
 
 
 def _winding(surface: Surface, points: np.ndarray) -> np.ndarray:
-    """How often a surface winds around each point [n, 3] (Van Oosterom and Strackee 1983), [n]."""
+    """Winding number of a surface around points [n, 3] (Van Oosterom and Strackee 1983), [n]."""
     a, b, c = (surface.vertices[surface.faces[:, k]][None] - points[:, None] for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
     over = np.einsum("nij,nij->ni", a, np.cross(b, c))

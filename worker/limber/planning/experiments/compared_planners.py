@@ -1,8 +1,9 @@
-"""Planners compared over trials with one goal: the paper's experiment.
+"""Comparison of planners over trials with one goal: the paper's experiment.
 
-Each trial starts at a random deformed configuration. The paper's two are RRT* on length and D-RRT*
-on length and deformation, as their trees have them; besides these stand the same after smoothing,
-and the gentlest path with its certificate. All are scored alike on the energy field.
+Each trial starts at a random deformed configuration. The paper's two planners are RRT* on length
+and D-RRT* on length and deformation, with their raw tree paths. They are compared with their
+smoothed paths, and with the gentlest path and its certificate. All are scored alike on the energy
+field.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,10 +22,10 @@ from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import plan_pair
 
 BASELINE = "RRT*, not smoothed"
-"""What the others are compared with, as in the paper."""
+"""Baseline of the comparison, as in the paper."""
 COMPARED = {BASELINE: "RRT*", "D-RRT*, not smoothed": "D-RRT*", "RRT*": "RRT*, smoothed",
             "D-RRT*": "D-RRT*, smoothed", "eikonal": "gentle"}
-"""Names of paths, and what the table calls their planners."""
+"""Names of paths, and their planners' names in the table."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,9 @@ def _score(field: EnergyField, path: np.ndarray) -> PlannerScore:
 
 
 def summarised(trials: Sequence[ComparedTrial]) -> dict[str, dict[str, float | None]]:
-    """Return by planner mean and deviation of length and energy, and the change of the means
-    against the baseline's [%], over the trials in which both found a path."""
+    """Return by planner mean and deviation of length and energy, and the change of the means from
+    the baseline's [%], over the trials in which both found a path.
+    """
     found: dict[str, dict[str, float | None]] = {}
     for name in COMPARED:
         both = [trial for trial in trials if name in trial.scores and BASELINE in trial.scores]

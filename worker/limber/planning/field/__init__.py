@@ -1,1 +1,1 @@
-"""The energy field over grasp poses: samples, radial basis functions, where it is trusted."""
+"""The energy field over grasp poses: samples, radial basis functions, trusted region."""

@@ -1,17 +1,17 @@
 """Coordinates in which a field over grasp positions is smooth, and its shell flat.
 
-A branch bends easily across and hardly yields along. The grasp moves by itself on a shell
-(:mod:`limber.planning.field.low_energy_surface`); a few millimetres off it the energy changes as
-much as across all of the reach: beyond the shell the branch is drawn taut, inside it bows out, and
-what is
-left of the bow grows with the root of the way. Radial functions know one length scale only, and a
+A branch bends easily across and hardly yields along. A free grasp moves on a shell
+(:mod:`limber.planning.field.low_energy_surface`). A few millimetres off it, the energy changes as
+much as over the whole reach: beyond the shell the branch is drawn taut, inside it bows out, and the
+bow grows with the square root of the distance. Radial functions have a single length scale, and a
 convex hull of samples on a curved shell cuts its facets off. Hence
 
     y = (R t e_1, R t e_2, k g(r - R)),    g(w) = w / (1 + (w / d)^2)^(1/4),
 
 with ``r`` the distance from the shell's pivot, ``t`` the angle from the rest direction ``n``, ``e``
 the unit vector across towards the point (the azimuthal projection of maps), ``k`` a stretch and
-``d`` the depth from which on depths count by their root. Without a shell ``y`` is the point itself.
+``d`` the depth beyond which depths count by their square root. Without a shell ``y`` is the point
+itself.
 """
 
 from dataclasses import dataclass, replace
@@ -46,12 +46,12 @@ class Chart:
 
     @property
     def plain(self) -> "Chart":
-        """The same without stretch: lengths along and off the shell as they are."""
+        """The same without stretch: lengths along and off the shell are unchanged."""
         return replace(self, stretch=1.0, depth=np.inf)
 
     @property
     def arrays(self) -> tuple[np.ndarray, float, np.ndarray, float, float]:
-        """What the compiled functions take after the point."""
+        """Arguments of the compiled functions after the point."""
         return self.pivot, self.radius, self.axes, float(self.stretch), float(self.depth)
 
     def map(self, points: np.ndarray) -> np.ndarray:
@@ -68,11 +68,11 @@ class Chart:
         return self.pivot + (self.radius + flat[:, 2:]) * direction
 
     def pull_back(self, points: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-        """Return gradients to the point [n, 3] of those to the chart's coordinates [n, 3]."""
+        """Return gradients to the point [n, 3], from those to the chart's coordinates [n, 3]."""
         return self._turned(points, gradients, False)
 
     def push_forward(self, points: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-        """Return gradients to the chart's coordinates of those to the point: the inverse."""
+        """Return gradients to the chart's coordinates from those to the point: the inverse."""
         return self._turned(points, gradients, True)
 
     def _turned(self, points: np.ndarray, gradients: np.ndarray, forward: bool) -> np.ndarray:
@@ -82,10 +82,10 @@ class Chart:
                        np.ascontiguousarray(gradients, float), forward, *self.arrays)
 
     def growth(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Return the most by which plain coordinates differ a metre within ``reach`` [m], [n].
+        """Return the largest change of plain coordinates per metre within ``reach`` [m], [n].
 
-        The map's singular values are 1, R / r and R t / (r sin t). Infinite where the pivot or the
-        point opposite is that near.
+        The map's singular values are 1, R / r and R t / (r sin t). Infinite if the pivot or the
+        point opposite is within reach.
         """
         if self.radius == 0.0:
             return np.ones(len(points))
@@ -95,17 +95,17 @@ class Chart:
         return np.where(np.isnan(angle), np.inf, np.maximum(most, 1.0))
 
     def bend(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Return the most that the second derivative of plain coordinates along a line is within
-        ``reach`` [m], [1/m], shape [n]; infinite as :meth:`growth`.
+        """Return the largest second derivative of plain coordinates along a line within ``reach``
+        [m], [1/m], shape [n]; infinite as :meth:`growth`.
 
-        Of ``R t e`` along a straight line with the parts ``a, b, c`` outward, along the meridian
-        and the parallel (``a^2 + b^2 + c^2 = 1``) it is ``R / r^2`` times
+        For ``R t e`` along a straight line with the components ``a, b, c`` outward, along the
+        meridian and the parallel (``a^2 + b^2 + c^2 = 1``) it is ``R / r^2`` times
 
             along e:   -2 a b - (t - sin t cos t) / sin^2 t  c^2
             across e:   2 b c (1 - t cot t) / sin t - 2 a c t / sin t,
 
-        whose factors grow with ``t``; of ``r`` it is ``(b^2 + c^2) / r``. Each product of two parts
-        is at most a half.
+        whose factors grow with ``t``; for ``r`` it is ``(b^2 + c^2) / r``. Each product of two
+        components is at most a half.
         """
         if self.radius == 0.0:
             return np.zeros(len(points))
@@ -119,7 +119,8 @@ class Chart:
 
     def _within(self, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the least distance from the pivot [m] and the largest angle from the outward axis
-        [rad] within ``reach`` [m]; no angle (NaN) where the pivot or the point opposite is near."""
+        [rad] within ``reach`` [m]; no angle (NaN) if the pivot or the point opposite is near.
+        """
         local = (points - self.pivot) @ self.axes.T
         least = np.linalg.norm(local, axis=1) - reach
         safe = np.maximum(least, 1e-9)
@@ -176,7 +177,7 @@ def _turned(points, gradients, forward, pivot, radius, axes, stretch, depth):
         square = ((r - radius) / depth) ** 2
         meridian, parallel = radius / r, radius * np.arctan2(rho, local[2]) / rho
         outward = stretch * (1.0 + 0.5 * square) / (1.0 + square) ** 1.25
-        # Parts along the meridian, along the parallel and outward, there and here.
+        # Components along the meridian, along the parallel and outward, at both ends.
         across = x * own[0] + y * own[1]
         aside = x * own[1] - y * own[0]
         if forward:

@@ -1,12 +1,12 @@
 """Neighbouring samples that disagree, and the states of the branch between them.
 
-Pushed together below its rest, a branch goes aside one way or the other, within millimetres, and
-with its grasp in one place it may stand in either of two shapes; which one is a matter of the way
-there. A field fitted to both says a mean that the branch never takes. So where the shapes of two
-neighbours differ by more than their slopes say, the branch is taken half-way between them: first
-where it matters most, by how far the shapes are apart and how many poses lie about the two. If it
-arrives in one state, that is a sample more. If it arrives in two, or would have to snap, no path
-may lead there: the place counts as refused.
+Pushed together below its rest position, a branch buckles to one side or the other, within
+millimetres, and with its grasp at one position it may be in either of two shapes, depending on the
+path there. A field fitted to both gives a mean that the branch never takes. So where the shapes of
+two neighbours differ by more than their slopes explain, the branch is moved half-way between them:
+first where it matters most, by the difference of the shapes and the number of poses around the two.
+If it arrives in one state, that is a further sample. If it arrives in two, or would have to snap,
+no path may lead there: the position counts as refused.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ _NEARER = 0.4  # of a jump is left half-way, at most, where the branch surely is
 _LEAST = 0.02  # of it: neighbours nearer than this are asked no more
 _ROUNDS = 4  # each knows what the ones before have found
 _SHARE_PAIRS = 6
-"""Pairs of one task; must not depend on how many processes there are."""
+"""Pairs of one task; must not depend on the number of processes."""
 _CORNERS = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 Pair = tuple[Solved, Solved]
@@ -42,14 +42,14 @@ def ask_between(
     *,
     progress: Progress = SILENT,
 ) -> tuple[list[Solved], np.ndarray]:
-    """Return samples between neighbours that do not agree, and places [t, 3] of two shapes.
+    """Return samples between neighbours that disagree, and places [t, 3] with two shapes.
 
     Args:
         known: Accepted states.
-        chart: In which the samples are neighbours; plain.
-        usual: Places [n, 3] as densely as the field is asked: what is wrong near many of them
-            matters more.
-        most: So many places are asked at most.
+        chart: Chart in which the samples are neighbours; plain.
+        usual: Places [n, 3] at the density of queries to the field: errors near many of them matter
+            more.
+        most: Most places to solve.
     """
     known, begun, asked = list(known), len(known), 0
     torn = np.empty((0, 3))
@@ -60,7 +60,7 @@ def ask_between(
         if not chosen:
             break
         asked += len(chosen)
-        # In turn: hard places come first, and lie together.
+        # In turn: hard places come first, and are close together.
         count = max(2, -(-len(chosen) // _SHARE_PAIRS))
         shares = [chosen[k::count] for k in range(count)]
         found = solvers.run(_ask, [(share,) for share in shares if share],
@@ -75,9 +75,8 @@ def disagreeing(known: Sequence[Solved], chart: Chart, usual: np.ndarray, length
                 ) -> list[tuple[int, int, np.ndarray]]:
     """Return the pairs of neighbours that disagree, the most important first.
 
-    As numbers in ``known``, with those of the tetrahedra [k] that share them. Between two it
-    matters as much as their jump times how many of the ``usual`` places are in those.
-    ``length`` [m] is the branch's.
+    As numbers in ``known``, with those of the tetrahedra [k] that share them. The weight of a pair
+    is its jump times the number of ``usual`` places in those. ``length`` [m] is the branch's.
     """
     flat = chart.map(np.array([one.pose[:3] for one in known]))
     tetrahedra = Delaunay(flat)
@@ -102,15 +101,15 @@ def neighbours(flat: np.ndarray) -> np.ndarray:
 
 
 def jump(first: Solved, second: Solved) -> float:
-    """Return how far apart two neighbours predict the tip, or a target, half-way [m].
+    """Return the distance between two neighbours' predictions of tip or target half-way [m].
 
-    By the slopes of each; where one has none, by the other's alone.
+    By the slopes of each; if one has none, by the other's alone.
     """
     return float(_jumps([first, second], np.array([[0, 1]]))[0])
 
 
 def _jumps(known: Sequence[Solved], edges: np.ndarray) -> np.ndarray:
-    """Return those of pairs of numbers [e, 2] in ``known``, shape [e]."""
+    """Return the distances for pairs of numbers [e, 2] in ``known``, shape [e]."""
     places = np.array([one.pose[:3] for one in known])
     shapes = np.array([one.shape[3:] for one in known])
     slopes = np.array([one.shape_slopes[:, 3:] for one in known])
@@ -126,8 +125,9 @@ def _jumps(known: Sequence[Solved], edges: np.ndarray) -> np.ndarray:
 
 def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], torn: np.ndarray,
            chart: Chart) -> list[tuple[Pair, np.ndarray]]:
-    """Return pairs and the places [1, 3] half-way, of each tetrahedron one pair alone; none where
-    a place of two shapes is nearer than any that is known."""
+    """Return pairs and the places [1, 3] half-way, one pair per tetrahedron; none where a place
+    with two shapes is nearer than any known one.
+    """
     flat = chart.map(np.array([one.pose[:3] for one in known]))
     positions, taken_up, chosen = np.array([one.pose[:3] for one in known]), set(), []
     for first, second, about in pairs:
@@ -156,7 +156,7 @@ def _ask(grasp_model: GraspModel, places: list[tuple[Pair, np.ndarray]],
 
 def _half_way(grasp_model: GraspModel, first: Solved, second: Solved, middle: np.ndarray,
               ) -> Solved | None:
-    """Return the state at ``middle`` [1, 3] that both neighbours come to, None if there is none."""
+    """Return the state at ``middle`` [1, 3] that both neighbours reach, None if there is none."""
     found, apart = None, jump(first, second)
     if (guess := half_way(grasp_model, first, second, middle[0])) is not None:
         there = grasp_model.follow(middle, first.displacement, guess, snap=False)[0]

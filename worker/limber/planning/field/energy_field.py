@@ -1,10 +1,11 @@
 """The energy field: deformation energy of the branch over the position of its grasp.
 
 The energy is the potential of strain and weight above the hanging state, the branch with the
-gripper open: what the gripper does to bring the branch there slowly. Its gradient is the force of
+gripper open: the work of the gripper to bring the branch there slowly. Its gradient is the force of
 the gripper. Without weight it is the strain energy, the paper's measure of deformation.
 
-The field also gives the rotation that the grasped piece takes by itself, and the branch's tip.
+The field also gives the natural rotation of the grasped piece, and the position of the branch's
+tip.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +27,7 @@ from limber.planning.field.trust import TrustRegion, trusted_at
 
 @dataclass(frozen=True)
 class FitChoice:
-    """How a field is fitted: kernel and shape; stretch and depth of the chart (in radii)."""
+    """Choices of a field's fit: kernel and shape; stretch and depth of the chart (in radii)."""
 
     kernel: str
     shape: float
@@ -41,7 +42,7 @@ class FitChoice:
 KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))
 CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
                 (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005))
-"""Stretch and depth; what bends how fast off the shell decides, whichever the kernel."""
+"""Stretch and depth; they depend on the curvature off the shell, for any kernel."""
 _FINALISTS = 3  # charts, the best with the first kernel, that the others are tried on
 _SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites round-off
 _CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
@@ -51,9 +52,10 @@ _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_n
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
              "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
 LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
-"""What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
-gripper's force along the branch [N], outward positive, and its torque [Nm]; how close the branch is
-to an obstacle, 1 where it touches one. A plan's constraints may add more."""
+"""Loads of a pose besides energy and force: largest strain and stress [Pa] by magnitude; the
+gripper's force along the branch [N], outward positive, and its torque [Nm]; closeness of the branch
+to an obstacle, 1 where it touches one. A plan's constraints may add more.
+"""
 _WHAT = "an energy field (`limber energy --force` creates one)"
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
@@ -69,9 +71,9 @@ _OPTIONAL_SHAPES = {
            "value_weights": (f"{fit} m", f"{fit} c"),
            "gradient_weights": (f"{fit} g", 3, f"{fit} c"),
            "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
-"""Of the arrays in a file; equal letters are equal lengths."""
+"""Shapes of the arrays in a file; equal letters are equal lengths."""
 _LARGEST = 1e60
-"""In any unit here: with larger numbers sums would not be finite."""
+"""In any unit here: with larger numbers, sums would not be finite."""
 _CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
 
 
@@ -80,7 +82,7 @@ class GraspSamples:
     """Results of the branch model at ``m`` accepted grasp poses, rest pose first.
 
     Attributes:
-        poses: Position [m] and the rotation vector [rad] that the grasped piece takes, [m, 6].
+        poses: Position [m] and natural rotation vector of the grasped piece [rad], [m, 6].
         energies: Potential of strain and weight above the hanging state [J], shape [m].
         forces: Force that the gripper exerts on the branch [N], shape [m, 3].
         tips: Position of the branch's tip [m], shape [m, 3].
@@ -89,14 +91,14 @@ class GraspSamples:
         strains: Largest principal Green-Lagrange strain by magnitude, shape [m].
         targets: Positions of the named targets [m], shape [m, targets, 3].
         torques: Torque that the gripper exerts about the pose's position [Nm], shape [m, 3].
-        strain_places: Where, in the rest shape [m], shape [m, 3].
+        strain_places: Position of that strain in the rest shape [m], shape [m, 3].
         stresses: Largest principal Cauchy stress by magnitude [Pa], shape [m].
         shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
             [m, 3, 6 + 3 targets].
-        axial_forces: Part of the force along the branch at the grasp, outward [N], shape [m].
-        reduced: Which the reduced model found, corrected once by the full one; the others, and all
-            of a file that does not say it, the full model alone; shape [m].
-        added: What a plan's constraints are on, by their names, shape [m] each; in no file.
+        axial_forces: Component of the force along the branch at the grasp, outward [N], shape [m].
+        reduced: Whether the reduced model found the sample, corrected once by the full one; the
+            full model alone found the others, and all of a file without this entry; shape [m].
+        added: Quantities of a plan's constraints, by their names, shape [m] each; in no file.
     """
 
     poses: np.ndarray
@@ -129,19 +131,19 @@ class GraspSamples:
 
     @property
     def loads(self) -> dict[str, np.ndarray | None]:
-        """By the names of ``LOADS`` and of what was added, shape [m] each; None where not known."""
+        """Loads by the names of ``LOADS`` and of added ones, shape [m] each; None if not known."""
         torque = None if self.torques is None else np.linalg.norm(self.torques, axis=1)
         known = (self.strains, self.stresses, self.axial_forces, torque, None)
         return dict(zip(LOADS, known, strict=True)) | self.added
 
     @property
     def load_table(self) -> np.ndarray:
-        """The same as columns, shape [m, loads]; 0 for what is not known."""
+        """The same as columns, shape [m, loads]; 0 if not known."""
         nothing = np.zeros(len(self.poses))
         return np.column_stack([nothing if one is None else one for one in self.loads.values()])
 
     def joined(self, other: "GraspSamples") -> "GraspSamples":
-        """Return these samples and those of ``other`` behind them."""
+        """Return these samples followed by those of ``other``."""
         if self.reduced is not None and other.reduced is None:
             other = replace(other, reduced=np.zeros(len(other.poses), bool))
         added = {name: np.concatenate([values, other.added[name]])
@@ -160,7 +162,7 @@ class GraspSamples:
 
 
 class FieldArrays(NamedTuple):
-    """A field and its limits as the compiled loops take them; see :meth:`EnergyField.limited`."""
+    """A field and its limits as arrays for the compiled loops; see :meth:`EnergyField.limited`."""
 
     chart: tuple
     energy: tuple
@@ -179,18 +181,18 @@ class EnergyField:
     """Fitted field; positions [n, 3] in, arrays out. Make it with :func:`fit_field`.
 
     Attributes:
-        samples: What it was fitted to.
-        chart: The coordinates of the energy's fit.
-        shape_chart: Those of the other two.
+        samples: The samples of the fit.
+        chart: Coordinates of the energy's fit.
+        shape_chart: Coordinates of the other two.
         energy_fit: Interpolant of the energy (cut off at 0 by the methods).
         shape_fit: Channels: natural rotation vector, position of the tip and of each target.
         load_fit: Channels: those of ``load_names``.
-        region: Where the field may be believed.
-        errors: On samples left out; see :func:`error_measures`.
+        region: Region in which the field is trusted.
+        errors: Errors at left-out samples; see :func:`error_measures`.
         missed: There, prediction less truth of energy [J], force [N] and loads, [m, 4 + loads]; nan
-            where it is not known.
+            if not known.
         misplaced: There, distance of the predicted tip and targets from the true ones [m], shape
-            [m, 1 + targets]; nan where it is not known.
+            [m, 1 + targets]; nan if not known.
     """
 
     samples: GraspSamples
@@ -211,7 +213,7 @@ class EnergyField:
 
     @property
     def load_names(self) -> tuple[str, ...]:
-        """``LOADS``, and what a plan's constraints added."""
+        """``LOADS``, and the loads added by a plan's constraints."""
         return tuple(self.samples.loads)
 
     def energy(self, points: np.ndarray) -> np.ndarray:
@@ -219,7 +221,7 @@ class EnergyField:
         return np.maximum(self._value(self.energy_fit, points)[:, 0], 0.0)
 
     def energy_gradient(self, points: np.ndarray) -> np.ndarray:
-        """Return its gradient [N], shape [n, 3]; zero where the energy is cut off."""
+        """Return the energy's gradient [N], shape [n, 3]; zero where the energy is cut off."""
         cut_off = self._value(self.energy_fit, points)[:, 0] <= 0.0
         return np.where(cut_off[:, None], 0.0, self._gradient(self.energy_fit, points, 0))
 
@@ -228,19 +230,19 @@ class EnergyField:
         return self._gradient(self.energy_fit, points, 0)
 
     def poses(self, points: np.ndarray) -> np.ndarray:
-        """Return positions with the rotation that the grasped piece takes there, [n, 6]."""
+        """Return positions with the natural rotation of the grasped piece there, [n, 6]."""
         return np.hstack([_rows(points), self._value(self.shape_fit, points, slice(3), True)])
 
     def tip(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
-        """Return where the branch's tip, or a target, is with the grasp at ``points`` [m], [n, 3].
+        """Return the position of the tip, or a target, with the grasp at ``points`` [m], [n, 3].
         """
         first = 3 if target is None else 6 + 3 * target
         return self._value(self.shape_fit, points, slice(first, first + 3), True)
 
     def place_error(self, target: int | None = None) -> float:
-        """Return how far the tip, or a target, may be from where the field has it [m].
+        """Return the largest error of the field's position of the tip, or a target [m].
 
-        The largest distance at samples left out, inside the samples' hull; infinite where none is
+        The largest distance at left-out samples, inside the samples' hull; infinite if none is
         known.
         """
         off = self.misplaced[~self.region.is_face(), 0 if target is None else 1 + target]
@@ -277,8 +279,9 @@ class EnergyField:
                 low: np.ndarray | None = None, high: np.ndarray | None = None,
                 slack: Slack | None = None, **max_loads: float) -> FieldArrays:
         """Return the arrays for compiled loops, with limits on energy [J], force [N], the box from
-        ``low`` to ``high`` [m] that the grasp stays in, and on loads by name (magnitudes); by
-        ``slack`` they are tighter at places, energy, force and the loads in turn."""
+        ``low`` to ``high`` [m] that the grasp stays in, and on loads by name (magnitudes);
+        ``slack`` tightens them by position, in the order energy, force, loads.
+        """
         return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.region.arrays,
                            (self.shape_chart.arrays, self.load_fit.arrays),
                            float(max_energy), float(max_force),
@@ -288,7 +291,7 @@ class EnergyField:
                            slack or slack_of(("energy", "force", *self.load_names), {}, 0.0))
 
     def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
-        """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; nothing pickled."""
+        """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; without pickling."""
         samples = self.samples
         arrays = {
             "poses": samples.poses, "energies_j": samples.energies,
@@ -311,7 +314,7 @@ class EnergyField:
 
     @classmethod
     def read(cls, path: Path) -> "EnergyField":
-        """Read what :meth:`write` wrote; nothing is fitted again.
+        """Read a file that :meth:`write` wrote; nothing is fitted again.
 
         Raises:
             InputError: the file is not an energy field.
@@ -356,11 +359,11 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     """Fit the field with the kernel and chart of least cross-validation error.
 
     Args:
-        samples: What the branch model says.
+        samples: Results of the branch model.
         base: Pivot of the shell along which the branch yields
-            (:class:`~limber.planning.field.low_energy_surface.LowEnergySurface`), or where the
-            branch is rooted [m]; None: no chart is tried.
-        radius: The shell's [m]; default the distance of the rest position.
+            (:class:`~limber.planning.field.low_energy_surface.LowEnergySurface`), or the branch's
+            root [m]; None: no chart is tried.
+        radius: Radius of the shell [m]; by default the distance of the rest position.
 
     Raises:
         WorkError: too few samples, or they span no volume.
@@ -382,7 +385,7 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
 
     def energy_missed(choice: FitChoice) -> float:
         errors = left_out_errors(some, choice.on(chart), choice, face)[0]
-        # Each over its own value: of means a few stiff poses, pressed in and buckled, have most.
+        # Each relative to its own value: a few stiff poses, compressed and buckled, dominate means.
         return float(np.prod([errors[name] for name in _CHOSEN_BY]))
 
     def shape_missed(choice: FitChoice) -> float:
@@ -395,8 +398,9 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
 
 def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, float]],
            progress: Progress) -> FitChoice:
-    """Return the choice with the least ``missed``: the first kernel on all charts, then each other
-    one on the best of those."""
+    """Return the choice with the least ``missed``: the first kernel on all charts, then every other
+    kernel on the best of those.
+    """
     first, *others = KERNELS_TRIED
     asked = [FitChoice(*first, *chart) for chart in charts]
     scores: dict[FitChoice, float] = {}
@@ -413,7 +417,7 @@ def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, f
 
 def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
                ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``missed`` and ``misplaced`` as a file has them; nan for what it does not have."""
+    """Return ``missed`` and ``misplaced`` from a file; nan if it does not contain them."""
     places = 1 + (0 if samples.targets is None else samples.targets.shape[1])
     found = []
     for name, columns in (("left_out_errors", 4 + len(LOADS)), ("left_out_place_errors_m", places)):
@@ -428,8 +432,9 @@ def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
 
 def _misplaced(samples: GraspSamples, choice: FitChoice, chart: Chart, channels: slice = slice(3),
                ) -> np.ndarray:
-    """Return how far each sample's tip is off in the fit to all the others [m], and its targets
-    with more ``channels`` than those of the tip, shape [m, channels / 3]."""
+    """Return the tip's error at each sample in the fit to all the others [m], and its targets' with
+    more ``channels`` than those of the tip, shape [m, channels / 3].
+    """
     chart = choice.on(chart)
     slopes = _slopes_on(chart, samples)
     missed = RadialInterpolant.leave_one_out(
@@ -440,8 +445,9 @@ def _misplaced(samples: GraspSamples, choice: FitChoice, chart: Chart, channels:
 
 
 def _with_slopes(samples: GraspSamples) -> np.ndarray:
-    """Return which samples the shape is fitted to: those whose slopes are known, which they are not
-    at a snap; all where hardly any are."""
+    """Return the samples of the shape's fit: those with known slopes, which are unknown at a snap;
+    all if hardly any are known.
+    """
     everything = np.arange(len(samples.poses))
     if samples.shape_slopes is None:
         return everything
@@ -458,12 +464,12 @@ def _slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
 
 
 def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
-    """Return the field fitted to ``added`` samples as well, in the same way."""
+    """Return the field fitted to ``added`` samples as well, in the same manner."""
     return _as_before(field, field.samples.joined(added))
 
 
 def knowing(field: EnergyField, added: dict[str, np.ndarray]) -> EnergyField:
-    """Return the field that knows as loads what is ``added`` at its samples, by name, [m] each."""
+    """Return the field with ``added`` quantities at its samples as loads, by name, [m] each."""
     return _as_before(field, replace(field.samples, added=added))
 
 
@@ -491,10 +497,10 @@ def left_out_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face
                     ) -> tuple[dict[str, float], np.ndarray]:
     """Return errors on each sample of the fit to all the others, in closed form.
 
-    Only samples inside the hull count: the planner never goes outside.
+    Only samples inside the hull count: the planner never leaves it.
 
     Args:
-        face: Which samples lie on the hull's face, bool [m].
+        face: Whether each sample is on the hull's face, bool [m].
 
     Returns:
         The measures of :func:`error_measures`, and prediction less truth of energy [J] and force
@@ -523,7 +529,7 @@ def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
         ``energy_error`` and ``force_error``: root mean square error over root mean square of the
         branch model's values; ``energy_error_median`` and ``force_error_median``: median of
         the error of each sample over its own value; ``energy_error_most`` and
-        ``force_error_most``: 95 % of those are no larger; ``gentle_energy_error``: as the first,
+        ``force_error_most``: 95 % of those are no larger; ``gentle_energy_error``: like the first,
         over the half of the samples with the least energy, where gentle paths run;
         ``held_out_count``.
     """

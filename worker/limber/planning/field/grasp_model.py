@@ -1,10 +1,10 @@
 """The branch model as planning uses it: the state of the branch for a grasp position.
 
-The grasp is pinned: its position is imposed and the branch turns freely in it. Energy is then a
-field over three coordinates that a hundred solutions describe well, where six would take
-thousands. And it is the least energy over all rotations: a gripper that holds firmly reaches it
-by turning as the branch would, so each pose carries that natural rotation for the robot. A firm
-gripper that turns otherwise bends the branch more than planned here.
+The grasp is pinned: its position is imposed and the branch rotates freely in it. The energy is then
+a field over three coordinates that a hundred solutions describe well, where six would take
+thousands. It is also the least energy over all rotations: a firm gripper reaches it by rotating as
+the branch would, so each pose includes that natural rotation for the robot. A firm gripper that
+rotates otherwise bends the branch more than planned here.
 """
 
 from dataclasses import dataclass, field, replace
@@ -30,7 +30,7 @@ from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.solve_status import Status
 from limber.mechanics.strain import peak_load
 
-# A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
+# A pose that needs finer steps than this is beyond a snap. It is rejected early.
 _SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False, keeps_factor=True)
 _STEADY = replace(_SETTINGS, snap=False)
 _DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differentiated
@@ -38,14 +38,14 @@ _DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differenti
 
 @dataclass(frozen=True)
 class Reach:
-    """Where the grasp may be taken: the paper's hemisphere, bounded by the branch's length.
+    """Allowed positions of the grasp: the paper's hemisphere, bounded by the branch's length.
 
     Attributes:
-        base: Where the branch is rooted [m], shape [3].
+        base: Root of the branch [m], shape [3].
         arc_length: Length of branch between base and grasp [m].
         chord: Straight distance between them at rest [m].
         tip: Position of the main path's tip [m], shape [3].
-        axis: Of the branch at the grasp, towards the tip, unit, shape [3].
+        axis: Axis of the branch at the grasp, towards the tip, unit, shape [3].
     """
 
     base: np.ndarray
@@ -70,8 +70,9 @@ class Reach:
 
 @dataclass(frozen=True)
 class Guess:
-    """What a branch may look like: ``displacement`` [m], shape [node_count, 3], and the ``strain``
-    that goes with it, [tet_count, q, 6]; None where either is not known."""
+    """Guess of a branch's shape: ``displacement`` [m], shape [node_count, 3], and the matching
+    ``strain``, [tet_count, q, 6]; None if either is not known.
+    """
 
     displacement: np.ndarray | None = None
     strain: np.ndarray | None = None
@@ -79,13 +80,13 @@ class Guess:
 
 @dataclass(frozen=True)
 class GraspModel:
-    """The loaded branch and its grasp; picklable, so that processes can each have one.
+    """The loaded branch and its grasp; picklable, so that each process can have one.
 
     Attributes:
         branch: As it hangs, or without weight.
         grasp: Pinned.
-        reach: Where the grasp may go.
-        needs_guess: Whether :meth:`follow` is quicker with a guess.
+        reach: Allowed positions of the grasp.
+        needs_guess: Whether :meth:`follow` is faster with a guess.
     """
 
     needs_guess: ClassVar[bool] = True
@@ -113,13 +114,13 @@ class GraspModel:
         """The hanging state: the branch as scanned, the gripper open; its energy is 0.
 
         Raises:
-            ConvergenceError: there is none, as when the branch cannot bear its weight.
+            ConvergenceError: there is none, for example if the branch cannot bear its weight.
         """
         return self.branch.equilibrium(None, None).require()
 
     @property
     def rest_position(self) -> np.ndarray:
-        """Where the grasp is at rest [m], shape [3]."""
+        """Position of the grasp at rest [m], shape [3]."""
         return self.pose(self.rest.displacement)[:3]
 
     def follow(self, positions: np.ndarray, start: np.ndarray, guess: Guess | None = None,
@@ -127,8 +128,8 @@ class GraspModel:
         """Take the grasp through ``positions`` [m, 3] slowly, from displacement ``start``.
 
         Args:
-            guess: What the branch may look like at the first of them.
-            snap: Whether the branch may snap on the way; else it ends there.
+            guess: Guess of the branch's shape at the first of them.
+            snap: Whether the branch may snap on the path; else the path ends there.
         """
         poses = np.hstack([positions, np.zeros_like(positions)])
         guess = guess or Guess()
@@ -150,13 +151,13 @@ class GraspModel:
     def energy(self, result: StaticResult) -> float:
         """Return the potential of strain and weight above the hanging state [J].
 
-        That is what a gripper has to do slowly to bring the branch there; its gradient to the
+        That is the work of a gripper that brings the branch there slowly. Its gradient to the
         grasp's position is the gripper's force.
         """
         return result.energy
 
     def axial_force(self, displacement: np.ndarray, force: np.ndarray) -> float:
-        """Return the part of a force [3] on the grasp along the branch there, outward [N]."""
+        """Return the component of a force [3] on the grasp along the branch there, outward [N]."""
         return float(rotated(self.pose(displacement)[3:], self.reach.axis) @ force)
 
     def tip(self, displacement: np.ndarray) -> np.ndarray:
@@ -168,8 +169,9 @@ class GraspModel:
         return peak_load(self.model, displacement)[0]
 
     def peak_load(self, displacement: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return the largest principal strain by magnitude, where it is [m] at rest, shape [3], and
-        the largest principal Cauchy stress by magnitude [Pa]."""
+        """Return the largest principal strain by magnitude, its position [m] at rest, shape [3],
+        and the largest principal Cauchy stress by magnitude [Pa].
+        """
         strain, tet, stress = peak_load(self.model, displacement)
         return strain, self.mesh.nodes[self.mesh.tets[tet, :4]].mean(axis=0), stress
 
@@ -181,8 +183,8 @@ class GraspModel:
     def tangents(self, displacement: np.ndarray) -> np.ndarray:
         """Return how a state changes with the grasp's position, shape [3, node_count, 3].
 
-        By the tangent stiffness with the pin moved; it is not positive definite at a snap, where
-        these are not known: NaN.
+        By the tangent stiffness with the pin moved. It is not positive definite at a snap; the
+        result is then NaN.
         """
         equations = self.model.equations((self.grasp,))
         try:
@@ -197,7 +199,7 @@ class GraspModel:
                      ) -> np.ndarray:
         """Return how :meth:`shape` changes with the grasp's position, [3, 6 + 3 targets].
 
-        ``tangents``: Of the state, where they are known already. NaN where they are.
+        ``tangents``: Tangents of the state, if already known. NaN if they are NaN.
         """
         tangents = self.tangents(displacement) if tangents is None else tangents
         at = self.shape(displacement)
@@ -219,7 +221,7 @@ def refusal(result: StaticResult) -> Status | None:
 
 
 def grasp_model_of(branch: LoadedBranch, skeleton: Skeleton) -> GraspModel:
-    """Return what planning asks of a branch that hangs as it was scanned.
+    """Return the planning model of a branch that hangs as it was scanned.
 
     Raises:
         InputError: the mesh marks no grasp.

@@ -1,9 +1,9 @@
-"""What a branch may look like with its grasp at a place, by the states about it.
+"""Guess of a branch's shape for a grasp position, from the nearby states.
 
-Displacements between two states that are turned against each other are too short: they have strain
-that no state has, and bending is a thousandth of what that costs. So the strain is interpolated by
-itself, to first order in what each state says: from there Newton's iteration, whose stress is then
-right, is half as long.
+Displacements between two states that are rotated against each other are too short: they contain
+strain that neither state has, and bending costs a thousandth of that. So the strain is
+interpolated by itself, to first order about each state. From there Newton's iteration, whose stress
+is then right, takes half as many steps.
 """
 
 from collections.abc import Sequence
@@ -22,16 +22,16 @@ _STRAIGHT = 0.9  # cosine of the turn of a way, below which it does not go on
 _DIFFERENCE = 1e-4  # of a state's change, by which that of its strain is measured
 
 Share = tuple[float, np.ndarray, np.ndarray]
-"""Of a state in a guess: its weight, its displacement, and the change of that by its tangents."""
+"""Terms of a state in a guess: weight, displacement, and its change by the tangents."""
 
 
 def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.ndarray,
              place: np.ndarray) -> Guess | None:
-    """Return what the branch may look like with the grasp at ``place`` [3], None where nothing is
-    known, nothing in it where the model needs no guess.
+    """Return a guess of the branch's shape with the grasp at ``place`` [3], None if nothing is
+    known; an empty guess if the model needs none.
 
-    An interpolation of the nearest states with their tangents (Hermite, radial); by the nearest
-    alone where the others say something else: they may have gone aside another way.
+    An interpolation of the nearest states with their tangents (Hermite, radial); the nearest alone
+    if the others disagree: they may have buckled to another side.
 
     Args:
         known: With their ``positions`` [m], shape [m, 3].
@@ -56,7 +56,7 @@ def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.nda
 
 
 def foretold_by(grasp_model: GraspModel, state: Solved, place: np.ndarray) -> Guess | None:
-    """Return what a state's tangents say of ``place`` [3], None where it has none."""
+    """Return the prediction of a state's tangents at ``place`` [3], None if it has none."""
     if not state.has_tangents:
         return None
     return blended(grasp_model, [_share(1.0, state, place - state.pose[:3])])
@@ -64,7 +64,7 @@ def foretold_by(grasp_model: GraspModel, state: Solved, place: np.ndarray) -> Gu
 
 def half_way(grasp_model: GraspModel, first: Solved, second: Solved, place: np.ndarray,
              ) -> Guess | None:
-    """Return what values and slopes of both say near half-way, None without slopes."""
+    """Return the blend of both states' values and slopes near half-way, None without slopes."""
     if not (first.has_tangents and second.has_tangents):
         return None
     straight = 0.5 * (first.pose[:3] + second.pose[:3])
@@ -75,10 +75,11 @@ def half_way(grasp_model: GraspModel, first: Solved, second: Solved, place: np.n
 
 def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, place: np.ndarray,
                 ) -> Guess | None:
-    """Return what two states on a way, displacements [node_count, 3], say of the next ``place``
-    [3]: straight on by the tangents of the second, and bent as the way has bent from the first.
+    """Return the extrapolation of two states on a path, displacements [node_count, 3], to the next
+    ``place`` [3]: straight on by the tangents of the second, plus the curvature of the path since
+    the first.
 
-    None where the way turns, or the branch is about to snap.
+    None if the path turns, or the branch is about to snap.
     """
     here = grasp_model.pose(now)[:3]
     back, on = grasp_model.pose(before)[:3] - here, place - here
@@ -95,8 +96,9 @@ def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, pl
 
 
 def blended(grasp_model: GraspModel, shares: Sequence[Share]) -> Guess:
-    """Return the sum of the states' displacements and their changes, each by its weight, and of
-    their strains likewise; nothing where the model needs no guess."""
+    """Return the sum of the states' displacements and their changes, each with its weight, and
+    likewise of their strains; empty if the model needs no guess.
+    """
     if not grasp_model.needs_guess:
         return Guess()
     strains, strain = grasp_model.model.strains, 0.0
@@ -118,7 +120,7 @@ def _displacement(shares: Sequence[Share]) -> np.ndarray:
 def _interpolated(states: list[Solved], place: np.ndarray) -> list[Share]:
     points = np.array([one.pose[:3] for one in states])
     count = len(points)
-    # What each value, and each slope, contributes: the interpolation of unit data.
+    # Contribution of each value, and each slope: the interpolation of unit data.
     unit = np.eye(4 * count)
     weights = RadialInterpolant.fit(points, unit[:count], unit[count:].reshape(count, 3, -1),
                                     **_KERNEL).value(place[None])[0]

@@ -9,7 +9,7 @@ from limber.planning.field.energy_field import EnergyField, FieldArrays
 
 UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
          "torque": "Nm", "closeness": ""}
-"""Of what limits are on by nature; a plan's constraints bring their own."""
+"""Built-in limited quantities; a plan's constraints bring their own."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Limited:
         return self.name.replace("_", " ")
 
     def size(self, points: np.ndarray) -> np.ndarray:
-        """Return what the limit is on at ``points`` [n, 3], shape [n]."""
+        """Return the limited quantity at ``points`` [n, 3], shape [n]."""
         if self.name == "energy":
             return self.field.energy(points)
         if self.name == "force":
@@ -38,7 +38,7 @@ class Limited:
 
 
 def limited(field: EnergyField, limits: FieldArrays) -> Iterator[Limited]:
-    """Yield what has a finite limit: energy, force, and loads."""
+    """Yield the quantities with a finite limit: energy, force, and loads."""
     of_loads = zip(field.load_names, limits.max_loads, strict=True)
     for name, limit in (("energy", limits.max_energy), ("force", limits.max_force), *of_loads):
         if limit < np.inf:

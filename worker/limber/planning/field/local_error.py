@@ -1,11 +1,11 @@
-"""How far a field may be off, as a function of the place.
+"""Error bound of a field, as a function of the position.
 
-Each sample was left out of the fit once: how far the fit to the others is off there is known. At
-any other place it is taken to be as the nearest samples have it: a mean of their squares, with
-weights that fall with the distance in the chart. How well that foretells is known as well, from
-each sample and the others: the mean is multiplied by what covers the share of them that is asked
-for (split conformal prediction: Vovk et al. 2005; with a local scale: Lei et al. 2018). States of
-the full model along plans join the samples, and with them what is said here.
+Each sample was left out of the fit once; the error there of the fit to the others is known. At
+any other position it is taken from the nearest samples: a mean of their squares, with weights that
+fall with the distance in the chart. The accuracy of this prediction is known as well, from
+each sample and the others: the mean is multiplied by the factor that covers the requested fraction
+of them (split conformal prediction: Vovk et al. 2005; with a local scale: Lei et al. 2018). States
+of the full model along plans join the samples, and with them these errors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,14 +22,14 @@ _FEWEST = 8  # samples of which misses are known; of fewer nothing is said
 
 @dataclass(frozen=True)
 class LocalError:
-    """An error at places.
+    """An error bound by position.
 
     Attributes:
-        places: Of samples, in coordinates of the chart, shape [m, 3].
-        squares: Of their misses, floor included, shape [m].
+        places: Positions of samples, in coordinates of the chart, shape [m, 3].
+        squares: Squares of their errors, floor included, shape [m].
         near: Square of the distance within which weights hardly differ [m^2].
-        factor: What covers the share of samples asked for; infinite where nothing is known.
-        most: No larger error is stated.
+        factor: Covers the requested fraction of samples; infinite if nothing is known.
+        most: Largest error that is stated.
     """
 
     places: np.ndarray
@@ -41,14 +41,14 @@ class LocalError:
     @classmethod
     def of(cls, places: np.ndarray, above: np.ndarray, covered: float, most: float = np.inf,
            ) -> "LocalError":
-        """Return by how much the field says too much at most, at ``covered``, a share, of samples.
+        """Return the bound on the field's overestimate for a fraction ``covered`` of samples.
 
         Args:
-            places: Of samples, in coordinates in which the field is smooth, shape [m, 3].
-            above: By how much the fit without a sample says too much there, below 0 where it says
-                too little, nan where not known, shape [m].
+            places: Positions of samples, in coordinates in which the field is smooth, shape [m, 3].
+            above: Overestimate of the fit without the sample there, below 0 for an underestimate,
+                nan if not known, shape [m].
             covered: 1: all of them.
-            most: No larger error is stated.
+            most: Largest error that is stated.
         """
         known = np.isfinite(above)
         places, above = np.ascontiguousarray(places[known], float), above[known]
@@ -60,7 +60,7 @@ class LocalError:
         near = max(_spacing(places)**2, 1e-18)
         foretold = np.sqrt(_means(places, places, squares, near, True))
         shares = np.sort(np.maximum(above, 0.0) / np.maximum(foretold, 1e-300))
-        # One more than there are: the place that is asked about is as good as any sample.
+        # One more than there are: the queried position counts as one more sample.
         rank = min(int(np.ceil(covered * (len(shares) + 1))), len(shares)) - 1
         return cls(places, squares, near, float(shares[rank]), most)
 
@@ -74,13 +74,13 @@ class LocalError:
 
 
 class Slack(NamedTuple):
-    """By how much limits are tighter at a place, for compiled loops; see :func:`slack_at`.
+    """Tightening of limits by position, for compiled loops; see :func:`slack_at`.
 
     Attributes:
-        places: Of samples in the plain chart, shape [m, 3].
-        squares: Of their misses, a row a limit, shape [limits, m].
-        factors, most: As of :class:`LocalError`, shape [limits]; a factor of 0: no tighter.
-        near: As of :class:`LocalError`.
+        places: Positions of samples in the plain chart, shape [m, 3].
+        squares: Squares of their errors, one row per limit, shape [limits, m].
+        factors, most: As in :class:`LocalError`, shape [limits]; a factor of 0: no tighter.
+        near: As in :class:`LocalError`.
     """
 
     places: np.ndarray
@@ -108,7 +108,7 @@ def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: floa
 
 @compiled
 def slack_at(place: np.ndarray, row: int, slack: Slack) -> float:
-    """Return by how much the limit of a ``row`` is tighter at ``place`` [3] of the chart."""
+    """Return the tightening of the limit of a ``row`` at ``place`` [3] of the chart."""
     factor = slack.factors[row]
     if factor == 0.0 or factor == np.inf:
         return slack.most[row] if factor > 0.0 else 0.0
@@ -142,8 +142,9 @@ def _spacing(places: np.ndarray) -> float:
 @compiled
 def _means(places: np.ndarray, samples: np.ndarray, squares: np.ndarray, near: float,
            is_left_out: bool) -> np.ndarray:
-    """Return means [n] of ``squares`` [m] of ``samples`` [m, 3] at ``places`` [n, 3]; where
-    ``is_left_out`` without the sample of the same number."""
+    """Return means [n] of ``squares`` [m] of ``samples`` [m, 3] at ``places`` [n, 3]; if
+    ``is_left_out``, without the sample of the same number.
+    """
     out = np.empty(len(places))
     for n in range(len(places)):
         total, weights = 0.0, 0.0

@@ -1,11 +1,11 @@
 """The low-energy surface: the sphere on which a free grasp moves.
 
 A branch yields easily across and hardly along. Under forces across, its grasp stays within a tenth
-of a millimetre on a sphere about a pivot a fifth to a quarter of the way up (the pseudo-rigid body
-of a cantilever: Howell, Compliant Mechanisms, 2001, 5.1; measured on four branches, 40 %
-deflection). Inside it the branch is pushed together and bends; beyond it is drawn taut, and the
-force grows a hundred times as fast. Gentle paths run along the shell. So samples follow it, and
-some are drawn a little beyond: no path is best at the limit of what was sampled.
+of a millimetre on a sphere about a pivot at a fifth to a quarter of its height (the pseudo-rigid
+body of a cantilever: Howell, Compliant Mechanisms, 2001, 5.1; measured on four branches, 40 %
+deflection). Inside it the branch is pushed together and bends; beyond it the branch is drawn taut,
+and the force grows a hundred times as fast. Gentle paths run along the shell. So samples follow it,
+and some are drawn a little beyond: no path is best at the border of the sampled region.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ _RIM = 1.1  # times the force that linear bending needs for the largest deflecti
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 _WORST = 0.02  # share of the radius that the sphere may miss the states by, root mean square
 _SHARE_DIRECTIONS = 3
-"""Directions of one task; must not depend on how many processes there are."""
+"""Directions of one task; must not depend on the number of processes."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,13 @@ def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, s
     """Return the shell, and states of the branch on it and a little beyond.
 
     Args:
-        count: Directions to go; each gives two states, one under a force across and one drawn
-            outward besides, as strongly as the branch is bent at the largest deflection.
-        deflection: Largest distance from rest, as a share of the arc length.
-        seed: Turns the directions.
+        count: Number of directions; each gives two states, one under a force across and one also
+            drawn outward, as strongly as the branch is bent at the largest deflection.
+        deflection: Largest distance from rest, as a fraction of the arc length.
+        seed: Rotates the directions.
 
-    A branch that is no cantilever (its states lie on no sphere) gets the sphere about its base.
+    A branch that is not a cantilever (its states are not on a sphere) gets the sphere about its
+    base.
     """
     grasp_model = solvers.grasp_model
     reach = grasp_model.reach
@@ -69,7 +70,7 @@ def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, s
 
 def _walk(grasp_model: GraspModel, across: np.ndarray, outward: float,
           progress: Progress = SILENT) -> list[tuple[Solved | None, Solved | None]]:
-    """Return the states under each force [n, 3], and drawn ``outward`` [N] besides."""
+    """Return the states under each force [n, 3], also drawn ``outward`` [N]."""
     pairs = []
     for number, force in enumerate(across):
         progress(number / len(across), "finding the low-energy surface")

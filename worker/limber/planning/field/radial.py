@@ -3,13 +3,13 @@
     f(x) = sum_j c_j phi(|x - x_j|) - sum_j g_j . grad phi(|x - x_j|) + p(x)
 
 With values alone this is the interpolation of the paper (Wright 2003). A finite element solution
-gives the force beside the energy, which is the energy's gradient: the second sum (Hermite-Birkhoff
-interpolation, Wu 1992) makes the field match both, so the same number of solutions tells
-``1 + dimension`` times as much.
+gives, besides the energy, the force, which is the energy's gradient. The second sum
+(Hermite-Birkhoff interpolation, Wu 1992) makes the field match both, so each solution contributes
+``1 + dimension`` times as much data.
 
-The fit is dense linear algebra; values and gradients, in three coordinates, are evaluated by
-compiled loops that the planner calls some million times: each over all samples, of which arrays in
-the order of the loop hold one coordinate, so that the processor takes several at once.
+The fit is dense linear algebra. Values and gradients, in three coordinates, are evaluated by
+compiled loops that the planner calls some million times, each over all samples. Their arrays hold
+one coordinate each in the order of the loop, so that the processor vectorises.
 """
 
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ class RadialInterpolant:
             ) -> "RadialInterpolant":
         """Fit to ``values`` [m] or [m, channels] at ``points`` [m, dimension].
 
-        ``gradients`` [m, dimension] or [m, dimension, channels], where given, are matched too.
+        ``gradients`` [m, dimension] or [m, dimension, channels], if given, are matched too.
 
         Raises:
             WorkError: the samples do not determine the field (too few, or coinciding).
@@ -91,7 +91,7 @@ class RadialInterpolant:
     def leave_one_out(points: np.ndarray, values: np.ndarray,
                       gradients: np.ndarray | None = None, *, kernel: str,
                       shape: float = 1.0, smoothing: float = 0.0) -> np.ndarray:
-        """Return what a fit without a sample would miss there, in closed form.
+        """Return the error of a fit without a sample at that sample, in closed form.
 
         With ``A`` the system, ``b`` its right side and ``B`` the rows of one sample, the truth less
         the prediction of the fit to all others is ``((A^-1)_BB)^-1 (A^-1 b)_B`` (Rippa 1999, here
@@ -100,7 +100,7 @@ class RadialInterpolant:
         Args:
             points: Shape [m, dimension].
             values: Shape [m] or [m, channels].
-            gradients: Shape [m, dimension] or [m, dimension, channels], where they are matched.
+            gradients: Shape [m, dimension] or [m, dimension, channels], if they are matched.
 
         Returns:
             Shape [m, 1 + dimension, channels]: value, gradient; [m, 1, channels] without gradients.
@@ -139,7 +139,7 @@ class RadialInterpolant:
 
     @cached_property
     def arrays(self) -> tuple:
-        """What the compiled loops take after the point; samples along the last axis."""
+        """Arguments of the compiled loops after the point; samples along the last axis."""
         return (KERNELS[self.kernel], self.shape, self.scale, self.shift,
                 np.ascontiguousarray(self.centres.T), np.ascontiguousarray(self.value_weights.T),
                 np.ascontiguousarray(self.gradient_weights.transpose(2, 1, 0)), self.polynomial,
@@ -274,7 +274,7 @@ def value_at(point, channel, kernel, shape, scale, shift, centres, value_weights
     """Return one channel of the field at ``point`` [3]; arrays as ``RadialInterpolant.arrays``."""
     scaled = _scaled(point, shift, scale)
     weights, slopes = value_weights[channel], gradient_weights[channel]
-    # With the kernel's number written out the choice is made outside the loop, as it has to be.
+    # With the kernel's number written out, the choice is made outside the loop, as required.
     if kernel == 0:
         total = _value_sum(0, scaled, shape, centres, weights, slopes)
     elif kernel == 1:

@@ -1,11 +1,11 @@
 """The branch model as planning uses it, answered by a trained reduced model.
 
-What the reduced model finds is corrected once by the full one, with the tangent at the strain that
-the reduced model assumes: its displacement alone has ten times the error in strain, all of it
-stiff. The correction says how far off it was. Where that is more than a state may be off unsaid,
-or the full tangent is not positive definite, or the branch would have jumped there, the full model
-answers alone. So a field on it is as good as one on the full model, for a factorisation a pose
-where that takes a dozen.
+The full model corrects the reduced model's result once, with the tangent at the strain that the
+reduced model assumes: its displacement alone has ten times the error in strain, all of it stiff.
+The correction measures the error. If it exceeds the error a state may have without a warning, or
+the full tangent is not positive definite, or the branch would have snapped there, the full model
+alone is used. So a field on it is as good as one on the full model, at one factorisation per pose
+instead of a dozen.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class CorrectedResult(StaticResult):
     """A state of the reduced model, corrected once by the full one.
 
     Attributes:
-        tangents: How it changes with the grasp's position, shape [3, node_count, 3].
+        tangents: Its change with the grasp's position, shape [3, node_count, 3].
     """
 
     tangents: np.ndarray | None = None
@@ -42,7 +42,7 @@ class LearntGraspModel(GraspModel):
     """A branch with a trained reduced model; also picklable.
 
     Attributes:
-        reduced: Of this branch and this grasp.
+        reduced: Reduced model of this branch and this grasp.
     """
 
     needs_guess: ClassVar[bool] = False
@@ -52,10 +52,10 @@ class LearntGraspModel(GraspModel):
     @classmethod
     def learnt(cls, grasp_model: GraspModel, cache: ReducedCache | None = None, *,
                progress: Progress = SILENT) -> "LearntGraspModel":
-        """Return a grasp model that asks the reduced model of its branch first.
+        """Return a grasp model that tries the reduced model of its branch first.
 
-        That of `limber session --mode point` on the same branch, from the ``cache``, by default
-        the one that sessions use; learnt now, which takes minutes, where there is none yet.
+        The model of `limber session --mode point` on the same branch, from the ``cache``, by
+        default the one that sessions use; trained now, which takes minutes, if there is none yet.
 
         Raises:
             ConvergenceError: no training grasp has an equilibrium.
@@ -69,7 +69,7 @@ class LearntGraspModel(GraspModel):
 
     def follow(self, positions: np.ndarray, start: np.ndarray, guess: Guess | None = None,
                *, snap: bool = True) -> list[StaticResult]:
-        """As of the full model; only that needs ``guess``."""
+        """As for the full model; only that needs ``guess``."""
         results, at = [], start
         for place in positions:
             pose = np.concatenate([place, np.zeros(3)])
@@ -93,7 +93,7 @@ class LearntGraspModel(GraspModel):
         return super().tangents(displacement)
 
     def _corrected(self, state: ReducedState) -> CorrectedResult | None:
-        """Return a state as the full model corrects it, None where it is not to be believed."""
+        """Return a state as the full model corrects it, None if it cannot be trusted."""
         found = corrected_once(self.model, self.reduced, state) if state.converged else None
         if found is None:
             return None
@@ -113,5 +113,5 @@ class LearntGraspModel(GraspModel):
 
     @cached_property
     def _last(self) -> dict[str, CorrectedResult]:
-        """The state that was found last: what is asked of it next is known already."""
+        """The state found last: the next queries about it are already answered."""
         return {}

@@ -16,7 +16,7 @@ _ROUND = 0.15  # of the samples are added a round
 _FEWEST = 8
 _APART = 0.5  # of the way between two samples, that no other place of a round lies nearer
 _SHARE_PLACES = 20
-"""Places of one task; must not depend on how many processes there are."""
+"""Places of one task; must not depend on the number of processes."""
 
 
 def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked: float, most: int,
@@ -24,8 +24,8 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
             ) -> tuple[Sampled, EnergyField]:
     """Return the field with samples added where its error is largest.
 
-    Ends when its error on samples left out (``energy_error``) is at most ``asked``, a share, or
-    there are ``most`` samples, or nothing is left to add.
+    Ends when its error on left-out samples (``energy_error``) is at most ``asked``, a fraction, or
+    there are ``most`` samples, or no more can be added.
     """
     begun = len(field.samples.poses)
     while field.errors["energy_error"] > asked and len(field.samples.poses) < most:
@@ -49,8 +49,9 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
 
 
 def _where_off(field: EnergyField, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places [n, 3] half-way between neighbours where the energy is off most, and the sample
-    nearest to each, [n]."""
+    """Return places [n, 3] half-way between neighbours where the energy's error is largest, and the
+    sample nearest to each, [n].
+    """
     chart, positions = field.region.chart, field.samples.positions
     flat = chart.map(positions)
     edges = neighbours(flat)

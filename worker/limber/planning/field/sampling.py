@@ -1,12 +1,11 @@
 """Energy of the branch at sampled grasp positions, by the full model.
 
-Some poses follow the shell on which the grasp moves by itself, and go a little beyond
+Some poses follow the shell on which a free grasp moves, and go a little beyond
 (:mod:`limber.planning.field.low_energy_surface`). The positions of the others come from a Sobol
 sequence in the ball about the rest position that the deflection allows, inside that shell, cut by
-the paper's
-hemisphere. They are solved along a nearest-neighbour tree: next is the position nearest to any that
-has been solved, and it starts from that solution. So every step is short, also where a tour would
-have to jump, and the branch stays in the equilibrium that bends out of rest.
+the paper's hemisphere. They are solved along a nearest-neighbour tree: the next position is the one
+nearest to any solved one, and starts from that solution. So every step is short, also where a tour
+would have to jump, and the branch stays in the equilibrium that bends out of rest.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,13 +33,12 @@ _FEWEST_DIRECTIONS = 8
 _USUAL = 2048  # poses that say where the field is asked how often
 _TAUT = 2.0  # times the median force
 _SHARE_POSES = 30
-"""Poses of one tree. How many trees there are must not depend on how many processes work on
-them, nor what they find."""
+"""Poses of one tree. The number of trees must not depend on the processes, nor on their results."""
 _SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
 _SAME_PLACE = 1e-9  # of the mesh's size: last digits differ between machines
 _GRASP_INPUT = "grasp nodes"
 TWO_SHAPES = "two shapes"
-"""Among the reasons for which poses are refused: which of two shapes it is depends on the way."""
+"""One of the reasons for refusing poses: which of two shapes results depends on the path."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +46,11 @@ class Sampled:
     """Results of the branch model.
 
     Attributes:
-        samples: Those to fit to, the rest pose first.
-        displacements: Of all nodes at those [m], shape [node_count, 3] each.
+        samples: Samples for the fit, the rest pose first.
+        displacements: Displacements of all nodes at those [m], shape [node_count, 3] each.
         valley: The shell that they follow.
-        reasons: How many poses were rejected for which reason.
-        taut_count: How many were left out as taut.
+        reasons: Number of rejected poses by reason.
+        taut_count: Number of poses left out as taut.
     """
 
     samples: GraspSamples
@@ -64,8 +62,8 @@ class Sampled:
 
 def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: int | None = None,
                  progress: Progress = SILENT) -> Sampled:
-    """Solve the branch at ``settings.samples`` poses: two thirds of them spread over where its
-    grasp may be taken, the others between neighbours that do not agree
+    """Solve the branch at ``settings.samples`` poses: two thirds of them spread over the allowed
+    positions of its grasp, the others between neighbours that disagree
     (:mod:`limber.planning.field.disagreeing_neighbours`).
 
     Raises:
@@ -111,12 +109,12 @@ def sample_positions(
     seed: int = 0,
     fewest: int | None = None,
 ) -> np.ndarray:
-    """Return ``count`` positions [m] to which the grasp may be taken, shape [count, 3].
+    """Return ``count`` allowed positions of the grasp [m], shape [count, 3].
 
-    Where there is little room fewer, but no fewer than ``fewest`` (by default all).
+    Fewer if there is little room, but no fewer than ``fewest`` (by default all).
 
-    They lie within ``deflection`` times the arc length of ``rest``, above the base, and inside the
-    shell. Half of them lie in a layer just inside it: there the branch bends without being pushed
+    They are within ``deflection`` times the arc length of ``rest``, above the base, and inside the
+    shell. Half of them are in a layer just inside it: there the branch bends without being pushed
     together or pulled taut, the energy is least and changes fastest, and gentle paths run.
 
     Raises:
@@ -134,7 +132,7 @@ def sample_positions(
             energy_surface.radius * depth / np.linalg.norm(arm, axis=1, keepdims=True))
         inside = np.linalg.norm(points - rest, axis=1) <= radius
         inside &= np.linalg.norm(points - energy_surface.pivot, axis=1) <= energy_surface.radius
-        # The sphere's other half is no shell: nothing is sampled beyond the pivot.
+        # The sphere's other half is not part of the shell: no position is sampled beyond the pivot.
         inside &= (points - energy_surface.pivot) @ (rest - energy_surface.pivot) > 0.0
         inside &= points[:, 2] >= reach.base[2]
         bulk, layer = points[::2][inside[::2]], points[1::2][inside[1::2]]
@@ -159,7 +157,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
     """Solve the branch with its grasp at each of ``targets`` [n, 3].
 
     Returns:
-        The accepted samples, the rest pose first; and how many were rejected for which reason.
+        The accepted samples, the rest pose first; and the number of rejected ones by reason.
     """
     with SolverPool(grasp_model, workers) as solvers:
         good, bad = solve_branch(solvers, targets, progress=progress)
@@ -169,7 +167,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
 def solve_branch(solvers: SolverPool, targets: np.ndarray, known: Sequence[Solved] = (), *,
                  progress: Progress = SILENT) -> tuple[list[Solved], list[Solved]]:
     """Return accepted solutions, the rest state first, then ``known`` ones, and refused ones."""
-    # Slabs of space: in each a tree of its own out of what is known.
+    # Slabs of space; each has its own tree that starts from the known states.
     share_count = max(2, -(-len(targets) // _SHARE_POSES))
     shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), share_count)
     begin = [taken(solvers.grasp_model, solvers.grasp_model.rest), *known]
@@ -191,7 +189,7 @@ def _counted(bad: list[Solved]) -> dict[str, int]:
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
                 known: Sequence[Solved], report: Callable[[int], None]) -> list[Solved]:
-    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their names.
+    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their numbers.
 
     A pose that cannot be reached from there is tried again at the end, from other sides.
     """
@@ -231,7 +229,7 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
 
 def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
                      workers: int | None = None, progress: Progress = SILENT) -> np.ndarray:
-    """Return the branch's states with its grasp at ``positions`` [m, 3] that could be solved once.
+    """Return the branch's states with its grasp at ``positions`` [m, 3] that were solved before.
 
     Shape [m, node_count, 3]; each from the nearest one before.
 
@@ -257,12 +255,13 @@ def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarr
 
 
 def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
-    """Return which of ``forces`` [m] are no wall; ``usual`` are those of poses that lie evenly.
+    """Return which of ``forces`` [m] are not of a wall; ``usual`` are those of evenly spread poses.
 
-    Bending a branch, even double, takes about the same force anywhere; pulled taut it takes many
-    times that within millimetres. Such a wall spoils the field around it, and no gentle path
-    goes there: poses over twice the median force stay out, and so out of the trusted region; but
-    none that takes no more than ``drawn`` [N], the force that the branch was drawn outward with.
+    Bending a branch, even double, takes about the same force anywhere; pulling it taut takes many
+    times that within millimetres. Such a wall spoils the field around it, and no gentle path goes
+    there. Poses over twice the median force are therefore left out, and are thus outside the
+    trusted region, except those that take no more than ``drawn`` [N], the force that the branch was
+    drawn outward with.
     """
     middle = np.median(usual) if len(usual) else 0.0
     slack = forces <= max(_TAUT * middle, drawn * (1.0 + 1e-9))
@@ -275,12 +274,12 @@ def is_sampled_on(reads: Mapping[str, str], rest: np.ndarray, grasp_model: Grasp
 
     Args:
         reads: :func:`energy_inputs` when it was sampled.
-        rest: Where the field's grasp is at rest [m], shape [3].
+        rest: Position of the field's grasp at rest [m], shape [3].
         grasp_model: The model as it is now.
     """
     inputs = energy_inputs(grasp_model)
     if _GRASP_INPUT not in reads:
-        # Of an earlier version, which digested the weights: the grasp's place tells as much.
+        # Of an earlier version, which digested the weights; the grasp's position is as good.
         del inputs[_GRASP_INPUT]
         away = np.linalg.norm(rest - grasp_model.grasp.centre)
         if away > _SAME_PLACE * np.ptp(grasp_model.mesh.nodes, axis=0).max():
@@ -291,7 +290,7 @@ def is_sampled_on(reads: Mapping[str, str], rest: np.ndarray, grasp_model: Grasp
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
     """Return digests of what the field depends on: geometry, grasp, material, weight, targets.
 
-    Only of what is stored or counted: a grasp's weights are computed, and their last digits differ
+    Only of stored or counted data: a grasp's weights are computed, and their last digits differ
     between machines, to which a branch folder may be moved.
     """
     import hashlib

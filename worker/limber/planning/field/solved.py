@@ -14,12 +14,12 @@ from limber.planning.field.reduced_grasp import CorrectedResult
 
 @dataclass(frozen=True)
 class Solved:
-    """A solution; ``target`` is the number of the position that was asked, -1: none was.
+    """A solution; ``target`` is the number of the requested position, -1 if there was none.
 
-    The others as in :class:`~.energy_field.GraspSamples`, of one sample; ``trouble`` is why it
-    cannot be believed, ``displacement`` [node_count, 3] that of all nodes [m], ``tangents``
-    [3, node_count, 3] how that changes with the grasp's position, in single precision; ``reduced``
-    whether the reduced model found it.
+    The others as in :class:`~.energy_field.GraspSamples`, for one sample; ``trouble`` is why it
+    cannot be trusted, ``displacement`` [node_count, 3] that of all nodes [m], ``tangents`` [3,
+    node_count, 3] its change with the grasp's position, in single precision; ``reduced`` whether
+    the reduced model found it.
     """
 
     target: int
@@ -47,23 +47,23 @@ class Solved:
 
     @property
     def has_tangents(self) -> bool:
-        """Whether they are known, which they are not at a snap."""
+        """Whether they are known; at a snap they are not."""
         return bool(np.isfinite(self.tangents[0, 0, 0]))
 
     def foretold(self, place: np.ndarray) -> np.ndarray | None:
-        """Return the displacement with the grasp at ``place`` [3] by the tangents, if known."""
+        """Return the displacement by the tangents with the grasp at ``place`` [3], if known."""
         if not self.has_tangents:
             return None
         return self.displacement + self.moved(place - self.pose[:3])
 
     def moved(self, way: np.ndarray) -> np.ndarray:
-        """Return what the tangents say of a ``way`` [3] of the grasp, shape [node_count, 3]."""
+        """Return the tangents' displacement for a ``way`` [3] of the grasp, [node_count, 3]."""
         # Not by BLAS, whose last digit may differ between processes.
         return way[0] * self.tangents[0] + way[1] * self.tangents[1] + way[2] * self.tangents[2]
 
 
 def taken(grasp_model: GraspModel, result: StaticResult, target: int = -1) -> Solved:
-    """Return what a solution says."""
+    """Return the stored state of a solution."""
     moved, at_rest = result.displacement, result is grasp_model.rest
     strain, place, stress = grasp_model.peak_load(moved)
     tangents = grasp_model.tangents(moved)

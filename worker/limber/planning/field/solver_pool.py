@@ -1,6 +1,6 @@
 """Processes that each hold the branch, for all solves of one field.
 
-A process takes about a second to start, and the branch's equations as long again: both once.
+A process takes about a second to start, and the branch's equations as long again: both only once.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,11 +15,11 @@ _held: list[GraspModel] = []  # in a process of a crew
 
 
 class SolverPool:
-    """Solves a branch side by side; close it, or use it in a ``with``.
+    """Solves a branch in parallel; close it, or use it in a ``with``.
 
     Args:
         grasp_model: The branch.
-        workers: At most so many processes; by default the core budget. One: none is started.
+        workers: Most processes; by default the core budget. One: none is started.
     """
 
     def __init__(self, grasp_model: GraspModel, workers: int | None = None):
@@ -31,7 +31,7 @@ class SolverPool:
             message: str = "") -> list:
         """Return ``[function(grasp_model, *task) for task in tasks]``, in this order.
 
-        Results do not depend on how many processes there are. ``function`` may take ``progress``.
+        Results do not depend on the number of processes. ``function`` may take ``progress``.
 
         Raises:
             WorkError: a process crashed. Exception: the first error of a call.

@@ -1,7 +1,7 @@
 """The region in which a fitted field is trusted.
 
 Radial functions extrapolate freely, and wrongly. A point is trusted inside the convex hull of the
-accepted samples, unless a pose that the branch model refused lies nearer than any it accepted. The
+accepted samples, unless a pose that the branch model refused is nearer than any accepted one. The
 samples lie along a curved shell, whose flat facets would cut off the very poses that gentle paths
 take: the hull is taken in coordinates that flatten it (:mod:`limber.planning.field.chart`).
 """
@@ -21,10 +21,10 @@ _OUTLINE = 24  # points a side of the grid that tells how far the region reaches
 
 @dataclass(frozen=True)
 class TrustRegion:
-    """Where a field is trusted.
+    """Region in which a field is trusted.
 
     Attributes:
-        planes: With ``n . y + c <= 0`` inside, in coordinates of ``chart``, shape [k, 4].
+        planes: Hull with ``n . y + c <= 0`` inside, in coordinates of ``chart``, shape [k, 4].
         accepted, rejected: Sample positions [m], shapes [m, 3] and [q, 3].
         chart: Plain.
         low, high: Corners of a box that holds the region [m], shape [3].
@@ -42,7 +42,7 @@ class TrustRegion:
     @classmethod
     def of(cls, accepted: np.ndarray, rejected: np.ndarray, pivot: np.ndarray | None = None,
            radius: float = 0.0) -> "TrustRegion":
-        """Make the region of samples, the rest pose first, along the sphere where one is given.
+        """Make the region of samples, the rest pose first, along the sphere if one is given.
 
         Raises:
             WorkError: the samples span no volume.
@@ -64,7 +64,7 @@ class TrustRegion:
 
     @property
     def arrays(self) -> tuple:
-        """What :func:`trusted_at` takes after the point."""
+        """Arguments of :func:`trusted_at` after the point."""
         return self.chart.arrays, self.planes, self.accepted, self.rejected
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -81,9 +81,9 @@ class TrustRegion:
     def surely_outside(self, centres: np.ndarray, halves: np.ndarray) -> np.ndarray:
         """Return which boxes about ``centres`` [n, 3] hold no trusted point, bool [n].
 
-        ``halves`` [3, 3] are their half edges as rows. A box is outside if it lies above the plane
+        ``halves`` [3, 3] are their half edges as rows. A box is outside if it is above the plane
         that is highest at its centre, to second order in its size; or if all of it is nearer to one
-        refused pose than to any accepted one (the sides between are flat: nothing is left out).
+        refused pose than to any accepted one (the boundaries between are flat: this is exact).
         """
         reach = float(np.linalg.norm(halves))
         heights, slopes = self.height_and_slope(centres)
@@ -123,15 +123,15 @@ class TrustRegion:
 def _outline(flat: np.ndarray, planes: np.ndarray, chart: Chart) -> np.ndarray:
     """Return points [n, 3] whose bounding box, along any axes, holds the region.
 
-    A grid over the hull's box, and about each of its points that may be near the hull the corners
-    of a box as large as a cell becomes at most when it is bent back.
+    A grid over the hull's box, and around each of its points that may be near the hull the corners
+    of the largest box that a cell becomes when mapped back.
     """
     low, high = flat.min(axis=0), flat.max(axis=0)
     ticks = [np.linspace(a, b, _OUTLINE) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     half = 0.5 * float(np.linalg.norm((high - low) / (_OUTLINE - 1)))
     near = grid[_heights(grid, planes)[0] <= half]
-    # Bent back, a length grows by r / R at most.
+    # Mapped back, a length grows by r / R at most.
     reach = half * max(1.0, 1.0 + (high[2] + half) / chart.radius)
     sides = reach * np.concatenate([np.eye(3), -np.eye(3)]) * np.sqrt(3.0)
     points = chart.curved(near)
@@ -216,7 +216,7 @@ def _nearest_number(point, others):
 
 @compiled
 def _heights(points, planes):
-    """Return how far ``points`` are above the plane that is highest there, and which that is."""
+    """Return the height of ``points`` above the plane highest there, and which plane that is."""
     dimension = points.shape[1]
     out = np.full(len(points), -np.inf)
     top = np.zeros(len(points), np.int64)

@@ -1,1 +1,1 @@
-"""Where a path may end."""
+"""Goal regions of a path."""

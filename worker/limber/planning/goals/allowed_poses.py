@@ -1,4 +1,4 @@
-"""Poses of a goal that keep the limits, and the error where there are none."""
+"""Allowed poses of a goal, and the error if there are none."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
     """Return allowed grasp positions in the goal region, at most ``count``, shape [n, 3].
 
     Raises:
-        NoPathError: the region is out of reach. GoalOverLimitsError: none was drawn that keeps the
+        NoPathError: the region is out of reach. GoalOverLimitsError: no drawn pose keeps the
             limits; in a narrow valley one may.
     """
     points = goal.guess(field, count, np.random.default_rng(seed))
@@ -44,9 +44,10 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
 
 def with_near_side(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField,
                    limits: FieldArrays) -> np.ndarray:
-    """Return ``points`` [n, 3] of the goal, and where the straight ways to them from ``start`` [3]
-    enter it: in a large goal the near side is where short and gentle paths end. More ways are
-    tried about those that are nearest."""
+    """Return ``points`` [n, 3] of the goal, and where the straight lines to them from ``start`` [3]
+    enter it: in a large goal, short and gentle paths end on the near side. More lines are tried
+    around the nearest ones.
+    """
     generator, found = np.random.default_rng(0), [points]
     aims = points
     for _ in range(_NEARER):
@@ -67,7 +68,7 @@ def with_near_side(points: np.ndarray, start: np.ndarray, goal: Goal, field: Ene
 
 
 def _entered(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField) -> np.ndarray:
-    """Return where the straight ways from ``start`` [3] to ``points`` [n, 3] of the goal enter it.
+    """Return where the straight lines from ``start`` [3] to ``points`` [n, 3] of the goal enter it.
     """
     low, high = np.zeros(len(points)), np.ones(len(points))
     for _ in range(_HALVINGS):
@@ -114,8 +115,9 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
 
 
 def unit_uncertainty(off: float, field: EnergyField) -> str:
-    """Return words of doubt about the unit where something is so far ``off`` [m] that it can hardly
-    be in metres; nothing else."""
+    """Return a hint about the unit if something is so far ``off`` [m] that it is hardly in metres;
+    else an empty text.
+    """
     size = float(np.linalg.norm(field.region.high - field.region.low))
     return " (in millimetres? Lengths are in metres)" if off > _MILLIMETRES * size else ""
 

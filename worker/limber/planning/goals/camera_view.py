@@ -1,4 +1,4 @@
-"""The view of a fixed camera, and what hides a target in it."""
+"""The view of a fixed camera, and occlusion of a target in it."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ _OWN = 0.003  # [m] of the surface about a target that does not hide it
 
 @dataclass(frozen=True)
 class View(Convex):
-    """What a pinhole camera sees within a range of distances along its axis.
+    """The view of a pinhole camera within a range of distances along its axis.
 
     Attributes:
-        frame: The camera's in the branch's: x right, y down, z ahead, shape [4, 4].
+        frame: Frame of the camera in the branch's: x right, y down, z ahead, shape [4, 4].
         slopes: x / z and y / z at the picture's borders: left, right, top, bottom.
         range_m: Least and greatest z [m].
     """
@@ -46,9 +46,9 @@ class View(Convex):
                 "range_m": list(self.range_m)}
 
     def hidden_by(self, triangles: np.ndarray, place: np.ndarray, slack: float) -> bool:
-        """Return whether a surface lies between the camera and ``place`` [3].
+        """Return whether a surface is between the camera and ``place`` [3].
 
-        ``triangles`` are [f, 3, 3]; what is within ``slack`` [m] of the place is the place's own.
+        ``triangles`` are [f, 3, 3]; surface within ``slack`` [m] of the position belongs to it.
         Moeller and Trumbore 1997.
         """
         eye = self.frame[:3, 3]
@@ -66,7 +66,7 @@ class View(Convex):
         return bool((hit & (t < 1.0 - slack / np.linalg.norm(way))).any())
 
     def require_seen(self, what: str, place: np.ndarray, triangles: np.ndarray) -> None:
-        """Raise NoPathError where the branch's surface hides ``what`` at a place."""
+        """Raise NoPathError if the branch's surface hides ``what`` at a position."""
         if self.hidden_by(triangles, place, _OWN):
             raise NoPathError(
                 f"At the end of the path the branch hides {what} from the camera.",

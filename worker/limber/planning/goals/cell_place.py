@@ -1,10 +1,10 @@
 """The target in a region that a robot's cell gives: ``--in-view``, ``--second-arm``.
 
-The region is an outer bound: within it the arm may not reach every place, and the branch may hide
-the target. Which grasp poses do is asked of poses of the field (of an arm, whose kinematics are of
-the target's place alone) or of the branch model (of a view, past the branch's own surface). Between
-them a pose counts as one that does where it is nearer to one that does than to one that does not.
-Each planned path adds its own states, so that the border is refined where paths end.
+The region is an outer bound: within it the arm may not reach every position, and the branch may
+hide the target. Which grasp poses are valid is tested at poses of the field (for an arm, whose
+kinematics depend on the target's position alone) or of the branch model (for a view, past the
+branch's own surface). Between them a pose counts as valid if it is nearer to a valid one than to an
+invalid one. Each planned path adds its own states, so that the border is refined where paths end.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,13 +31,13 @@ _NOWHERE = np.empty((0, 3))
 
 @dataclass(frozen=True, kw_only=True)
 class CellGoal(TargetGoal):
-    """A target in a region of the cell, at a place that does for it.
+    """A target in a region of the cell, at a valid position.
 
     Attributes:
         cell_place: The region and its test.
-        grasp_model: Of the branch.
-        taken, refused: Positions of the grasp at which the target's place does, and at which it
-            lies in the region and does not [m], shapes [k, 3] and [q, 3].
+        grasp_model: Model of the branch.
+        taken, refused: Positions of the grasp at which the target's position is valid, and at which
+            it is in the region and is not valid [m], shapes [k, 3] and [q, 3].
     """
 
     cell_place: CellPlace
@@ -54,7 +54,7 @@ class CellGoal(TargetGoal):
         return np.maximum(within, self.tolerance + 0.5 * nearer)
 
     def uncertainty(self, field: EnergyField) -> float:
-        # Between poses that do not do there may be one that does: then nothing is proven.
+        # Between invalid poses there may be a valid one: then nothing is proven.
         return np.inf if len(self.refused) else super().uncertainty(field)
 
     def drawn_in(self, states: SolvedPoses) -> Self:
@@ -66,10 +66,10 @@ class CellGoal(TargetGoal):
                                 self._surface(states.displacements[-1]))
 
     def learnt(self, field: EnergyField) -> Self:
-        """Return the goal with what poses of the field say of it.
+        """Return the goal with the results at poses of the field.
 
         Raises:
-            NoPathError: the target lies in the region at some of them, and does at none.
+            NoPathError: the target is in the region at some of them, and valid at none.
         """
         if self.cell_place.of_surface:
             found = self._of_states(field)
@@ -83,8 +83,9 @@ class CellGoal(TargetGoal):
         return found
 
     def _sharpened(self, field: EnergyField) -> Self:
-        """Return the goal with poses near its border: between each that does not do and the
-        nearest that does, where the target's place alone counts."""
+        """Return the goal with poses near its border: between each invalid one and the nearest
+        valid one, if only the target's position counts.
+        """
         if not len(self.taken) or not len(self.refused):
             return self
         chosen = _far_apart(self.refused, _PAIRS)
@@ -100,7 +101,7 @@ class CellGoal(TargetGoal):
                        refused=np.concatenate([self.refused, wrong]))
 
     def _of_states(self, field: EnergyField) -> Self:
-        """Ask states of the branch model at samples of the field in the region, far apart."""
+        """Test states of the branch model at samples of the field in the region, far apart."""
         samples = field.samples
         places = samples.tips if self.target is None or samples.targets is None else (
             samples.targets[:, self.target])
@@ -116,8 +117,9 @@ class CellGoal(TargetGoal):
                            np.array([one.displacement for one in states]))
 
     def _asked(self, grasps: np.ndarray, places: np.ndarray, moved: np.ndarray | None) -> Self:
-        """Return the goal knowing poses [n, 3] with the target at ``places`` [n, 3] as well; the
-        nodes are displaced by ``moved`` [n, nodes, 3] there."""
+        """Return the goal with poses [n, 3] added that have the target at ``places`` [n, 3]; the
+        nodes are displaced by ``moved`` [n, nodes, 3] there.
+        """
         inside = np.flatnonzero(self.region.distance(places) <= 0.0)
         does = np.array([self._does(places[k], None if moved is None else moved[k])
                          for k in inside], bool)

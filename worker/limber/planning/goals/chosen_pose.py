@@ -14,9 +14,9 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
     """Return a useful goal: far from rest, and reached without force.
 
     Of the samples deflected by over three quarters of the largest deflection, the one with the
-    least energy, drawn a little towards the rest pose so that the region lies where the field is
+    least energy, moved a little towards the rest pose so that the region is where the field is
     trusted. The trusted region is a shell, often thinner than the tolerance: what counts is how
-    much of the goal lies in it along the shell.
+    much of the goal is in it along the shell.
     """
     chart = field.region.chart.plain
     samples = chart.map(field.samples.positions)
@@ -41,8 +41,8 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
 def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,
                     tolerance: float, seed: int) -> GraspGoal:
     """Return a goal as the paper draws its candidates: evenly from the half ball above the branch's
-    ``base`` [m] with its ``length`` [m] as radius; of those, one that the field knows, that keeps
-    the limits and lies at least half the largest deflection away from rest.
+    ``base`` [m] with its ``length`` [m] as radius; of those, one that is in the trusted field,
+    keeps the limits and is at least half the largest deflection away from rest.
 
     Raises:
         NoPathError: no such pose was found.

@@ -1,7 +1,6 @@
 """Goals of a plan, and the description of a kind of goal.
 
-A kind stands in a file of its own beside this one; :mod:`limber.planning.goals.goal_kinds` has the
-list.
+Each kind has its own file beside this one; :mod:`limber.planning.goals.goal_kinds` has the list.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,8 +20,8 @@ class Goal(Protocol):
     """A region of grasp positions.
 
     Attributes:
-        tolerance: The ``distance`` up to which the branch is in the goal [m].
-        what: The part of the branch that is brought there, in words.
+        tolerance: Largest ``distance`` at which the branch is in the goal [m].
+        what: The part of the branch to be brought there, in words.
     """
 
     @property
@@ -32,32 +31,33 @@ class Goal(Protocol):
     def what(self) -> str: ...
 
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        """Return how far off the goal the branch is with its grasp at ``points`` [m], [n]."""
+        """Return the branch's distance from the goal with its grasp at ``points`` [m], [n]."""
         ...
 
     def uncertainty(self, field: EnergyField) -> float:
-        """Return how much nearer than its ``distance`` the branch may be at most [m]; infinite
-        where the field's error is not known."""
+        """Return how much nearer than its ``distance`` the branch may be at most [m]; infinite if
+        the field's error is not known.
+        """
         ...
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Return grasp positions likely to be in the region, shape [n, 3]."""
+        """Return grasp positions that are probably in the region, shape [n, 3]."""
         ...
 
     def centre(self, field: EnergyField) -> np.ndarray:
-        """Return one grasp position that stands for the region, the same for any seed, [3]."""
+        """Return one representative grasp position of the region, the same for any seed, [3]."""
         ...
 
     def missed_by(self, states: SolvedPoses) -> float:
-        """Return how far outside the goal the last of the states is [m]; inside: 0 or below."""
+        """Return how far outside the goal the last state is [m]; inside: 0 or below."""
         ...
 
     def drawn_in(self, states: SolvedPoses) -> "Goal":
-        """Return the goal to plan for where the last of the states was the end of a plan."""
+        """Return the goal to plan for next if the last state was the end of a plan."""
         ...
 
     def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
-        """Raise NoPathError where the last of the states is in the region and does not do."""
+        """Raise NoPathError if the last state is in the region and is not valid."""
         ...
 
     def describe(self) -> dict[str, Any]:
@@ -66,7 +66,7 @@ class Goal(Protocol):
         ...
 
     def describe_end(self, states: SolvedPoses) -> dict[str, Any]:
-        """Return what a plan's summary says of where the last of the states is, as plain data."""
+        """Return the plan summary's entries about the last state, as plain data."""
         ...
 
 
@@ -75,11 +75,11 @@ class CellPlace:
     """A region given by a robot's cell.
 
     Attributes:
-        region: Holds every place that does.
-        require: Raises NoPathError where a place [3] in it does not do for something, said in
-            words, while the branch's surface is where triangles [f, 3, 3] are; None: not known.
+        region: Contains every valid position.
+        require: Raises NoPathError if a position [3] in it is not valid for something, given in
+            words, while the branch's surface is at triangles [f, 3, 3]; None: not known.
         of_surface: Whether that surface counts.
-        refusal: What is said where no place does, with ``{what}``.
+        refusal: Message if no position is valid, with ``{what}``.
     """
 
     region: Region
@@ -90,13 +90,13 @@ class CellPlace:
 
 @dataclass(frozen=True)
 class GoalRequest:
-    """What a goal is made from.
+    """Inputs from which a goal is made.
 
     Attributes:
-        field, grasp_model: Of the branch.
-        settings: Of the plan.
+        field, grasp_model: Field and model of the branch.
+        settings: Settings of the plan.
         limits: Those settings' limits on the field.
-        cell: What a robot's cell gives, by the names of settings.
+        cell: Data of a robot's cell, by the names of settings.
     """
 
     field: EnergyField
@@ -111,12 +111,12 @@ class GoalKind:
     """A kind of goal.
 
     Attributes:
-        name: Of the setting that asks for it, where it is neither None nor False. A kind from
-            outside brings settings of its own, a class that inherits from ``PlanSettings``.
-        make: Makes the goal, given the setting's value; raises InputError or NoPathError where
-            that cannot be.
-        is_of_target: It is a place of the tip or of ``--target``.
-        is_place: The setting's value is a place [m], which no obstacle may cover.
+        name: Name of the setting that requests it, if neither None nor False. An external kind
+            brings settings of its own, a class that inherits from ``PlanSettings``.
+        make: Makes the goal, given the setting's value; raises InputError or NoPathError if it
+            cannot.
+        is_of_target: Whether it is a position of the tip or of ``--target``.
+        is_place: Whether the setting's value is a position [m], which no obstacle may cover.
     """
 
     name: str
@@ -129,6 +129,6 @@ class GoalKind:
         return "--" + self.name.replace("_", "-")
 
     def is_asked(self, settings: PlanSettings) -> bool:
-        """Whether the settings ask for it."""
+        """Whether the settings request it."""
         value = getattr(settings, self.name, None)
         return value is not None and value is not False

@@ -9,7 +9,7 @@ from limber.planning.goals.target_goal import IN_BALL, IN_BOX
 from limber.planning.settings import PlanSettings
 
 KINDS = [AT_PLACE, IN_BALL, IN_BOX, IN_VIEW, SECOND_ARM, DRAWN]
-"""A kind from outside is appended to it."""
+"""An external kind is appended to it."""
 
 
 def asked_kinds(settings: PlanSettings) -> list[GoalKind]:
@@ -21,7 +21,7 @@ def goal_of(request: GoalRequest) -> Goal:
     """Return the requested goal, or a distant pose if there is none.
 
     Raises:
-        InputError: two are asked for, or one that makes no sense.
+        InputError: two are requested, or one is invalid.
         NoPathError: there is no far pose.
     """
     settings = request.settings

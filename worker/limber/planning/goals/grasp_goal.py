@@ -1,4 +1,4 @@
-"""The grasp at a place: ``--goal``."""
+"""The grasp at a position: ``--goal``."""
 
 from dataclasses import dataclass
 

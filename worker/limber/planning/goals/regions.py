@@ -1,4 +1,4 @@
-"""Regions of space that a place on the branch may be brought into.
+"""Regions of space as goals for a point on the branch.
 
 Each has a signed distance: negative inside, and outside at most the true one.
 """
@@ -19,7 +19,7 @@ class Region(Protocol):
 
     @property
     def depth(self) -> float:
-        """How far the middle is from the outside, at least [m]."""
+        """Lower bound of the middle's distance from the outside [m]."""
         ...
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ class Region(Protocol):
 
 @dataclass(frozen=True)
 class Ball:
-    """All that is within ``radius`` [m] of ``centre`` [m]."""
+    """The points within ``radius`` [m] of ``centre`` [m]."""
 
     centre: tuple[float, float, float]
     radius: float
@@ -61,7 +61,7 @@ class Ball:
 
 
 class Convex(Protocol):
-    """What is below planes ``n . x + c`` with unit normals; ``planes`` [k, 4]."""
+    """The points below planes ``n . x + c`` with unit normals; ``planes`` [k, 4]."""
 
     @property
     def planes(self) -> np.ndarray: ...

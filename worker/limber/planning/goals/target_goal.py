@@ -1,4 +1,4 @@
-"""A place on the branch, its tip or a named target, in a region: ``--tip-goal``, ``--target-box``.
+"""A point on the branch, its tip or a named target, in a region: ``--tip-goal``, ``--target-box``.
 """
 
 from dataclasses import dataclass, replace
@@ -19,13 +19,13 @@ _HALVINGS = 12  # of the way into a region
 
 @dataclass(frozen=True)
 class TargetGoal:
-    """A place on the branch within a region of space.
+    """A point on the branch within a region of space.
 
     Attributes:
-        region: Where it shall be.
+        region: Region for the point.
         target: Number of the named target; None: the branch's tip.
-        name: Of the target.
-        inset: What plans stay off the region's outside by [m]: as far as the field was off there.
+        name: Name of the target.
+        inset: Distance that plans keep from the region's outside [m]: the field's error there.
     """
 
     region: Region
@@ -51,7 +51,7 @@ class TargetGoal:
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         # A small region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
-        # Who is in it already stays: in a large one a walk may lead out of the samples.
+        # Points already in it stay: in a large one a walk may lead out of the samples.
         drawn = field.region.draw(20 * count, generator)
         distance = self.distance(field, drawn)
         points = drawn[distance <= self.tolerance][:count]
@@ -60,7 +60,7 @@ class TargetGoal:
 
     def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
                 ) -> np.ndarray:
-        """Return ``points`` [n, 3] moved so that the target comes towards places in the region."""
+        """Return ``points`` [n, 3] moved so that the target approaches places in the region."""
         if not len(points):
             return points
         wanted = self._entered(field.tip(points, self.target),
@@ -73,8 +73,9 @@ class TargetGoal:
         return points
 
     def _entered(self, places: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Return the points [n, 3] on the way from ``places`` to ``wanted`` places in the region
-        that are just inside: in a large region the others are far out of the branch's reach."""
+        """Return the points [n, 3] on the path from ``places`` to ``wanted`` places in the region
+        that are just inside: in a large region the others are far out of the branch's reach.
+        """
         inside = 0.25 * self.tolerance if self.tolerance < _SMALL else 0.25 * _SMALL
         low, high = np.zeros(len(places)), np.ones(len(places))
         for _ in range(_HALVINGS):
@@ -91,7 +92,7 @@ class TargetGoal:
         return points[np.argmin(self.distance(field, points))]
 
     def place(self, states: SolvedPoses) -> np.ndarray:
-        """Return where the target is in the last of the states [m], shape [3]."""
+        """Return the target's position in the last state [m], shape [3]."""
         return states.tips[-1] if self.target is None else states.targets[-1, self.target]
 
     def missed_by(self, states: SolvedPoses) -> float:
@@ -100,7 +101,7 @@ class TargetGoal:
         return float(self.region.distance(self.place(states)[None])[0])
 
     def drawn_in(self, states: SolvedPoses) -> Self:
-        """Return the goal further in by what the last of the states misses it by, at most half."""
+        """Return the goal moved inwards by the last state's distance from it, at most half."""
         missed = max(self.missed_by(states), 0.0)
         return replace(self, inset=min(self.inset + 1.5 * missed, 0.5 * self.tolerance))
 
@@ -126,7 +127,7 @@ def target_of(asked: GoalRequest) -> tuple[int | None, str]:
     """Return number and name of the requested target.
 
     Raises:
-        InputError: the branch has none of that name.
+        InputError: the branch has no target of that name.
     """
     name = asked.settings.target
     names = [target.name for target in asked.grasp_model.branch.targets]

@@ -1,15 +1,16 @@
-"""The gentlest path that is not too long, and the trade between energy and length.
+"""The gentlest path that is not too long, and the trade-off between energy and length.
 
-Of all paths no longer than L the gentlest has the least integral of energy I. None leaves the
-ellipsoid about start and goal whose points are reached and left within L: the bound counts on its
-cells alone. With a weight w on a metre, every path there costs I + w length >= B(w); so
+Of all paths no longer than L, the gentlest has the least integral of energy I. None leaves the
+ellipsoid about start and goal whose points are reached and left within L: the bound uses its cells
+alone. With a weight w per metre, every path there costs I + w length >= B(w); so
 
     I >= B(w) - w L        for any w
 
-(weak duality: Boyd and Vandenberghe 2004, 5.2). Where the length does not hold the path back, the
-least weights say most. Where it does, the best weight is what a metre more would save: the slope of
-the gentlest path's energy over the length. Where the length jumps at a weight (energy over length
-is not convex: one way round a ridge, or the other) what the bound leaves open is the jump's.
+(weak duality: Boyd and Vandenberghe 2004, 5.2). If the length does not constrain the path, the
+smallest weights give the best bound. If it does, the best weight is the saving per additional
+metre: the slope of the gentlest path's energy over the length. If the length jumps at a weight
+(energy over length is not convex: one path round a ridge, or the other), the remaining gap of the
+bound is the jump's.
 """
 
 from dataclasses import dataclass, replace
@@ -39,8 +40,9 @@ _SPACING = 0.001  # [m] at which a path's integral is taken
 
 @dataclass(frozen=True)
 class TradePoint:
-    """A weight of a metre relative to the given one, the gentlest path that was found with it, and
-    what no path costs less than (None where it was not asked): in J m, length at the weight."""
+    """A weight per metre relative to the given one, the gentlest path found with it, and the lower
+    bound on the cost of any path (None if it was not computed): in J m, length at the weight.
+    """
 
     weight: float
     length_m: float
@@ -54,11 +56,11 @@ class DetourPath:
     """The gentlest path within a length.
 
     Attributes:
-        found: Path, and the certificate of what was asked: of the integral of energy [J m].
+        found: Path, and the certificate of the requested quantity: the integral of energy [J m].
         weight: That weight, relative to the problem's.
-        shortest, longest: Length of the shortest path known, and what was allowed [m].
-        energy_integral: Of the path [J m]. energy_bound: No path so short has less.
-        curve: The trade, by weight.
+        shortest, longest: Length of the shortest known path, and the largest allowed [m].
+        energy_integral: Integral of the path [J m]. energy_bound: Lower bound for paths this short.
+        curve: The trade-off, by weight.
     """
 
     found: GentlePath
@@ -79,10 +81,10 @@ class DetourPath:
 
 def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
                 others: list[np.ndarray], *, progress: Progress = SILENT) -> DetourPath:
-    """Return the gentlest path at most ``max_detour`` (a share) longer than ``shortest`` [n, 3].
+    """Return the gentlest path at most ``max_detour`` (a fraction) longer than ``shortest`` [n, 3].
 
     Raises:
-        NoPathError: there is no path at all; says whether that is proven.
+        NoPathError: there is no path at all; states whether that is proven.
     """
     least = float(arc_lengths(shortest)[-1])
     search = _Search(problem, shortest, (1.0 + max_detour) * least)
@@ -113,7 +115,7 @@ class _Search:
         self.low, self.high = 0.0, np.inf
 
     def begin(self, others: list[np.ndarray]) -> None:
-        """Find the gentlest path from those known, and what a metre more saves.
+        """Find the gentlest path from those known, and the saving per additional metre.
 
         Raises:
             NoPathError: the shortest path is not allowed.
@@ -141,14 +143,14 @@ class _Search:
                     break
 
     def first_weight(self) -> float:
-        """Return the weight whose bound is asked for first."""
+        """Return the weight whose bound is computed first."""
         spare = max(self.longest - self.length, (1.0 - _BINDS) * self.longest)
         light = _UNUSED * self.integral / spare
         return max(self.slope, min(light, self.integral / self.longest)) / self._metre
 
     @property
     def _metre(self) -> float:
-        """What a metre weighs by the problem's own weights [J]."""
+        """Cost of a metre by the problem's own weights [J]."""
         return self.problem.weights.length / self.problem.weights.energy
 
     def _own_weight(self) -> float:
@@ -156,10 +158,10 @@ class _Search:
         return max(self.slope / self._metre, _LIGHT)
 
     def bound(self, weight: float, progress: Progress) -> float | None:
-        """Bound at a weight; return the next one, None where none is worth its time."""
+        """Bound at a weight; return the next one, None if none is worth its time."""
         energy, metre = self.problem.weights.energy, weight * self._metre
         asked = replace(_weighed(self.problem, weight), longest=self.longest)
-        # The gap that is asked for is the energy's: of the weighed cost it is a part.
+        # The requested gap is the energy's, which is a part of the weighted cost.
         wanted = self.integral / (1.0 + _ENOUGH) + metre * self.longest
         enough = max((self.integral + metre * self.length) / wanted - 1.0, _FINEST_GAP)
         found = plan_gentle(asked, [self.path], enough=enough, progress=progress)
@@ -188,7 +190,7 @@ class _Search:
         return weight * _STRIDE if self.low > 0.0 else weight / _STRIDE
 
     def _take(self, path: np.ndarray) -> None:
-        """Keep a path where it is short enough, allowed and gentler than what is known."""
+        """Keep a path if it is short enough, allowed and gentler than the known ones."""
         length, integral = _measured(path, self.problem)
         allowed = np.isfinite(replace(self.problem, longest=self.longest).cost(path))
         if allowed and integral < self.integral:

@@ -1,9 +1,9 @@
-"""The path to the goal that exceeds the limits least, where no path keeps them.
+"""The path to the goal that exceeds the limits least, if no path keeps them.
 
-The planners follow the cost, and know of limits only that they forbid. Here what counts is how far
-over its limit the worst pose of a way is: on a grid over the trusted region, along the shell that
-the samples follow and as dense across it as they are, the least that lets start and goal hang
-together. Where that is within the field's error, it is there that the field must be known better.
+The planners follow the cost; limits only forbid poses. Here what counts is the excess over its
+limit of the worst pose of a path: on a grid over the trusted region, along the shell that the
+samples follow and as dense across it as they are, the least level at which start and goal are
+connected. If that is within the field's error, the field must be known better there.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,9 @@ _DEARER = 30.0  # times the length counts where a pose is as much over its limit
 
 @dataclass(frozen=True)
 class EasiestWay:
-    """A way ``points`` [n, 3] from the start into the goal; ``worst`` is the most that anything is
-    of its limit along it, 1 and less where all limits are kept."""
+    """A path ``points`` [n, 3] from the start into the goal; ``worst`` is the largest ratio of a
+    quantity to its limit along it, 1 or less if all limits are kept.
+    """
 
     points: np.ndarray
     worst: float
@@ -37,7 +38,7 @@ class EasiestWay:
 
 def easiest_way(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal: Goal,
                 ) -> EasiestWay | None:
-    """Return the way from ``start`` [3]; None where none stays among the samples, limits or not."""
+    """Return the path from ``start`` [3]; None if none stays among the samples, limits or not."""
     chart, places = _grid(field)
     shape = places.shape[:3]
     points = chart.curved(places.reshape(-1, 3))
@@ -54,7 +55,7 @@ def easiest_way(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal
     if level is None:
         return None
     numbers = _shortest(shares, places, level, begin, ends)
-    # Along the shell: chords lie well off it.
+    # Along the shell: chords are well off it.
     flat = np.concatenate([chart.map(start), chart.map(points[numbers])])
     way = chart.curved(resample(flat, _FINE))
     return EasiestWay(way, float(max(_shares(field, limits, way).max(), 0.0)))
@@ -74,8 +75,9 @@ def _grid(field: EnergyField) -> tuple:
 
 
 def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.ndarray:
-    """Return the most that anything is of its limit at ``points`` [n, 3], shape [n]; infinite
-    outside the samples' hull and the workspace."""
+    """Return the largest ratio of a quantity to its limit at ``points`` [n, 3], shape [n]; infinite
+    outside the samples' hull and the workspace.
+    """
     out = np.full(len(points), np.inf)
     within = field.region.height(points) <= 0.0
     within &= ((points >= limits.low) & (points <= limits.high)).all(axis=1)
@@ -88,7 +90,7 @@ def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.n
 
 
 def _least_level(shares: np.ndarray, begin: tuple, ends: np.ndarray) -> float | None:
-    """Return the least level at which places no higher lead from ``begin`` to one of ``ends``."""
+    """Return the least level at which places no higher connect ``begin`` to one of ``ends``."""
     def leads(level: float) -> bool:
         together = scipy.ndimage.label(shares <= level, _NEAR)[0]
         return together[begin] > 0 and bool((together[ends] == together[begin]).any())
@@ -106,8 +108,9 @@ def _least_level(shares: np.ndarray, begin: tuple, ends: np.ndarray) -> float | 
 
 def _shortest(shares: np.ndarray, places: np.ndarray, level: float, begin: tuple,
               ends: np.ndarray) -> np.ndarray:
-    """Return the numbers of the places on the shortest way that goes over no ``level``; the part
-    over its limit counts as longer."""
+    """Return the numbers of the places on the shortest path that exceeds no ``level``; the part
+    over its limit counts as longer.
+    """
     open_places = np.flatnonzero(shares.ravel() <= level)
     number = np.full(shares.size, -1)
     number[open_places] = np.arange(len(open_places))

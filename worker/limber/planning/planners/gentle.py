@@ -1,9 +1,9 @@
 """The gentlest path with its certificate: eikonal descent, refinement, bound.
 
-Each grid of the certificate shows the cheapest way on it; refined, it is a path. The first paths
-that are tried are the straight line and what other planners found; where none of them keeps the
-limits, a way by cells that do, if there is one (:mod:`limber.planning.certificate.feasibility`),
-else the way that goes least over them.
+Each grid of the certificate gives its cheapest path; refined, it becomes a path on the field. The
+first paths tried are the straight line and those of other planners. If none of them keeps the
+limits, next come a path through cells that do, if there is one
+(:mod:`limber.planning.certificate.feasibility`), else the path that exceeds the limits least.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _SAME_WAY = 0.05  # of a path's length: another way round a ridge is farther off
 
 @dataclass(frozen=True)
 class GentlePath:
-    """A path [n, 3], its cost, and how close to the best it is."""
+    """A path [n, 3], its cost, and its gap to the best."""
 
     points: np.ndarray
     cost: float
@@ -34,13 +34,13 @@ class GentlePath:
 
 def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, *,
                 enough: float = ENOUGH, progress: Progress = SILENT) -> GentlePath:
-    """Return the gentlest path that was found, and a lower bound on every path.
+    """Return the gentlest path found, and a lower bound on every path.
 
     ``others`` are paths [n, 3] to start from besides the straight line; ``enough`` is the gap
     below which the bound is refined no further.
 
     Raises:
-        NoWayError: it is proven that there is none, or none was found; says which.
+        NoWayError: it is proven that there is none, or none was found; states which.
     """
     best: list = [None, np.inf]
     verdicts: list[Verdict] = []
@@ -66,7 +66,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
                 in_vain.append(True)
             return best[1]
         if rough is not None:
-            # Coarser cells than those that left it open will not settle it.
+            # Coarser cells than those that left it open will not decide it.
             raise not_found(problem, f"The question is undecided on {_grid(verdicts[0])}.")
         verdicts.append(judge(problem))
         # A path that keeps the limits is a better proof than cells that separate.
@@ -87,8 +87,9 @@ def separated(problem: GentleProblem, verdict: Verdict) -> NoWayError:
 
 
 def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:
-    """Return whether a rough path [n, 3] keeps so near to a refined one [k, 3] that refined it
-    would be that one again."""
+    """Return whether a rough path [n, 3] is so near to a refined one [k, 3] that refining it would
+    give the same path.
+    """
     away = cKDTree(path).query(rough)[0]
     return bool(away.max() <= _SAME_WAY * arc_lengths(path)[-1])
 

@@ -1,10 +1,10 @@
 """RRT* of the Open Motion Planning Library on the same problem, cost and limits as our own.
 
-What its Python bindings (2.0.1) need to be told, each found out by measuring:
-``StateCostIntegralObjective`` never calls Python, so the objective overrides ``motionCost``;
-the default neighbour constant connects every node to every other, so the rewire factor is small;
-the random seed must be set before anything is built; progress comes from the termination
-callback, where an exception (a cancelled run) passes through ``solve``.
+Peculiarities of its Python bindings (2.0.1), all found by measuring: ``StateCostIntegralObjective``
+never calls Python, so the objective overrides ``motionCost``; the default neighbour constant
+connects every node to every other, so the rewire factor is small; the random seed must be set
+before anything is built; progress comes from the termination callback, where an exception (a
+cancelled run) passes through ``solve``.
 """
 
 import math
@@ -39,8 +39,8 @@ class OmplRrtStar:
         from ompl import base, geometric
         from ompl import util as ompl_util
 
-        # OMPL takes seeds from 1 on, and logs at a second call that it is late; it reseeds all the
-        # same.
+        # OMPL takes seeds from 1 on; at a second call it logs that it is too late, but still
+        # reseeds.
         ompl_util.setLogLevel(ompl_util.LogLevel.LOG_NONE)
         ompl_util.RNG.setSeed(search.seed + 1)
         setup, planner = _setup(base, geometric, problem, search)
@@ -115,7 +115,7 @@ def _space(base: object, problem: PathProblem) -> object:
 
 
 def _rules(base: object, information: object, problem: PathProblem, search: Search) -> tuple:
-    """Make the subclasses of OMPL's classes that know the problem."""
+    """Make the subclasses of OMPL's classes for the problem."""
     generator = np.random.default_rng([search.seed, 2])
     weights, field = problem.weights, problem.limits
 

@@ -1,15 +1,15 @@
 """From any rough path to the nearest gentlest one, along limits where it meets them.
 
 The cost of a polyline is smooth and so are its limits: L-BFGS with exact gradients minimises the
-augmented Lagrangian. Each limit has a multiplier at each point, which after each round is what the
-limit pushed with there: so the limits are kept in the end without a penalty that grows until
-nothing else counts (that left paths up to 4 % over a limit on force, or 10 to 40 % too dear). The
-gentlest path often runs along the face of the sampled region or in a valley a tenth of a millimetre
+augmented Lagrangian. Each limit has a multiplier at each point. After each round it becomes the
+force of the limit there. So the limits are kept in the end without a penalty that grows until it
+dominates (that left paths up to 4 % over a limit on force, or 10 to 40 % too dear). The gentlest
+path often runs along the face of the sampled region or in a valley a tenth of a millimetre
 wide: steps that are merely refused there stop far from it.
 
-What is moved are corners in the chart of the shell that the grasp follows
-(:mod:`limber.planning.field.chart`), off it in units as much smaller as the branch is stiffer:
-chords in space leave the valley between their ends.
+The variables are corners in the chart of the shell that the grasp follows
+(:mod:`limber.planning.field.chart`), off it in units that are smaller in proportion to the branch's
+stiffness: chords in space leave the valley between their ends.
 """
 
 from collections.abc import Callable, Iterator
@@ -101,7 +101,7 @@ class _Line:
         return self.chart.curved(both)
 
     def settle(self, flat: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
-        """Return the corners moved to where the augmented Lagrangian is least, and the cost.
+        """Return the corners moved to the minimum of the augmented Lagrangian, and the cost.
 
         The unknowns are the edges: so a step moves whole parts of the path, and the end with them,
         as lightly as one corner (the length's second derivative is that of a chain of springs).
@@ -134,8 +134,9 @@ class _Line:
 
 @dataclass(frozen=True)
 class _Excess:
-    """How far over a limit a path is, relative, ``values`` [k], and what ``pull`` makes of weights
-    [k] on them: the gradient of the weighted sum to each of the path's points, [n, 3]."""
+    """Relative excess of a path over a limit, ``values`` [k], and ``pull``, which maps weights [k]
+    on them to the gradient of the weighted sum at each of the path's points, [n, 3].
+    """
 
     values: np.ndarray
     pull: Callable[[np.ndarray], np.ndarray]
@@ -144,9 +145,9 @@ class _Excess:
 
 @dataclass
 class Limited:
-    """The limits on a path's points [n, 3] with what each pushes with.
+    """The limits on a path's points [n, 3] and their multipliers.
 
-    Places closer than ``margin`` [m] to the limit of the trusted region are over it; so is an end
+    Points closer than ``margin`` [m] to the limit of the trusted region are over it; so is an end
     outside the goal. Energy, force and length count relative to their limits.
     """
 
@@ -164,11 +165,11 @@ class Limited:
 
     @property
     def reserve(self) -> float:
-        """What is kept from every limit, relative."""
+        """Relative margin kept from every limit."""
         return self.margin / self.scale
 
     def penalty(self, points: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return what the limits add to the cost, and its gradient to each point, [n, 3]."""
+        """Return the limits' contribution to the cost, and its gradient to each point, [n, 3]."""
         total, gradient = 0.0, np.zeros_like(points)
         for excess, multiplier in self._with_multipliers(points):
             weight = self.heavier * excess.weight
@@ -179,8 +180,7 @@ class Limited:
         return total, gradient
 
     def push(self, points: np.ndarray) -> float:
-        """Let each limit push with what it does on this path from now on; return the most that any
-        is over."""
+        """Set each multiplier to its limit's force on this path; return the largest excess."""
         found = list(self._with_multipliers(points))
         self.multipliers = [np.maximum(
             multiplier + self.heavier * excess.weight * excess.values, 0.0)
@@ -225,7 +225,7 @@ class Limited:
 
         def excess(values: np.ndarray, limit: float, row: int,
                    slope: Callable[[np.ndarray], np.ndarray]) -> _Excess:
-            """Ask the slopes [k, 3] at those points alone at which the limit pushes."""
+            """Compute the slopes [k, 3] only at the points where the limit acts."""
             def pull(push: np.ndarray) -> np.ndarray:
                 out, active = np.zeros_like(points), np.flatnonzero(push)
                 rise = slope(active) + self._slack_slope(points[active], row)

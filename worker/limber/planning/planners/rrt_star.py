@@ -13,7 +13,7 @@ _CHUNK = 250  # iterations between two reports of progress, each a chance to can
 
 
 class OwnRrtStar:
-    """It runs wherever Limber does, with the same path on every system, and holds no lock."""
+    """It runs on every system, with the same path, and holds no lock."""
 
     def missing(self) -> str:
         return ""
@@ -132,7 +132,7 @@ def _distances(point, nodes, count, distance):
 
 @compiled
 def _smallest(distance, count, wanted):
-    """Return the indices of the ``wanted`` smallest of ``distance[:count]``, in rising order."""
+    """Return the indices of the ``wanted`` smallest of ``distance[:count]``, in ascending order."""
     wanted = min(wanted, count)
     kept = np.empty(wanted, np.int64)
     size = 0
@@ -170,7 +170,7 @@ def _detach(node, parent, first_child, next_sibling):
 
 @compiled
 def _lower(node, saving, cost, first_child, next_sibling):
-    """Take ``saving`` off the cost of ``node`` and of all below it."""
+    """Subtract ``saving`` from the cost of ``node`` and of all its descendants."""
     stack = [node]
     while len(stack) > 0:
         current = stack.pop()

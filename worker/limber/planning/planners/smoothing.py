@@ -1,7 +1,7 @@
 """From the corners of a tree to a path for a robot: shortcuts, then the nearest local optimum.
 
-The same steps for the baseline and for D-RRT*, so that their difference is that of their costs
-and not of the luck of sampling.
+The same steps for the baseline and for D-RRT*, so that they differ by their costs and not by the
+luck of sampling.
 """
 
 import numpy as np
@@ -37,8 +37,8 @@ def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights:
               ) -> np.ndarray:
     """Return the path bent to end in that one of ``goals`` [g, 3] which makes it cheapest.
 
-    A tree ends in the goal region where its samples happened to fall; the region is as good
-    everywhere, the path to it is not.
+    A tree ends where its samples happened to fall in the goal region; all of the region is equally
+    good, but the paths to it are not.
     """
     part = (arc_lengths(path) / max(arc_lengths(path)[-1], _MIN_GAP))[:, None]
     best, least = path, path_cost(path, limits, weights)
@@ -53,8 +53,8 @@ def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
            weights: EdgeWeights) -> np.ndarray:
     """Return the path moved to the nearest local optimum of its cost; ends stay, [n, 3].
 
-    L-BFGS with the field's gradient. Trust and limits are not in the gradient: of the way from
-    the old path to the optimum, the farthest tenth that is allowed and cheaper is taken.
+    L-BFGS with the field's gradient. Trust and limits are not in the gradient: of the line from the
+    old path to the optimum, the farthest tenth that is allowed and cheaper is taken.
     """
     spacing = max(weights.step, np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
                   / _POLISH_POINTS)

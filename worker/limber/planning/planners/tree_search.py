@@ -1,4 +1,4 @@
-"""What a sampling planner is, what it is asked and what it answers."""
+"""Interface of a sampling planner: its problem and its result."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -37,14 +37,14 @@ class PathProblem(GentleProblem):
 
 @dataclass(frozen=True)
 class Search:
-    """How long and how wide to search.
+    """Effort and range of a search.
 
     Attributes:
         iterations: Samples drawn.
         reach: Longest edge, as a fraction of the box's diagonal.
-        goal_bias: Share of samples that are drawn from the goal region.
+        goal_bias: Fraction of samples that are drawn from the goal region.
         shortcuts: Attempts to shorten the found path.
-        seed: Of all that is random.
+        seed: Seed of all random numbers.
     """
 
     iterations: int = 5000
@@ -56,7 +56,7 @@ class Search:
 
 @dataclass(frozen=True)
 class SearchTree:
-    """A tree as it ended: ``nodes`` [n, 3] [m], and the ``parents`` [n] that they hang on.
+    """A tree as it ended: ``nodes`` [n, 3] [m], and their ``parents`` [n].
 
     A parent comes before its children; the first node is the start and has the parent -1.
     """
@@ -66,7 +66,7 @@ class SearchTree:
 
     @classmethod
     def of(cls, nodes: np.ndarray, parents: np.ndarray) -> "SearchTree":
-        """Return the tree of nodes in any order; what does not hang on the start is left out."""
+        """Return the tree of nodes in any order; nodes not connected to the start are left out."""
         depth = np.where(parents < 0, 0, -1)
         depth[np.flatnonzero(depth == 0)[1:]] = -1
         while True:
@@ -80,9 +80,9 @@ class SearchTree:
         return cls(nodes[order], np.where(depth[order] > 0, place[parents[order]], -1))
 
     def pruned(self, most: int) -> "SearchTree":
-        """Return at most ``most`` of its nodes: those that carry the most others.
+        """Return at most ``most`` of its nodes: those with the most descendants.
 
-        Its edges are all edges of the tree: a node carries fewer than the one that it hangs on.
+        Its edges are all edges of the tree: a node has fewer descendants than its parent.
         """
         if len(self.nodes) <= most:
             return self
@@ -96,12 +96,12 @@ class SearchTree:
 
 @dataclass(frozen=True)
 class Searched:
-    """What a search came to.
+    """Result of a search.
 
     Attributes:
-        path: The best polyline of grasp positions [m], shape [k, 3]; None where none was found.
+        path: The best polyline of grasp positions [m], shape [k, 3]; None if none was found.
         history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
-        tree: All that was searched; None from a planner that grows no tree.
+        tree: The whole search tree; None from a planner that grows no tree.
     """
 
     path: np.ndarray | None

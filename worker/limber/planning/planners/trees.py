@@ -1,8 +1,8 @@
-"""RRT* (Karaman and Frazzoli 2011) over grasp positions, by the planner that is asked for.
+"""RRT* (Karaman and Frazzoli 2011) over grasp positions, by the requested planner.
 
-``ompl`` is the Open Motion Planning Library's, kept as the reference that others know; ``own``
-stands in where OMPL has no wheel. Paths end with shortcuts that lower the cost; OMPL's other
-simplifiers ignore it.
+``ompl`` is the Open Motion Planning Library's, kept as the widely known reference; ``own`` replaces
+it where OMPL has no wheel. Paths end with shortcuts that lower the cost; OMPL's other simplifiers
+ignore it.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,12 +18,13 @@ from limber.planning.planners.smoothing import polish, shortcut, slide_end
 from limber.planning.planners.tree_search import PathProblem, Planner, Search, SearchTree
 
 PLANNERS: dict[str, Planner] = {"ompl": OmplRrtStar(), "own": OwnRrtStar()}
-"""By the names of ``--engine``, that come first which ``auto`` prefers; one from outside is added
-to it."""
+"""Planners by the names of ``--engine``, in the order in which ``auto`` prefers them; an external
+one is added to it.
+"""
 
 
 def chosen_engine(engine: str) -> str:
-    """Return the name of the planner for a setting: the first that can be used for ``auto``."""
+    """Return the name of the planner for a setting: the first available one for ``auto``."""
     if engine != "auto":
         return engine
     return next(name for name, planner in PLANNERS.items() if not planner.missing())
@@ -40,7 +41,7 @@ class FoundPath:
         history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
         engine: Which engine found it.
         raw: The tree's polyline before shortcuts, shape [k, 3]; None from a search without trees.
-        tree: All that was searched; None from a search without trees.
+        tree: The whole search tree; None from a search without trees.
     """
 
     points: np.ndarray
@@ -78,7 +79,7 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
 
 
 def found_again(found: FoundPath, problem: PathProblem) -> FoundPath | None:
-    """Return a found path on a field that has learnt since; None if it is not allowed there."""
+    """Return a found path on a field with more samples; None if it is not allowed there."""
     points = found.points
     if problem.weights.energy > 0.0:
         points = polish(points, problem.energy_field, problem.limits, problem.weights)

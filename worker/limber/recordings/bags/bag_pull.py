@@ -1,4 +1,4 @@
-"""A bag as a pull: which topics are meant, one clock, and the gripper's wrench on the branch."""
+"""A bag as a pull: choice of topics, one clock, and the gripper's wrench on the branch."""
 
 import tempfile
 from collections.abc import Callable
@@ -20,10 +20,10 @@ from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream
 
 BRANCH_FRAME = "branch"
-"""Frame of a bag that is taken for the branch's."""
+"""Frame of a bag that is taken as the branch's."""
 
 MOST_MARKERS = 60
-"""Clouds with as many points or fewer, the same number in each, are tracked markers."""
+"""Most points of a cloud that counts as tracked markers, if all clouds have the same number."""
 
 _LONGEST_GAP = 0.1  # s between wrenches, or three of their steps, over which nothing is known
 _GRIPPERS = ("grasp", "gripper", "tcp", "tool", "tool0", "flange", "ee_link", "hand")
@@ -34,13 +34,13 @@ JointPoses = Callable[[tuple[str, ...], np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class BagPull:
-    """What of a bag makes a pull.
+    """The content of a bag that makes up a pull.
 
     Attributes:
-        robot: Pose and wrench, as of a robot's table, branch frame.
+        robot: Pose and wrench, as in a robot's table, branch frame.
         observation: ``markers``, ``clouds``, ``depth`` or ``none``.
-        seen: Tracked markers; None for files and for nothing.
-        warnings: What was taken on trust.
+        seen: Tracked markers; None for files or no observation.
+        warnings: Assumptions that were made.
     """
 
     robot: Stream
@@ -51,14 +51,14 @@ class BagPull:
 
 def pull_of_bag(bag: Bag, folder: Path, settings: ImportSettings,
                 joint_poses: JointPoses | None = None, progress: Progress = SILENT) -> BagPull:
-    """Bring a bag into the folder of a pull: images and clouds as files, the rest as values.
+    """Import a bag into the folder of a pull: images and clouds as files, the rest as values.
 
     Args:
-        joint_poses: Where the gripper is by joint angles, where a cell is given.
+        joint_poses: Poses of the gripper by joint angles, if a cell is given.
 
     Raises:
-        InputError: no wrench or pose; more than one gripper, unless one is named; clocks that have
-            no moment in common.
+        InputError: there is no wrench or pose, more than one gripper without a choice, or no common
+            time span of the clocks.
     """
     clock = "stamps" if settings.bag_clock == "header" else "logged"
     warnings: list[str] = []
@@ -104,7 +104,7 @@ def _chosen(bag: Bag, kind: str, named: str | None, option: str, why: str) -> To
 def _gripper(bag: Bag, frames: Frames, settings: ImportSettings, clock: str,
              joint_poses: JointPoses | None, warnings: list[str],
              ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Times [s], poses [n, 6] of the gripper, and the frame that they are in."""
+    """Times [s], poses [n, 6] of the gripper, and their reference frame."""
     name = settings.pose_topic
     if not bag.of("pose") or (name is not None and not name.startswith("/")):
         found = (_by_frames(bag, frames, name, clock, warnings)
@@ -121,13 +121,13 @@ def _gripper(bag: Bag, frames: Frames, settings: ImportSettings, clock: str,
 
 def _by_frames(bag: Bag, frames: Frames, name: str | None, clock: str, warnings: list[str],
                ) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """The gripper by the tree of frames, where it moves in it."""
+    """The gripper from the tree of frames, if it moves there."""
     moving = [topic for topic in bag.of("transform") if len(topic.stamps) > 2]
     wanted = [frame for frame in frames.names
               if (frame == name if name else frame.lower() in _GRIPPERS)]
     if not moving or not wanted:
         return None
-    # Of a chain flange, tool0, gripper the last by our list is what holds.
+    # Of a chain flange, tool0, gripper, the last in our list is the gripper.
     frame = min(wanted, key=lambda frame: name is None and _GRIPPERS.index(frame.lower()))
     longest = max(moving, key=lambda topic: len(topic.stamps))
     root = _root(bag, frame)
@@ -141,10 +141,10 @@ def _by_frames(bag: Bag, frames: Frames, name: str | None, clock: str, warnings:
 
 def _by_joints(bag: Bag, name: str | None, clock: str, joint_poses: JointPoses | None,
                ) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """The gripper by the arm's joint angles.
+    """The gripper from the arm's joint angles.
 
     Raises:
-        InputError: there are angles alone, and no arm was named.
+        InputError: there are only angles, and no arm was named.
     """
     if not bag.of("joints"):
         return None
@@ -159,7 +159,7 @@ def _by_joints(bag: Bag, name: str | None, clock: str, joint_poses: JointPoses |
 
 
 def _root(bag: Bag, frame: str) -> str:
-    """The frame above all others on the way up from ``frame``."""
+    """The root frame above ``frame``."""
     above = {topic.labels[0].lstrip("/"): topic.frame.lstrip("/") for topic in bag.of("transform")}
     seen = {frame}
     while frame in above and above[frame] not in seen and frame != BRANCH_FRAME:
@@ -186,7 +186,7 @@ def _require_one_clock(bag: Bag, streams: tuple[tuple[str, np.ndarray], ...],
 
 def _on_branch(topic: Topic, clock: np.ndarray, times: np.ndarray, poses: np.ndarray, base: str,
                frames: Frames, warnings: list[str]) -> np.ndarray:
-    """Wrench at the poses' times in the poses' frame about the gripper, shape [n, 6]."""
+    """Wrench at the poses' times, in the poses' frame, about the gripper, shape [n, 6]."""
     order = np.argsort(clock, kind="stable")
     stamps, values = clock[order], topic.values[order]
     good = np.isfinite(values).all(axis=1) & np.isfinite(stamps)
@@ -220,7 +220,7 @@ def _on_branch(topic: Topic, clock: np.ndarray, times: np.ndarray, poses: np.nda
 
 def _placed(base: str, frames: Frames, settings: ImportSettings, warnings: list[str],
             ) -> tuple[np.ndarray, Rotation]:
-    """Position and turn of the poses' frame in the branch's."""
+    """Position and rotation of the poses' frame in the branch's."""
     if settings.frame_pose is not None:
         pose = np.array(settings.frame_pose)
         position, turn = pose[:3], Rotation.from_rotvec(pose[3:])
@@ -245,7 +245,7 @@ def _placed(base: str, frames: Frames, settings: ImportSettings, warnings: list[
 def _seen(bag: Bag, folder: Path, settings: ImportSettings, clock: str, begin: float, base: str,
           placed: tuple[np.ndarray, Rotation], frames: Frames, warnings: list[str],
           progress: Progress) -> tuple[str, Observations | None]:
-    """What was seen of the branch: markers as values; images and clouds become files."""
+    """Observations of the branch: markers as values; images and clouds become files."""
     named = settings.points_topic
     if named == "none":
         return "none", None
@@ -282,7 +282,7 @@ def _seen(bag: Bag, folder: Path, settings: ImportSettings, clock: str, begin: f
 
 def _frame_of(topic: Topic, base: str, placed: tuple[np.ndarray, Rotation], frames: Frames,
               warnings: list[str]) -> tuple[np.ndarray, Rotation]:
-    """Position and turn of a resting topic's frame in the branch's."""
+    """Position and rotation of a static topic's frame in the branch's."""
     own = topic.frame.lstrip("/")
     if own == BRANCH_FRAME:
         return np.zeros(3), Rotation.identity()
@@ -329,7 +329,7 @@ def _write_images(bag: Bag, topic: Topic, times: np.ndarray, base: str,
         Path(place, "depth").mkdir()
         write_camera(Path(place, "camera.toml"), camera)
         for image, time in zip(topic.values, times, strict=True):
-            # 16 bits are millimetres by ROS' convention (REP 118), floats metres.
+            # By ROS' convention (REP 118) 16 bits are millimetres, floats metres.
             depth = image if image.dtype.kind == "u" else np.clip(
                 np.nan_to_num(image) * 1000.0, 0, 65535).round().astype(np.uint16)
             Image.fromarray(depth).save(Path(place, "depth", f"{time:.6f}.png"))

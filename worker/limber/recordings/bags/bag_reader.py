@@ -1,8 +1,8 @@
-"""What of a bag belongs to a pull, as arrays: wrenches, poses, frames, joints, points, images.
+"""The content of a bag that belongs to a pull, as arrays from wrenches to images.
 
-Read by the `rosbags` package in a process of its own (:mod:`limber.geometry.io.isolated_readers`):
-bags come from strangers. A message that cannot be decoded is left out and counted; many are a
-refusal.
+Read by the `rosbags` package in a separate process (:mod:`limber.geometry.io.isolated_readers`),
+since bags may be untrusted. Messages that cannot be decoded are skipped and counted; a file with
+many of them is refused.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,10 @@ class Topic:
         name: The topic; for transforms ``topic parent>child``.
         frame: ``header.frame_id`` of the first message.
         stamps: ``header.stamp`` of each [s], shape [n].
-        logged: When each was recorded [s], shape [n].
-        values: What they hold, shape [n, ...]; see the readers.
+        logged: Recording time of each [s], shape [n].
+        values: Their content, shape [n, ...]; see the readers.
         labels: Names beside them: joints, an image's encoding, a transform's child.
-        counts: Points of each message, where their number differs.
+        counts: Number of points of each message, if it varies.
     """
 
     name: str
@@ -52,11 +52,11 @@ class Bag:
     """Content of a bag.
 
     Attributes:
-        path: Of the file or folder.
+        path: Path of the file or folder.
         kinds: ``wrench``, ``pose``, ``transform``, ``joints``, ``points``, ``image``, ``camera``
             to the topics that hold such messages.
         others: Topics with messages of other types, as ``topic (type)``.
-        broken: Messages that could not be decoded.
+        broken: Number of messages that could not be decoded.
         pull_toml: Limber's description of the pull if Limber wrote the bag; else empty.
     """
 
@@ -100,7 +100,7 @@ def read_bag(path: Path) -> Bag:
 
 @dataclass
 class _Growing:
-    """A topic while it is read."""
+    """A topic while it is being read."""
 
     kind: str
     frame: str
@@ -122,7 +122,7 @@ class _Growing:
 
 
 def bag_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return what a bag holds as flat arrays, for :func:`read_bag` on the other side."""
+    """Return the content of a bag as flat arrays, for :func:`read_bag` in the parent process."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -160,7 +160,8 @@ def bag_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _pull_toml(path: Path) -> str:
-    """The description that `limber export-pull` writes beside the messages; empty without one."""
+    """The description that `limber export-pull` writes beside the messages; empty if there is none.
+    """
     if path.suffix.lower() != ".mcap":
         return ""
     from mcap.exceptions import McapError
@@ -172,7 +173,7 @@ def _pull_toml(path: Path) -> str:
                 if record.name == LIMBER:
                     return record.metadata.get(PULL_TOML, "")[:_MOST_TEXT]
     except (McapError, OSError, ValueError):
-        # Cut off before its end, where such records are listed; the messages were read.
+        # The file is truncated before the index of such records; the messages were read.
         return ""
     return ""
 
@@ -208,7 +209,7 @@ def _joints(message: Any) -> list[_Entry]:
 
 
 def _cloud(message: Any) -> list[_Entry]:
-    """Coordinates [m] of a PointCloud2, shape [n, 3]; NaN where a sensor saw nothing."""
+    """Coordinates [m] of a PointCloud2, shape [n, 3]; NaN for invalid points."""
     kinds = {field.name: (field.offset, {7: "f4", 8: "f8"}[field.datatype])
              for field in message.fields if field.name in ("x", "y", "z")}
     order = ">" if message.is_bigendian else "<"
@@ -227,7 +228,7 @@ _PIXELS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 
 def _image(message: Any) -> list[_Entry]:
-    """Depths as they stand in the image; colours are passed by."""
+    """Depths as stored in the image; colour images are skipped."""
     if message.encoding not in _PIXELS:
         return []
     kind = np.dtype((">" if message.is_bigendian else "<") + _PIXELS[message.encoding])

@@ -25,7 +25,7 @@ _Message = tuple[float, str, str, Any]
 
 
 def write_mcap(path: Path, folder: Path, pull: Pull) -> dict[str, int]:
-    """Write a pull and the frames in its folder; returns how many messages each topic has.
+    """Write a pull and the frames in its folder; return the number of messages per topic.
 
     Times start at 0. Wrenches and poses that were not measured are omitted.
 
@@ -97,7 +97,7 @@ class _Messages:
         return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
     def transform(self, seconds: float, child: str, pose: np.ndarray) -> Any:
-        """Return where a frame is in the branch's."""
+        """Return the pose of a frame in the branch's."""
         moved = self.make("geometry_msgs/msg/Transform", translation=self.vector(pose[:3]),
                           rotation=self.turn(pose[3:]))
         return self.make("tf2_msgs/msg/TFMessage", transforms=[self.make(
@@ -105,7 +105,7 @@ class _Messages:
             child_frame_id=child, transform=moved)])
 
     def cloud(self, seconds: float, points: np.ndarray) -> Any:
-        """Return points [n, 3] as doubles; NaN where one was not seen."""
+        """Return points [n, 3] as doubles; NaN for points not seen."""
         rows = np.ascontiguousarray(points, "<f8")
         fields = [self.make("sensor_msgs/msg/PointField", name=name, offset=8 * k, datatype=8,
                             count=1) for k, name in enumerate("xyz")]
@@ -145,7 +145,7 @@ def _of_points(messages: _Messages, pull: Pull) -> Iterator[_Message]:
 
 
 def _of_frames(messages: _Messages, folder: Path, pull: Pull) -> Iterator[_Message]:
-    """What a camera saw; each file is read when it is written."""
+    """Images and clouds of a camera; each file is read when it is written."""
     offset = pull.entry.time_offset_s
     camera = read_camera(folder / "camera.toml") if (folder / "camera.toml").is_file() else None
     for time, file in _frames(folder):

@@ -1,4 +1,4 @@
-"""Messages whose header has no time, or one that cannot be."""
+"""Messages whose header has no time, or an impossible one."""
 
 from dataclasses import replace
 
@@ -8,20 +8,19 @@ from limber.core.errors import InputError
 from limber.recordings.bags.bag_reader import Bag, Topic
 
 _OFF_S = 3600.0
-"""Farther than this from what the topic's other stamps say, no clock's drift is it."""
+"""Largest distance from the topic's other stamps that a clock's drift can explain."""
 
 
 def stamped(bag: Bag, clock: str, warnings: list[str]) -> Bag:
-    """Return a bag without the messages whose time is 0 or far from all others of their topic.
+    """Return a bag without the messages whose time is 0 or far from the others of their topic.
 
-    Drivers publish a few before their clock is set. What holds at all times (a transform that is
-    sent once or twice, a camera's numbers) keeps its time. Adds a sentence to ``warnings`` for
-    each topic.
+    Drivers publish a few messages before their clock is set. Static data (a transform sent once or
+    twice, camera intrinsics) keep their time. Adds a sentence to ``warnings`` for each topic.
 
     Args:
         bag: As read.
-        clock: ``stamps`` or ``logged``, which of a topic's times count.
-        warnings: Gets what was left out.
+        clock: ``stamps`` or ``logged``: which of a topic's times count.
+        warnings: Gets a sentence on the messages left out.
 
     Raises:
         InputError: most of a topic's messages have no time.
@@ -43,11 +42,11 @@ def _of_topic(bag: Bag, topic: Topic, clock: str, warnings: list[str]) -> Topic:
             f"time in their {'headers' if clock == 'stamps' else 'log'}.",
             "Their order in time is not known from there.",
             f"Use the other times: --bag-clock {other}.")
-    # The other clock runs on while a driver's is set.
+    # The other clock continues while a driver's is set.
     lead = topic.stamps - topic.logged
     good = known & (np.abs(lead - np.median(lead[known])) < _OFF_S)
     if zero.sum() == 1 and np.median(times[known]) < _OFF_S:
-        # A clock of its own begins with 0, that of a simulation for one.
+        # A separate clock starts at 0, for example that of a simulation.
         good |= zero
     if good.all():
         return topic

@@ -1,4 +1,4 @@
-"""Frames of reference in a bag: the pose of one in another, from its transforms."""
+"""Reference frames in a bag: the pose of one in another, from its transforms."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ _MOST_LINKS = 32
 
 @dataclass(frozen=True)
 class Motion:
-    """A frame in another over time, or one that does not move.
+    """A frame in another over time, or a static one.
 
     Attributes:
         times: [s], increasing, shape [n].
@@ -34,7 +34,8 @@ class Motion:
         return cls(times, values[:, :3], Rotation.from_quat(values[:, 3:]))
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, Rotation]:
-        """Return position [n, 3] and turn at ``times``; the nearest known before and after."""
+        """Return position [n, 3] and rotation at ``times``; outside their range the nearest known.
+        """
         if len(self.times) == 1:
             return np.repeat(self.positions, len(times), axis=0), self.turns[[0] * len(times)]
         inside = np.clip(times, self.times[0], self.times[-1])
@@ -49,7 +50,7 @@ class Frames:
     def __init__(self, topics: tuple[Topic, ...], clock: str):
         self._links: dict[str, dict[str, tuple[Motion, bool]]] = {}
         for topic in topics:
-            # What does not move is often sent once, whenever: its clock does not count.
+            # A static transform is often sent only once, at any time: its stamp does not count.
             motion = Motion.of(getattr(topic, clock), topic.values)
             parent, child = topic.frame.lstrip("/"), topic.labels[0].lstrip("/")
             if len(motion.times) and parent != child:
@@ -63,7 +64,7 @@ class Frames:
 
     def between(self, frame: str, within: str, times: np.ndarray,
                 ) -> tuple[np.ndarray, Rotation] | None:
-        """Return position [n, 3] and turn of ``frame`` in ``within``; None if it is not known."""
+        """Return position [n, 3] and rotation of ``frame`` in ``within``; None if unknown."""
         way = self._way(within.lstrip("/"), frame.lstrip("/"))
         if way is None:
             return None

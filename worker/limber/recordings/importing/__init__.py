@@ -1,1 +1,2 @@
-"""Recordings of other programs into the pull format, and the registry of their formats."""
+"""Import of recordings of other programs into the pull format, and the registry of their formats.
+"""

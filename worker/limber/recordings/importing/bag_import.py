@@ -1,4 +1,4 @@
-"""A bag into the pull format, with what Limber itself has written into it."""
+"""Import of a bag into the pull format, including Limber's own records in it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from limber.recordings.time_series import MAD_TO_SIGMA
 
 
 def read_bag_pull(path: Path, request: ImportRequest) -> Pull:
-    """Return the pull that a bag holds; images and clouds go into the pull's folder.
+    """Return the pull in a bag; images and clouds go into the pull's folder.
 
     Raises:
         InputError: see :func:`.bag_reader.read_bag` and :func:`.bag_pull.pull_of_bag`; or no
@@ -48,7 +48,7 @@ def read_bag_pull(path: Path, request: ImportRequest) -> Pull:
 
 def _markers(seen: Observations, told: PullEntry | None, request: ImportRequest,
              ) -> tuple[Observations, np.ndarray]:
-    """Markers whose place at rest is known, and those places [m], shape [m, 3]."""
+    """Markers with a known rest position, and those positions [m], shape [m, 3]."""
     placed = request.registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)])
     at_rest = None if told is None or placed else told.rest_points_m
     known = at_rest is not None and len(at_rest) == seen.point_count
@@ -66,7 +66,7 @@ def _markers(seen: Observations, told: PullEntry | None, request: ImportRequest,
 
 
 def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
-    """What `limber export-pull` wrote of the pull beside its messages, and what was wrong with it.
+    """The description that `limber export-pull` wrote beside the messages, and its faults.
     """
     if not bag.pull_toml:
         return None, ()
@@ -77,7 +77,7 @@ def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
 
 
 def _as_told(entry: PullEntry, told: PullEntry, request: ImportRequest) -> PullEntry:
-    """The entry of a bag that Limber wrote; what the settings ask for goes before."""
+    """The entry of a bag that Limber wrote; the import's settings take precedence."""
     given = request.given
     kept: dict[str, Any] = {
         "calibration": told.calibration, "weightless": told.weightless, "truth": told.truth,
@@ -105,8 +105,8 @@ def _as_told(entry: PullEntry, told: PullEntry, request: ImportRequest) -> PullE
 
 
 def _torque_noise(torques: np.ndarray) -> float | None:
-    """Standard deviation of measured torques [n, 3] by their steps [N m]; at least 2 % of the peak,
-    which sensors err by. None where none was measured.
+    """Standard deviation of measured torques [n, 3] from their steps [N m]; at least 2 % of the
+    peak, a typical sensor error. None if none was measured.
     """
     peak = float(np.abs(np.nan_to_num(torques)).max(initial=0.0))
     steps = np.abs(np.diff(torques, axis=0)).ravel()

@@ -1,4 +1,4 @@
-"""C3D files of motion capture, read in a process of their own."""
+"""C3D files of motion capture, read in a separate process."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from limber.recordings.time_series import Stream
 def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the markers of a C3D file: ``points`` [3, m, n], rate, unit, labels.
 
-    Compiled code reads it, which a mangled file may abort.
+    Read by compiled code, which a corrupt file may crash.
     """
     import ezc3d
 
@@ -27,7 +27,7 @@ def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: object,
                       ) -> tuple[Stream, list[str]]:
-    """Return marker tracks [m] and labels of arrays as :func:`c3d_arrays` gives them.
+    """Return marker tracks [m] and labels of arrays from :func:`c3d_arrays`.
 
     Raises:
         InputError: there are no points, no times, or positions that are not finite.

@@ -1,4 +1,4 @@
-"""What an import is asked: the recording, where it goes, the settings, the branch and the robot."""
+"""Input of an import: recording, target folder, settings, branch and robot."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -20,13 +20,13 @@ from limber.recordings.settings import ImportSettings
 
 @dataclass(frozen=True)
 class BranchFrame:
-    """What an import must know of the branch.
+    """Properties of the branch that an import needs.
 
     Attributes:
         alignment: From the scan's coordinates to the branch's.
         gravity: [m/s^2] in the branch's frame.
-        nodes: Of its mesh [m], shape [n, 3]; a steady load asks for them. None: there is no mesh
-            yet, and nothing can be held against it.
+        nodes: Nodes of its mesh [m], shape [n, 3]; needed for a steady load. None: there is no mesh
+            yet to compare with.
     """
 
     alignment: Alignment = field(default_factory=Alignment)
@@ -36,11 +36,11 @@ class BranchFrame:
 
 @dataclass(frozen=True)
 class RobotKnown:
-    """What is known of the robot that a recording was made with.
+    """Known properties of the robot of a recording.
 
     Attributes:
-        joint_poses: Where its gripper is by its joint angles.
-        noise: Of its force sensor.
+        joint_poses: Gripper poses by its joint angles.
+        noise: Noise of its force sensor.
         errors: Calibration errors of a recording of this many seconds.
     """
 
@@ -55,12 +55,12 @@ class ImportRequest:
 
     Attributes:
         source: The recording.
-        folder: Of the pull; images and clouds go there.
-        name: Of the pull.
+        folder: Folder of the pull, for images and clouds.
+        name: Name of the pull.
         settings: How to read it.
-        branch: What is known of the branch.
-        robot: What is known of the robot, if a cell states it.
-        progress: Called as it goes; gets what the user should know.
+        branch: Known properties of the branch.
+        robot: Known properties of the robot, if a cell states it.
+        progress: Called during the work; receives warnings for the user.
     """
 
     source: Path
@@ -78,20 +78,20 @@ class ImportRequest:
                 if getattr(self.settings, name) != field.default}
 
     def in_branch(self, points: np.ndarray) -> np.ndarray:
-        """Return points [m] of the user's frame in the branch's, shape [n, 3]."""
+        """Transform points [m] from the user's frame to the branch's, shape [n, 3]."""
         alignment = self.branch.alignment
         if self.settings.coordinates == "branch":
             return points
         return alignment.apply(points / alignment.scale)
 
     def grasp_or(self, otherwise: Callable[[], np.ndarray]) -> tuple[float, float, float]:
-        """Return the grasp point in the branch's frame [m]; where none was given, another."""
+        """Return the grasp point in the branch's frame [m]; if none was given, the alternative."""
         point = self.settings.grasp_point
         x, y, z = otherwise()[:3] if point is None else self.in_branch(np.array([point]))[0]
         return float(x), float(y), float(z)
 
     def registered(self, rest: np.ndarray, labels: list[str]) -> Registration | None:
-        """Return the fit of markers [m, 3] to their positions on the branch, if those are given.
+        """Return the fit of markers [m, 3] to their nominal positions on the branch, if given.
         """
         if self.settings.nominal is None:
             return None
@@ -115,10 +115,10 @@ class ImportRequest:
 
 
 def require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) -> None:
-    """Refuse a grasp in the air beside the branch.
+    """Refuse a grasp beside the branch.
 
     Raises:
-        InputError: no node lies within two grasp radii (and 5 mm) of it.
+        InputError: no node is within two grasp radii (and 5 mm) of it.
     """
     if nodes is None:
         return
@@ -134,7 +134,7 @@ def require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) ->
 
 
 def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
-    """Refuse markers that lie elsewhere than the branch, as those of a capture's own frame do.
+    """Refuse markers that are not at the branch, such as those in a capture system's own frame.
 
     Raises:
         InputError: one is farther from the mesh than a quarter of its extent.
@@ -150,10 +150,9 @@ def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
 
 
 def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
-    """Return the pull with what its robot's cell leaves open.
+    """Return the pull completed by values from its robot's cell.
 
-    A pull that states its calibration stays as it is; without a cell the assumed values are
-    reported.
+    A pull that states its calibration is unchanged; without a cell the assumed values are reported.
     """
     settings, robot = request.settings, request.robot
     if pull.entry.calibration is not None:

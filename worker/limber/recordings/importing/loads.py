@@ -1,4 +1,4 @@
-"""Pulls without a robot: markers on a branch that a steady load bends, or that is let go."""
+"""Pulls without a robot: markers on a branch that is bent by a steady load, or released."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from limber.recordings.time_series import Stream
 
 
 def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
-    """Refuse what does not go together with a load.
+    """Refuse settings that do not fit a load.
 
     Raises:
         InputError: no markers, two loads, a load without a position, or a dynamic pull.
@@ -107,7 +107,7 @@ def _import_rest(seen: Observations, labels: list[str], request: ImportRequest) 
 
 def _import_swing(seen: Observations, labels: list[str], request: ImportRequest,
                   ) -> dict[str, Any]:
-    """A branch that is let go: all frames, the load, and what swings with it."""
+    """A released branch: all frames, the load, and the mass that swings with it."""
     settings = request.settings
     rest, noise = swung(seen, settings.swing_start, request.name)
     found = _placed(rest, seen.positions, labels, request)
@@ -123,15 +123,15 @@ def _import_swing(seen: Observations, labels: list[str], request: ImportRequest,
 
 def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.ndarray,
            load: np.ndarray, sigma: float, **further: SwingEntry) -> None:
-    """Write a pull without a robot: a steady load [N], shape [3], where the grasp is.
+    """Write a pull without a robot: a steady load [N], shape [3], at the grasp.
 
     Args:
         moved: Displacements of the markers [m], shape [frames, m, 3].
         sigma: Standard deviation of their positions [m].
-        further: Entries beside those of a pull with a robot.
+        further: Additional entries beyond those of a pull with a robot.
     """
     nodes = _nodes(request)
-    # Of the branch's own weight alone no load hangs anywhere: where it is seen to move most.
+    # A branch under its own weight has no point of load: use the marker that moves most.
     grasp = request.grasp_or(lambda: _nearest(nodes, found.rest[_farthest(moved)]))
     entry = request.entry("markers", found.rest, drive="force", mode="pinned", grasp=grasp,
                           sigma=sigma)
@@ -145,20 +145,20 @@ def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.
 
 
 def _nearest(nodes: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """The node nearest to a place [m]."""
+    """The node nearest to a position [m]."""
     return nodes[np.linalg.norm(nodes - place, axis=1).argmin()]
 
 
 def _farthest(moved: np.ndarray) -> int:
-    """Which marker is seen to move farthest, by displacements [m], shape [frames, m, 3]."""
-    # A marker out of sight has not been seen to move.
+    """Index of the marker with the largest observed displacement [m], shape [frames, m, 3]."""
+    # An invisible marker does not count as moving.
     return int(np.nan_to_num(np.linalg.norm(moved, axis=2)).max(axis=0).argmax())
 
 
 def against_load(moved: np.ndarray, load: np.ndarray) -> str:
     """Return a warning if markers move against the load (displacements [m], load [N]), else "".
 
-    A motion across the load is plausible: an upright branch bends sideways under a weight.
+    Motion across the load is plausible: an upright branch bends sideways under a weight.
     """
     size = np.linalg.norm(moved, axis=1)
     mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)

@@ -1,4 +1,4 @@
-"""A recording of another program into ``pulls/NAME``."""
+"""Import of a recording of another program into ``pulls/NAME``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,16 +34,16 @@ from limber.recordings.time_series import Stream
 
 
 def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
-    """Bring a recording into the folder of a pull, in the pull format.
+    """Import a recording into the folder of a pull, in the pull format.
 
     Args:
         kind: The name of its format among :data:`~.formats.RECORDINGS`.
-        request: What is imported, and where to.
+        request: The import's source, target and settings.
 
     Returns:
-        ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
-        load ``displacement_m``, ``settled_s`` and ``registration_rms_m``; of a force table
-        ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
+        ``frame_count``, ``point_count``, ``time_offset_s``; for a steady load ``displacement_m``,
+        ``settled_s`` and ``registration_rms_m``; for a force table ``slope_n_per_m``,
+        ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
     Raises:
         InputError: the recording cannot be read as its stated kind.
@@ -98,7 +98,7 @@ def _import_motion(chosen: RecordingFormat, request: ImportRequest) -> dict[str,
 
 
 def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEntry:
-    """The pull's entry with the clocks' offset, as far as the recording tells it.
+    """The pull's entry with the clocks' offset, if the recording determines it.
 
     Args:
         seen: Times of the observations [s].
@@ -120,7 +120,7 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
 
 
 def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
-    """The pull of what was seen of the branch, or of the robot's log, and the robot's table."""
+    """The pull of the branch's observations, or of the robot's log, and the robot's table."""
     found, settings = _read(chosen, request), request.settings
     observations: Observations | None = None
     rest: np.ndarray | None = None
@@ -153,7 +153,7 @@ def _gripper(request: ImportRequest) -> Stream:
 
 def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
           ) -> tuple[Observations, np.ndarray | None, list[str]]:
-    """Markers [m], their places at rest where those are given, and warnings."""
+    """Markers [m], their nominal rest positions if given, and warnings."""
     stream, labels = read
     seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
     placed = request.registered(seen.positions[0], labels)

@@ -1,4 +1,4 @@
-"""What recognises and reads the recordings that are no bags: folders, tables, logs."""
+"""Detection and reading of recordings other than bags: folders, tables, logs."""
 
 import re
 import shutil
@@ -76,7 +76,7 @@ def _titles(path: Path) -> list[Title]:
 
 @lru_cache(maxsize=1)
 def _titles_of(path: Path, _changed: int) -> list[Title]:
-    """The columns of a table, of which several formats ask; none where it is no table."""
+    """The columns of a table, used by several formats; none if it is no table."""
     try:
         return [split_title(title) for title in read_table(path).titles]
     except InputError:

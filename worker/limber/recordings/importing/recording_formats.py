@@ -1,4 +1,4 @@
-"""The registry of formats of recordings; what reads them is imported when it is needed."""
+"""The registry of recording formats; their readers are imported when needed."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ class RecordingFormat(Format):
     Attributes:
         holds: What ``read`` returns. ``markers``: their tracks as a stream with three columns each
             [m], and their labels. ``robot``: a stream of the gripper's poses and wrenches in the
-            branch's frame. ``clouds`` and ``depth``: warnings; it puts them into the folder of the
+            branch's frame. ``clouds`` and ``depth``: warnings; it writes them to the folder of the
             pull. ``pull``: a whole :class:`Pull`. ``force``: displacements [m], forces [N] and
             warnings.
     """
@@ -44,7 +44,7 @@ RECORDINGS = Registry("recording", "limber.recordings", [
     RecordingFormat("markers", _TABLES, f"{_READERS}:read_markers", about="markers",
                     recognises=Path.is_file),
 ], of_arrays=f"{_HERE}.c3d:markers_of_arrays")
-"""Arrays that a format reads are markers, as :func:`.c3d.c3d_arrays` gives them."""
+"""Arrays read by a format are markers, as :func:`.c3d.c3d_arrays` gives them."""
 
 
 def kind_names() -> tuple[str, ...]:

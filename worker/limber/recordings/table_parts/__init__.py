@@ -1,1 +1,1 @@
-"""What tables of other programs need beside their numbers: clocks, and titles of several rows."""
+"""Further parts of other programs' tables: clocks, and titles of several rows."""

@@ -1,7 +1,7 @@
-"""Titles of motion capture in several rows: Motive, Vicon Nexus, Qualisys, OpenSim's TRC.
+"""Motion capture titles in several rows: Motive, Vicon Nexus, Qualisys, OpenSim's TRC.
 
-One row has the letters of the axes, a row above it the markers' names, where it applies a row below
-it the units; what was measured and how often stands in a preamble.
+One row has the letters of the axes, a row above it the markers' names, and in some formats a row
+below it the units. The quantity and the rate are in a preamble.
 """
 
 import re
@@ -13,18 +13,18 @@ _RATES = ("exportframerate", "framerate", "captureframerate", "frequency", "data
 _UNITS = ("lengthunits", "units")
 _KINDS = ("position", "rotation", "markerquality", "meanmarkererror", "quality", "error")
 _TYPES = ("marker", "rigid body marker", "bone marker", "rigid body", "bone")
-"""What of Motive is taken as markers; the first that is there."""
+"""Motive's types that count as markers; the first one present is used."""
 
 
 @dataclass(frozen=True)
 class Preamble:
-    """What stands above the numbers of a capture.
+    """Content of the rows above the numbers of a capture.
 
     Attributes:
-        titles: Of the columns; those of markers are ``NAME:X``, with a unit where rows have it.
-            None where they do not stand in several rows.
+        titles: Titles of the columns; those of markers are ``NAME:X``, with a unit if rows have it.
+            None if they do not span several rows.
         rate_hz: Frames per second, if stated.
-        unit: Of length, if the preamble states one, as the file spells it.
+        unit: Unit of length, if the preamble states one, as spelled in the file.
     """
 
     titles: list[str] | None
@@ -33,11 +33,11 @@ class Preamble:
 
 
 def capture_preamble(above: Sequence[Sequence[str]], width: int) -> Preamble:
-    """Return what the rows above the numbers state of a capture.
+    """Return what the rows above the numbers state about a capture.
 
     Args:
-        above: Their cells.
-        width: Columns of numbers.
+        above: Cells of these rows.
+        width: Number of columns of numbers.
     """
     rows = [[*row[:width], *[""] * (width - len(row))] for row in above]
     at = next((k for k in reversed(range(len(rows))) if len(above[k]) <= width + 1
@@ -85,7 +85,7 @@ def _titled(rows: list[list[str]], at: int) -> list[str] | None:
 
 
 def _without_axes(above: Sequence[Sequence[str]], width: int) -> list[str] | None:
-    """Qualisys names its markers in the preamble alone."""
+    """Qualisys names its markers only in the preamble."""
     names = next(([cell for cell in row[1:] if cell] for row in above
                   if row and _letters(row[0]) == "markernames"), None)
     if names is None or width - 3 * len(names) not in (0, 1, 2):
@@ -97,7 +97,7 @@ def _without_axes(above: Sequence[Sequence[str]], width: int) -> list[str] | Non
 
 
 def _filled(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
-    """A row's cells at columns; an empty one means what stands to its left."""
+    """A row's cells at columns; an empty one takes the value to its left."""
     found, last = {}, ""
     for k in columns:
         last = (row[k] if k < len(row) else "") or last
@@ -112,7 +112,7 @@ def _is_kind(row: Sequence[str]) -> bool:
 
 
 def _stated(above: Sequence[Sequence[str]], keys: Sequence[str]) -> str | None:
-    """What stands behind one of the keys, or below it."""
+    """The value after one of the keys, or below it."""
     for key in keys:
         for row, below in zip(above, [*above[1:], []], strict=False):
             at = next((k for k, cell in enumerate(row) if _letters(cell) == key), None)

@@ -1,4 +1,4 @@
-"""Time stamps of other programs: counts of any unit, clocks since 1970, dates as text."""
+"""Time stamps of other programs: counts in any unit, clocks since 1970, dates as text."""
 
 import datetime
 import re
@@ -14,7 +14,7 @@ TIME_UNITS_S = {
     **dict.fromkeys(("us", "usec", "usecs", "micros", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
                     1e-9), "min": 60.0}
-"""Seconds in one unit of time, by what files call it."""
+"""Units of time in seconds, by their names in files."""
 
 _WORDS = (r"t|times?|timestamps?|stamp|elapsed|elapsedtime|elapsedsince\w*|clock|clocktime|zeit"
           r"|zeitstempel|uhrzeit|datetime|date|datum|rostime|systime|systemtime|unixtime|epoch"
@@ -30,7 +30,7 @@ _DAY = 86400.0
 _LATEST, _EARLIEST = 4e9, 1e9  # [s] since 1970: 2001 to 2096
 _FASTEST, _SLOWEST = 2e-4, 0.2  # [s] between samples that are taken for granted without a unit
 _LEAST = 5
-"""Stamps from which a clock can be told."""
+"""Fewest stamps from which a clock can be recognised."""
 
 
 def unit_in_name(name: str) -> str | None:
@@ -47,7 +47,7 @@ def is_time(name: str) -> bool:
 
 
 def clock_seconds(text: str) -> float | None:
-    """Return the seconds of a date, a time of day, or both; None of any other text."""
+    """Return a date, a time of day, or both in seconds; None for any other text."""
     found = _STAMP.fullmatch(text.strip())
     if not found or not (found["hour"] or found["year"] or found["last"]):
         return None
@@ -75,19 +75,19 @@ def clock_seconds(text: str) -> float | None:
 
 def in_seconds(where: str, stamps: np.ndarray, unit: str | None, is_clock: bool,
                ) -> tuple[np.ndarray, list[str]]:
-    """Return time stamps in seconds, and what was assumed of them.
+    """Return time stamps in seconds, and the assumptions made.
 
-    Counters of 32 bits that began anew go on, clocks of a day as well; stamps of 0 among dates are
-    none.
+    Wrapped counters of 32 bits are continued, clocks of a day too; stamps of 0 among dates are
+    invalid.
 
     Args:
         where: The file and its column, for messages.
-        stamps: Shape [n], NaN where there is none.
+        stamps: Shape [n], NaN if missing.
         unit: One of :data:`TIME_UNITS_S`, if the column states it.
         is_clock: Whether they were dates or times of day, which are seconds.
 
     Raises:
-        InputError: the unit is not stated, and their steps do not tell it.
+        InputError: the unit is not stated, and their steps do not determine it.
     """
     if is_clock:
         return _unwrapped(stamps, _DAY), []
@@ -102,7 +102,7 @@ def in_seconds(where: str, stamps: np.ndarray, unit: str | None, is_clock: bool,
 
 
 def _unwrapped(stamps: np.ndarray, period: float) -> np.ndarray:
-    """Stamps of a counter that begins anew after ``period``, without those jumps."""
+    """Stamps of a counter that wraps after ``period``, without the jumps."""
     steps = np.diff(np.nan_to_num(stamps))
     if np.nanmax(np.abs(stamps), initial=0.0) > period:
         return stamps
@@ -110,7 +110,7 @@ def _unwrapped(stamps: np.ndarray, period: float) -> np.ndarray:
 
 
 def _recognised(where: str, stamps: np.ndarray) -> tuple[float, list[str]]:
-    """Seconds in one count of stamps without a unit, and what to tell of it."""
+    """Seconds per count of stamps without a unit, and the assumption to report."""
     known = stamps[np.isfinite(stamps)]
     if len(known) < 3:
         return 1.0, []

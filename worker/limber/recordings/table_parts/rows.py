@@ -1,4 +1,4 @@
-"""The lines of a table as text, cut into fields, and where its numbers begin."""
+"""The lines of a table as text, split into fields, and the start of its numbers."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ _EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
 
 
 def section_of(lines: list[str]) -> list[str]:
-    """Return the lines that are not empty; of a Vicon file its trajectories alone."""
+    """Return the lines that are not empty; of a Vicon file only its trajectories."""
     begin = next((k for k, line in enumerate(lines)
                   if line.strip('",;\t \ufeff').lower() == "trajectories"), None)
     if begin is None:
@@ -34,7 +34,7 @@ def text_of(path: Path) -> str:
     """Return the text of a file.
 
     Raises:
-        InputError: it cannot be read, or is no text.
+        InputError: it cannot be read, or is not text.
     """
     try:
         raw = path.read_bytes()
@@ -54,11 +54,11 @@ def text_of(path: Path) -> str:
 
 
 def separator_of(lines: list[str]) -> str | None:
-    """Return the sign between fields; None is white space."""
+    """Return the separator of the fields; None is white space."""
     sample = lines[-20:]
     for sign in ("\t", ";", ","):
         counts = [line.count(sign) for line in sample]
-        # The last line may be cut short.
+        # The last line may be truncated.
         if counts and np.median(counts) >= 1 and (
                 np.mean(np.array(counts[:-1] or counts) == np.median(counts)) > 0.6):
             return sign
@@ -73,7 +73,7 @@ def fields_of(line: str, separator: str | None) -> list[str]:
 
 
 def number_of(text: str, comma: bool) -> float | None:
-    """Return a number, a date or time of day in seconds, NaN of an empty field, None of a word.
+    """Return a number, a date or time of day in seconds, NaN for an empty field, None for a word.
 
     Args:
         text: The field.
@@ -89,7 +89,7 @@ def number_of(text: str, comma: bool) -> float | None:
 
 
 def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
-    """Return the index of the first row of numbers, and how many fields the rows have.
+    """Return the index of the first row of numbers, and the number of its fields.
 
     Raises:
         InputError: there is none.
@@ -98,8 +98,8 @@ def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
         words = words_in(row)
         known = [part for part in row if part.lower() not in _EMPTY]
         follows = rows[index + 1] if index + 1 < len(rows) else row
-        # A preamble (NO_OF_FRAMES 600) has numbers too, but never two rows of several alike, nor
-        # words at the same places twice.
+        # A preamble (NO_OF_FRAMES 600) also has numbers, but never two consecutive rows of several
+        # numbers, nor words at the same positions twice.
         if len(row) > 1 and len(known) - len(words) > len(row) // 2 and (
                 not words or (words == words_in(follows) and len(words) <= len(row) // 3)) and (
                 len(follows) == len(row) or index + 2 >= len(rows)):

@@ -6,7 +6,7 @@ from limber.mechanics.model import BranchModel
 from limber.results.exports.elastic import require_elastic
 
 _STEP = 0.005
-"""Moduli whose relative difference is below this have one material."""
+"""Relative difference of moduli below which they share one material."""
 _A_LINE = 12
 
 
@@ -14,18 +14,18 @@ def inp_text(model: BranchModel, name: str, tip: int, load: np.ndarray | None = 
              mode_count: int = 3) -> str:
     """Return an input file: mesh, materials, the held base, a static step and a frequency step.
 
-    The shape is that of the hanging branch, which carries its weight already: no weight acts in
-    the steps, and its geometric stiffness is left out. What hangs on the branch is not in it.
+    The shape is that of the hanging branch, which already carries its weight. The steps therefore
+    have no weight, and its geometric stiffness is left out. Attached masses are left out too.
 
     Args:
-        model: With quadratic tetrahedra; their node order is Abaqus' own.
-        name: Of the model.
-        tip: Node that is loaded, and named TIP.
-        load: On that node [N], shape [3]; None: no static step.
-        mode_count: Frequencies asked for; 0: no such step.
+        model: Has quadratic tetrahedra. Their node order is that of Abaqus.
+        name: Name of the model.
+        tip: The loaded node, named TIP.
+        load: Load on the tip node [N], shape [3]; None: no static step.
+        mode_count: Number of frequencies; 0: no frequency step.
 
     Raises:
-        InputError: the model's material is not one of *ELASTIC.
+        InputError: *ELASTIC does not support the model's material.
     """
     require_elastic(model.material, "Abaqus' *ELASTIC", at_any_strain=True)
     mesh = model.mesh

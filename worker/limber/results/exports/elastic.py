@@ -5,14 +5,14 @@ from limber.mechanics.materials.law import MaterialLaw, is_hookean_at_rest
 
 
 def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = False) -> None:
-    """Refuse a law that Young's modulus and Poisson's ratio do not describe.
+    """Refuse a law that is not described by Young's modulus and Poisson's ratio alone.
 
     Args:
-        program: The program that gets these two numbers.
-        at_any_strain: Whether it computes large strains with them, too.
+        program: The program that receives these two numbers.
+        at_any_strain: Whether the program also computes large strains with them.
 
     Raises:
-        InputError: the law is another.
+        InputError: it is another law.
     """
     if law.is_hookean or (not at_any_strain and is_hookean_at_rest(law)):
         return

@@ -13,15 +13,15 @@ _TIMESTEP = 1e-3
 
 def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
               sites: Mapping[str, tuple[float, float, float]]) -> str:
-    """Return an MJCF model that is at rest as it stands.
+    """Return an MJCF model that is at rest in its scanned shape.
 
-    Each link but the held one has three hinges (both bending axes and torsion). Of Rayleigh
-    damping MJCF can express the part that goes with the stiffness; not that of the mass.
+    Each link except the fixed one has three hinges (two for bending, one for torsion). Of Rayleigh
+    damping, MJCF supports the stiffness-proportional part but not the mass-proportional part.
 
     Args:
         tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
-        damping: Identified or assumed.
-        name: Of the model.
+        damping: Identified or assumed damping.
+        name: Name of the model.
         sites: Positions on the branch [m] to follow, by name.
     """
     root = ElementTree.Element("mujoco", model=name)
@@ -67,7 +67,7 @@ def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
 
 def _add_inertial(body: ElementTree.Element, tree: RodTree, link: int) -> None:
     inertia = tree.inertia[link]
-    # What is massless to the last digit would not be accepted.
+    # MuJoCo does not accept a body whose mass rounds to zero.
     floor = 1e-12 * np.eye(3)
     i = inertia + floor
     ElementTree.SubElement(

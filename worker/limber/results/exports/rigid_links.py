@@ -1,10 +1,10 @@
 """A branch as rigid links with springs between them, for robot simulators.
 
-The links follow the axes, a spring sits in the middle of each segment (Hrennikoff's and Wittbrodt's
-rigid finite elements): its bending stiffness is E I / l, its torsional one G J / l. Sections are
-integrated over the mesh itself, so mass and second moments are those of our own finite elements,
-flattened and off-axis sections included. Left out: shear, and how forks stiffen what they join;
-:func:`matched` makes up for it on the whole.
+The links follow the axes. A spring sits in the middle of each segment (rigid finite elements of
+Hrennikoff and Wittbrodt), with bending stiffness E I / l and torsional stiffness G J / l. Sections
+are integrated over the mesh itself, so mass and second moments equal those of our own finite
+elements, including flattened and off-axis sections. Shear and the stiffening effect of forks are
+left out; :func:`matched` corrects for both on average.
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,15 @@ from limber.results.exports.elastic import require_elastic
 
 _SAMPLES_A_SEGMENT = 12
 _SPLITS = 1
-"""Each tetrahedron is split so often into eight, each with the four points of Gauss' rule: second
-moments are exact but for which link a point belongs to."""
+"""Each tetrahedron is split into eight several times, each with the four points of Gauss' rule.
+Second moments are exact except for the assignment of points to links.
+"""
 _GAUSS = (0.58541019662496852, 0.1381966011250105)
 
 
 @dataclass(frozen=True)
 class RodTree:
-    """Rigid links; link 0 is held, link k hangs on link ``parent[k]`` by a spring at ``joint[k]``.
+    """Rigid links. Link 0 is fixed; link k hangs on ``parent[k]`` by a spring at ``joint[k]``.
 
     Attributes:
         parent: Shape [n]; -1 for link 0.
@@ -38,11 +39,11 @@ class RodTree:
         axes: Principal bending axes and the tangent, as rows, shape [n, 3, 3].
         stiffness: About these axes [N m/rad], shape [n, 3].
         mass: [kg], shape [n].
-        centre: Of mass [m], shape [n, 3].
+        centre: Centre of mass [m], shape [n, 3].
         inertia: About the centre, along the branch's axes [kg m^2], shape [n, 3, 3].
-        end: Where each link ends [m], shape [n, 3].
-        radius: Of a round section of the same area [m], shape [n].
-        gravity: [m/s^2], shape [3]; zero where the branch has no weight.
+        end: End of each link [m], shape [n, 3].
+        radius: Radius of a round section of the same area [m], shape [n].
+        gravity: [m/s^2], shape [3]; zero if the branch has no weight.
     """
 
     parent: np.ndarray
@@ -62,10 +63,10 @@ class RodTree:
 
     @property
     def carried(self) -> np.ndarray:
-        """Angles about its axes at which each spring is slack [rad], shape [n, 3].
+        """Angles about its axes at which each spring is unstressed [rad], shape [n, 3].
 
-        At these the springs carry the weight of what hangs beyond them, and the branch rests in
-        the shape in which it was scanned.
+        With these angles the springs carry the weight beyond them, and the branch rests in the
+        shape in which it was scanned.
         """
         pull = self.mass[:, None] * self.gravity
         force, moment = pull.copy(), np.cross(self.centre, pull)
@@ -78,7 +79,7 @@ class RodTree:
                          out=np.zeros_like(torque))
 
     def link_at(self, point: Sequence[float]) -> int:
-        """Return the link whose middle line is nearest to a point [m]."""
+        """Return the link whose centre line is nearest to a point [m]."""
         start, way = self.joint, self.end - self.joint
         size = np.maximum((way**2).sum(axis=1), 1e-18)
         share = np.clip(((np.asarray(point) - start) * way).sum(axis=1) / size, 0.0, 1.0)
@@ -88,8 +89,8 @@ class RodTree:
 def matched(tree: RodTree, model: BranchModel, tip: int) -> tuple[RodTree, float]:
     """Return the links with all springs scaled so that node ``tip`` is as compliant as in the mesh.
 
-    What links leave out, above all how forks stiffen a branch, is a few percent; one factor takes
-    it in on the whole. It is returned as well.
+    What links leave out (mainly the stiffening effect of forks) is a few percent. One common factor
+    corrects for it and is returned as well.
     """
     place = model.mesh.nodes[tip]
     compliance = np.zeros((3, 3))
@@ -104,7 +105,7 @@ def matched(tree: RodTree, model: BranchModel, tip: int) -> tuple[RodTree, float
 
 
 def tip_compliance(model: BranchModel, tip: int) -> float:
-    """Return how far node ``tip`` goes along a small force on it [m/N], summed over three axes."""
+    """Return the compliance at node ``tip`` under a small force [m/N], summed over three axes."""
     still = np.zeros_like(model.mesh.nodes)
     tangent = model.equations(()).tangent(model, still)
     compliance = 0.0
@@ -130,19 +131,19 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
     """Return the links of a branch.
 
     Args:
-        model: Mesh, material, weight and what hangs on the branch.
+        model: Mesh, material, weight and attached masses.
         skeleton: Its axes, in the mesh's frame.
         spacing: Length of a link [m]; forks cut links, too.
 
     Raises:
-        InputError: a link would contain no part of the mesh, or its material has no springs.
+        InputError: a link would contain no part of the mesh, or no springs exist for its material.
     """
     require_elastic(model.material, "A rod's spring")
     points, volume, tet = _sampled(model.mesh)
     wood = cKDTree(points)
     segments, samples, owner, before = _laid_out(skeleton, spacing, wood)
     nearest = cKDTree(samples).query(points)[1]
-    # Which segment a point belongs to, and on which side of its spring.
+    # The segment a point belongs to, and its side of the segment's spring.
     of, link = owner[nearest], before[nearest]
     count = len(segments) + 1
     parent = np.full(count, -1)
@@ -167,7 +168,7 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
         end[segment.link] = segment.end
     radius[0] = radius[1]
     mass, centre, inertia = _masses(points, volume * model.density[tet], link, count, end)
-    # What hangs on the branch goes with the link that it grows from.
+    # Attached masses belong to the link that they are attached to.
     tree = RodTree(parent, joint, axes, stiffness, mass, centre, inertia, end, radius,
                    np.array(model.gravity, float))
     return _with_hung(tree, model)
@@ -175,7 +176,7 @@ def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
 
 def _laid_out(skeleton: Skeleton, spacing: float, wood: cKDTree,
               ) -> tuple[list[_Segment], np.ndarray, np.ndarray, np.ndarray]:
-    """Segments in order, points along them, and of each the segment and the link."""
+    """Segments in order, points along them, and the segment and link of each point."""
     children = skeleton.child_counts()
     segments: list[_Segment] = []
     samples: list[np.ndarray] = []
@@ -190,7 +191,7 @@ def _laid_out(skeleton: Skeleton, spacing: float, wood: cKDTree,
         if int(fork) not in link_of or not _is_meshed(place, skeleton.radius[nodes], wood):
             continue  # a twig that the mesh leaves out: its mass hangs on the branch
         is_side = skeleton.branch[nodes[1]] != skeleton.branch[fork] and fork > 0
-        # A side branch begins to bend where it leaves the wood that it grows from.
+        # A side branch begins to bend where it leaves its parent axis's wood.
         first = _leaves_at(skeleton, int(fork), place, along) if is_side else 0.0
         number = max(1, round((along[-1] - first) / spacing))
         cuts = np.linspace(first, along[-1], number + 1)
@@ -215,7 +216,7 @@ def _laid_out(skeleton: Skeleton, spacing: float, wood: cKDTree,
 
 
 def _leaves_at(skeleton: Skeleton, fork: int, place: np.ndarray, along: np.ndarray) -> float:
-    """How far along a side branch its axis comes out of the wood that it grows from [m]."""
+    """Distance along a side branch at which its axis leaves the parent's wood [m]."""
     run = np.flatnonzero(skeleton.branch == skeleton.branch[fork])
     distance, nearest = cKDTree(skeleton.nodes[run]).query(place)
     outside = np.flatnonzero(distance > skeleton.radius[run][nearest])
@@ -248,9 +249,9 @@ def _pieces(skeleton: Skeleton, children: np.ndarray) -> list[list[int]]:
 
 
 def _sampled(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that stand for equal parts of each tetrahedron, their volumes and tetrahedra.
+    """Points that represent equal parts of each tetrahedron, with their volumes and tetrahedra.
 
-    Their sums of second order are those of the tetrahedra (Keast's rule of four points).
+    Their second-order sums equal those of the tetrahedra (Keast's four-point rule).
     """
     corners = np.eye(4)[None]
     for _ in range(_SPLITS):
@@ -287,7 +288,7 @@ def _section(offset: np.ndarray, segment: _Segment, volume: np.ndarray, young: n
     flat = flat - weight @ flat / weight.sum()
     spread = (flat * weight[:, None]).T @ flat / segment.length
     values, vectors = np.linalg.eigh(spread)
-    # Turning about an axis is resisted by what lies across it.
+    # Bending about one axis is resisted by the extent along the other.
     across = vectors.T @ np.stack([first, second])
     axes = np.stack([across[1], across[0], tangent])
     if np.linalg.det(axes) < 0:
@@ -330,5 +331,5 @@ def _with_hung(tree: RodTree, model: BranchModel) -> RodTree:
 
 
 def _about(mass: float, arm: np.ndarray) -> np.ndarray:
-    """Steiner's term of a mass at ``arm`` from the axis."""
+    """Parallel-axis term of a mass at ``arm`` from the axis."""
     return mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))

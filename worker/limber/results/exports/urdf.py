@@ -1,4 +1,4 @@
-"""URDF: rigid links on revolute joints; springs as Gazebo and its kin read them."""
+"""URDF: rigid links on revolute joints, with springs as Gazebo and related programs read them."""
 
 from xml.etree import ElementTree
 
@@ -10,20 +10,21 @@ from limber.results.exports.rigid_links import RodTree
 _LEAST_MASS, _LEAST_INERTIA = 1e-9, 1e-12
 _AXES = ("bend1", "bend2", "twist")
 _WIDEST = 1.5
-"""Limit of a joint [rad]: far beyond what a link of a branch turns."""
+"""Limit of a joint [rad], far beyond the rotation of any link of a branch."""
 
 
 def urdf_text(tree: RodTree, damping: RayleighDamping, name: str) -> str:
     """Return a URDF model of a branch; link ``link0`` is held by ``world``.
 
-    URDF knows no springs: stiffness and the angle at which each is slack are in ``<gazebo>``
-    (springStiffness, springReference) and once more in ``<limber>``, for programs of one's own.
-    A joint turns about one axis, so two links without size stand between neighbours.
+    URDF has no springs. Stiffness and the unstressed angle of each spring are written in
+    ``<gazebo>`` (springStiffness, springReference) and again in ``<limber>``, for the user's own
+    programs. A joint rotates about one axis, so there are two links without size between
+    neighbours.
 
     Args:
         tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
-        damping: Of it the part that goes with the stiffness.
-        name: Of the model.
+        damping: Only its stiffness-proportional part is used.
+        name: Name of the model.
     """
     root = ElementTree.Element("robot", name=name)
     ElementTree.SubElement(root, "link", name="world")
@@ -58,7 +59,7 @@ def _add_link(root: ElementTree.Element, tree: RodTree, link: int) -> None:
         return
     for kind in ("visual", "collision"):
         part = ElementTree.SubElement(element, kind)
-        # A cylinder stands along z about its middle.
+        # A cylinder's axis is z through its centre.
         roll_pitch_yaw = (0.0, float(np.arccos(np.clip(way[2] / length, -1.0, 1.0))),
                           float(np.arctan2(way[1], way[0])))
         ElementTree.SubElement(part, "origin", xyz=_numbers(way / 2), rpy=_numbers(roll_pitch_yaw))

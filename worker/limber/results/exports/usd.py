@@ -1,8 +1,8 @@
 """USD: the branch as a volume deformable body, for Isaac Sim and others that read USD physics.
 
-The schema is NVIDIA's ``OmniPhysics`` deformable schema, which stands ready to enter UsdPhysics
-(Omni Physics documentation, *Omni Physics Deformable Schema*); until then its names are unknown
-to USD itself, and are written as applied schemas and attributes of those names.
+The schema is NVIDIA's ``OmniPhysics`` deformable schema, which is proposed for UsdPhysics (Omni
+Physics documentation, *Omni Physics Deformable Schema*). USD itself does not know its names yet, so
+they are written as applied schemas and attributes of those names.
 """
 
 from dataclasses import dataclass, replace
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 _PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3],
                    [4, 9, 5, 6], [4, 9, 6, 7], [4, 9, 7, 8], [4, 9, 8, 5]])
-"""Nodes of a quadratic tetrahedron (VTK's order) in eight linear ones."""
+"""Nodes of a quadratic tetrahedron (VTK's order) in its eight linear ones."""
 _FRICTION = 0.5
-"""Of bark on a gripper; nobody has measured it."""
+"""Friction coefficient of bark on a gripper. Assumed, not measured."""
 
 
 @dataclass(frozen=True)
 class Deformable:
-    """A branch as simulators of deformable bodies hold it: linear tetrahedra of one material.
+    """A branch as simulators of deformable bodies represent it: linear tetrahedra of one material.
 
     Attributes:
-        model: Of linear tetrahedra, weightless, its modulus the same everywhere [Pa].
-        moduli: What the branch's own are, shape [tet_count] [Pa].
-        young: That of the model: the tip is as compliant as that of the branch.
+        model: Linear tetrahedra without weight and with one modulus throughout [Pa].
+        moduli: Moduli of the branch itself, shape [tet_count] [Pa].
+        young: Modulus of the model, with which its tip is as compliant as that of the branch.
     """
 
     model: BranchModel
@@ -44,16 +44,18 @@ class Deformable:
 def as_deformable(model: BranchModel, tip: int) -> Deformable:
     """Return a branch with linear tetrahedra and the modulus that makes its tip as compliant.
 
-    Each quadratic tetrahedron becomes eight on the same nodes: fewer linear ones are far too stiff
-    in bending. PhysX takes one material a body; one modulus takes that in, and what stiffness is
-    left over. It bends to another shape than the branch where the moduli vary along it.
+    Each quadratic tetrahedron becomes eight linear ones on the same nodes; fewer linear ones are
+    far too stiff in bending. PhysX takes one material per body. The one modulus accounts for this
+    and for the remaining excess stiffness. Where the moduli vary along the branch, the bent shape
+    differs from that of the branch.
 
     Args:
-        model: Of the hanging branch; its shape carries the weight, so none acts on it here.
-        tip: Node at which both are compared.
+        model: Model of the hanging branch. Its shape includes the effect of weight, so none acts on
+        it here.
+        tip: Node at which the two are compared.
 
     Raises:
-        InputError: PhysX has no such material.
+        InputError: PhysX does not support the material.
     """
     require_elastic(model.material, "PhysX")
     bare = model.without_point_masses().with_parameters(gravity=(0.0, 0.0, 0.0))
@@ -70,11 +72,11 @@ def as_deformable(model: BranchModel, tip: int) -> Deformable:
 
 
 def write_usd(branch: Deformable, damping: RayleighDamping, name: str, path: Path) -> None:
-    """Write a USD file, as text or binary by its suffix: metres, kilograms, z up.
+    """Write a USD file, text or binary depending on its suffix: metres, kilograms, z up.
 
-    ``/Branch`` is the body, ``/Branch/simulation`` its tetrahedra, ``/Branch/base`` holds the
-    vertices of the base, ``/Branch/wood`` is its material. What the schema has no place for stands
-    beside it as ``limber:...``: the moduli of the tetrahedra, Rayleigh's damping.
+    ``/Branch`` is the body, ``/Branch/simulation`` its tetrahedra, ``/Branch/base`` fixes the
+    vertices of the base, ``/Branch/wood`` is its material. Values without an attribute in the
+    schema are written as ``limber:...``: the moduli of the tetrahedra and Rayleigh damping.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
@@ -123,7 +125,7 @@ def write_usd(branch: Deformable, damping: RayleighDamping, name: str, path: Pat
 
 
 def _hold(stage: "Usd.Stage", fixed: np.ndarray, points: "Vt.Vec3fArray") -> None:
-    """Tie the vertices of the base to a frame that stays where it is."""
+    """Attach the vertices of the base to a fixed frame."""
     from pxr import Sdf, UsdGeom, Vt
 
     UsdGeom.Xform.Define(stage, "/Branch/ground")

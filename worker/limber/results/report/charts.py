@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def chart(width: float, height: float, across: str, up: str, *, has_grid: bool = False,
           ) -> tuple["Figure", "Axes"]:
-    """Return a figure of one chart, with labels; without a grid its frame is open."""
+    """Return a figure of one chart, with labels; without a grid, top and right spines are off."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -30,7 +30,7 @@ _NUMBER_INCHES = 0.6  # that a number below an axis takes
 def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int]]]:
     """Return a figure of the front and the side of ``points`` [n, 3].
 
-    Each view is its axes, which coordinate runs across it and which into it; z runs up.
+    Each view has its axes, the horizontal coordinate and the depth coordinate; z points up.
     """
     import matplotlib.pyplot as plt
     from matplotlib.ticker import MaxNLocator
@@ -42,7 +42,7 @@ def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int
                                 width_ratios=widths)
     for axis, label, width in zip(axes, "xy", widths, strict=True):
         axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
-        # A view may be as thin as a branch: few numbers, upright, which then do not overlap.
+        # A view may be as narrow as a branch: few tick labels, rotated so that they do not overlap.
         drawn = min(width, height * float(np.ptp(points[:, "xy".index(label)]) / extent[2]))
         axis.xaxis.set_major_locator(MaxNLocator(
             max(1, int(drawn / _NUMBER_INCHES)), steps=[1, 2, 5, 10]))
@@ -54,7 +54,7 @@ def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int
 
 def draw_faces(axis: "Axes", corners: np.ndarray, colours: np.ndarray, across: int, depth: int,
                ) -> None:
-    """Draw triangles [n, 3, 3] in their colours, those behind first."""
+    """Draw triangles [n, 3, 3] in their colours, back to front."""
     from matplotlib.collections import PolyCollection
 
     order = np.argsort(corners[:, :, depth].mean(axis=1) * (1 if across else -1))

@@ -14,7 +14,7 @@ OBSERVED, SIMULATED, TRUE = (DATA_COLOURS[key] for key in ("measured", "simulate
 FORCE = "#2e8b57"
 _BEFORE = "#bbbbbb"
 AXIS_LINES = {"x": "-", "y": "--", "z": ":"}
-"""A direction is a kind of line, so that colours are left for what was measured and simulated."""
+"""A direction is a line style, so that colours distinguish measured from simulated."""
 AXIS_DOTS = {"x": "o", "y": "s", "z": "^"}
 
 
@@ -51,7 +51,7 @@ def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
 
 
 def young_along_branch(estimate: dict[str, Any]) -> Any:
-    """E at the control points with intervals, and the truth where there is one."""
+    """E at the control points with intervals, and the truth if known."""
     figure, axes = chart(5.2, 3.2, "position on the main path (0 base, 1 tip)",
                          "Young's modulus [MPa]")
     place = np.array(estimate["fractions"])
@@ -80,14 +80,14 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
 
 
 def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
-    """Standard deviations of the parameters before and after the fit, one a row."""
+    """Standard deviations of the parameters before and after the fit, one per row."""
     before = np.array(estimate["deviations_before_fit"], float)
     after = np.sqrt(np.abs(np.diag(np.array(estimate["covariance"], float))))
     groups = [*estimate["groups"]]
     extra = estimate["parameters"][len(set(groups)):]
     names = [f"E{k + 1}" for k in range(len(groups))] + list(extra)
     after = np.concatenate([after[groups], after[len(set(groups)):]])
-    # Names of parameters are words: below each other they never overlap.
+    # Parameter names are words; stacked vertically they do not overlap.
     figure, axes = chart(6.0, 1.2 + 0.3 * len(names), "standard deviation", "")
     place = np.arange(len(names))
     least = 1e-4
@@ -153,7 +153,7 @@ def loss_over_evaluations(estimate: dict[str, Any]) -> Any:
 
 
 def simulated_over_observed(pull: dict[str, Any], estimate: dict[str, Any]) -> Any:
-    """Observed and simulated points at several frames, in the plane in which they move most."""
+    """Observed and simulated points at several frames, in the plane of largest motion."""
     figure, axes = chart(5.2, 4.2, "sideways [m]", "along the branch at rest [m]")
     observed, simulated = _numbers(pull["observed_m"]), _numbers(pull["simulated_m"])
     rest = np.array(estimate["control_points_m"])

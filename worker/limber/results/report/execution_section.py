@@ -44,7 +44,7 @@ def force_along_the_way(path: Path) -> "Figure":
     """Draw the measured force (smoothed), and the predicted one with its 95 % interval.
 
     Raises:
-        InputError: the log is damaged, or holds no moment for which a force was predicted.
+        InputError: the log is damaged, or has no moment with a predicted force.
     """
     from matplotlib.figure import Figure
 
@@ -63,7 +63,7 @@ def force_along_the_way(path: Path) -> "Figure":
     known = np.flatnonzero(known)
     known = known[::max(1, len(known) // _MOST_POINTS)]
     times, table = log.times[known] - log.times[known[0]], table[known]
-    # Nothing is drawn across a time in which nothing was expected.
+    # The line is interrupted where no force was predicted.
     after = np.flatnonzero(np.diff(times) > _GAP_SECONDS) + 1
     times, table = np.insert(times, after, np.nan), np.insert(table, after, np.nan, axis=0)
     felt, expected, variances = table[:, :3], table[:, 3:6], table[:, 6:]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 ORDER_COLOURS = ("#1f6f43", "#8a6d1d", "#6a4c93", "#7fb685", "#5d6a63")
 _CLOUD = "#a9b3ad"
-# More points than this only darken a picture, and slow it.
+# Most points that are drawn; more only darken the picture and slow it.
 _SHOWN_POINTS = 30_000
 
 
@@ -46,7 +46,7 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
 
 
 def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Figure":
-    """Diameter along the main path with its interval, and what calipers found."""
+    """Diameter along the main path with its interval, and caliper measurements."""
     from limber.geometry.skeleton.qsm_tables import diameters as along_path
 
     figure, axis = chart(9, 3.2, "distance from the root along the main path [m]",
@@ -68,7 +68,7 @@ def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Fig
 
 
 def radii(branch: Branch) -> "Figure":
-    """Radius and its uncertainty over the distance from the root, one colour an order."""
+    """Radius and its uncertainty over the distance from the root, one colour per order."""
     skeleton = load_skeleton(branch)
     figure, axis = chart(9, 3.6, "distance from the root along the tree [m]", "radius [mm]",
                          has_grid=True)
@@ -194,7 +194,7 @@ def _cloud_points(branch: Branch) -> np.ndarray:
 
 
 def _coloured_faces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Boundary faces and the modulus of the tetrahedra behind them: nodal means suffice here."""
+    """Boundary faces and the modulus of the tetrahedra behind them, from nodal averages."""
     faces = mesh.surface_faces()
     corners = mesh.tets[:, :4]
     total = np.zeros(mesh.node_count)

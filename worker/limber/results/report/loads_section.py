@@ -19,7 +19,7 @@ _Way = tuple[float, float, float]
 
 
 class Gusts(FileContent):
-    """Of ``loads/NAME.json``: how far gusts go beyond the mean."""
+    """Gusts in ``loads/NAME.json``: effects beyond those of the mean wind."""
 
     factor: float
     peak_factor: float
@@ -30,7 +30,7 @@ class Gusts(FileContent):
 
 
 class LoadFile(FileContent):
-    """Content of ``loads/NAME.json`` as far as it is shown."""
+    """Content of ``loads/NAME.json`` that is shown."""
 
     tip_displacement_m: _Way
     sag_m: float
@@ -51,7 +51,7 @@ class LoadFile(FileContent):
 
 
 def read_load(path: Path) -> LoadFile:
-    """Read what ``limber load --name`` kept.
+    """Read the output of ``limber load --name``.
 
     Raises:
         InputError: it cannot be read, or has other content.
@@ -60,7 +60,7 @@ def read_load(path: Path) -> LoadFile:
 
 
 def load_rows(load: LoadFile) -> list[list[str]]:
-    """Return what the loads do to the branch, each with its interval where one is known."""
+    """Return the effects of the loads on the branch, each with its interval if known."""
     tip = 1e3 * float(np.linalg.norm(load.tip_displacement_m))
     rows = [["quantity", "value", "95 % interval"],
             ["force of the wind [N]", f"{np.linalg.norm(load.wind_force_n):.3g}", ""],
@@ -102,14 +102,14 @@ def _between(interval: _Interval | None, factor: float, digits: int) -> str:
 
 
 def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
-    """Draw the branch as scanned (grey) and under the loads, coloured by its greatest strain.
+    """Draw the branch as scanned (grey) and under the loads, coloured by its largest strain.
 
     Args:
-        mesh: The branch's.
-        frames: ``frames/load-NAME.pc2``, beside it ``.npz``.
+        mesh: The branch's mesh.
+        frames: Path of ``frames/load-NAME.pc2``, with its ``.npz`` beside it.
 
     Raises:
-        InputError: the frames are damaged or of another mesh.
+        InputError: the frames are damaged or belong to another mesh.
     """
     import matplotlib.pyplot as plt
 
@@ -136,11 +136,11 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
 
 
 def strain_along_path(from_m: np.ndarray, to_m: np.ndarray, strain: np.ndarray) -> "Figure":
-    """Draw the greatest strain of each piece of the main path.
+    """Draw the largest strain of each piece of the main path.
 
     Args:
         from_m, to_m: Ends of the pieces, from the root [m], shape [n].
-        strain: Greatest principal strain in each, shape [n].
+        strain: Largest principal strain in each, shape [n].
     """
     from matplotlib.figure import Figure
 

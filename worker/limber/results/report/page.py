@@ -49,15 +49,15 @@ _SOURCE_LABELS = {"file": "source", "unit": "unit of length", "sha256": "sha256 
 
 def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence[Caliper] = (),
               progress: Progress = SILENT) -> tuple[str, list[Section]]:
-    """Return the page of whatever stages a branch has, as HTML, and its sections.
+    """Return the page for the stages that have been run, as HTML, and its sections.
 
     Args:
         picture: A render of the scene to put at the top, PNG.
-        calipers: Diameters that somebody measured, to hold beside the scan's.
+        calipers: Caliper diameters to compare with the scan's.
 
     Raises:
         InputError: the picture is not a PNG, or a diameter's position is beyond the branch.
-        MissingDependencyError: what the extra ``report`` brings is not installed.
+        MissingDependencyError: the packages of the extra ``report`` are not installed.
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
     page = [_found(branch, picture), *_held_back(branch), _summary(branch)]
@@ -83,7 +83,7 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
 
 def _each(build: Callable[..., Section], names: Iterable[str], title: str = "",
           missing: str = "") -> list[Callable[[Branch], Section]]:
-    """Return a builder for each name's section; without names, for one that is missing."""
+    """Return a builder for each name's section; without names, one for a missing section."""
     found: list[Callable[[Branch], Section]] = [partial(build, name=name) for name in names]
     return found or ([lambda _branch: Section(title, missing=missing)] if title else [])
 
@@ -95,7 +95,7 @@ def _names(branch: Branch, stage: str) -> list[str]:
 
 
 def _found(branch: Branch, picture: Path | None) -> Section:
-    """What was found in one paragraph, what it must not be taken for, and a picture of it."""
+    """The findings in one paragraph, their limits, and a picture."""
     section, pull = Section("What was found"), simulated_pull(branch)
     if pull is not None:
         section.text.append(ASSUMED if pull["young_assumed"] else (
@@ -280,7 +280,7 @@ def _is_virtual(branch: Branch, name: str) -> bool:
 
 
 def _has_truth(branch: Branch) -> bool:
-    """Whether the branch was generated: of a scan of another one no modulus is known."""
+    """Whether the branch was generated; the true modulus of any other scan is unknown."""
     return branch.has("truth/truth.json")
 
 

@@ -92,7 +92,7 @@ def paths_over_slice(field: EnergyField, plan: PlanFile,
     energy = field.energy(view.points)
     energy[~field.region.contains(view.points)] = np.nan
     figure, axis = view.figure()
-    # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
+    # Nearly all of the paths' energy range, without the few stiff corners of the slice.
     top = max(1.5 * max(way.energies.max() for way in _ways(plan).values()), 1e-9)
     view.fill(figure, axis, 1e3 * energy, 1e3 * top, "energy above rest [mJ]", "viridis")
     if tree is not None:
@@ -105,8 +105,9 @@ def paths_over_slice(field: EnergyField, plan: PlanFile,
 
 
 def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Figure | None":
-    """Draw both paths over the least cost of any path to the goal, in the paths' common plane; None
-    where the bound is nothing there."""
+    """Draw both paths over the least cost of any path to the goal, in their common plane; None if
+    the bound is zero there.
+    """
     view = _View.of(field, plan)
     cost = bound.at(view.points)
     cost[~field.region.contains(view.points)] = np.nan
@@ -122,7 +123,7 @@ def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Fi
 
 @dataclass(frozen=True)
 class _View:
-    """The plane that fits both paths best, a grid of points in it, and the paths on it [m]."""
+    """The plane that best fits both paths, a grid of points in it, and the paths on it [m]."""
 
     origin: np.ndarray
     axes: np.ndarray
@@ -146,7 +147,7 @@ class _View:
 
     @property
     def points(self) -> np.ndarray:
-        """Of the grid [m], shape [n, 3]."""
+        """Points of the grid [m], shape [n, 3]."""
         across, up = self.axes
         return (self.origin + self.x[None, :, None] * across
                 + self.y[:, None, None] * up).reshape(-1, 3)
@@ -158,7 +159,7 @@ class _View:
     def figure(self) -> tuple["Figure", "Axes"]:
         from matplotlib.figure import Figure
 
-        # As high as the slice needs at equal scales: paths are often long and flat.
+        # Figure height that the slice needs at equal scales: paths are often long and flat.
         height = 6.2 * float(np.ptp(self.y) / max(np.ptp(self.x), 1e-9)) + 1.0
         figure = Figure(figsize=(8, float(np.clip(height, 2.8, 6.5))), layout="constrained")
         axis = figure.subplots()
@@ -168,7 +169,7 @@ class _View:
 
     def fill(self, figure: "Figure", axis: "Axes", values: np.ndarray, top: float, label: str,
              colours: str, *, lines: bool = False) -> None:
-        """Fill the plane by ``values`` at the grid's points up to ``top``; NaN stays white."""
+        """Fill the plane with ``values`` at the grid's points up to ``top``; NaN stays white."""
         from matplotlib.ticker import MaxNLocator
 
         levels = MaxNLocator(14).tick_values(0.0, top)
@@ -194,16 +195,17 @@ class _View:
 
 
 def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return nodes [m] and parents of what D-RRT* searched; None where it is not kept."""
+    """Return nodes [m] and parents of the tree of D-RRT*; None if it was not kept."""
     file = f"plans/{name}-trees.csv"
     return read_trees(branch.path(file)).get("D-RRT*") if branch.has(file) else None
 
 
 def searched(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, np.ndarray]:
-    """Return iterations and cost over the last cost, [n, 2], of the searches that improved."""
+    """Return iterations and cost divided by the final cost, [n, 2], of the searches that improved.
+    """
     found = {}
     for key, history in histories.items():
-        # On a first, coarse grid there may be no path yet.
+        # A coarse first grid may have no path yet.
         known = np.array([[entry["iteration"], entry["cost"]] for entry in history
                           if entry["cost"] is not None], float).reshape(-1, 2)
         if len(known) and np.ptp(known[:, 1]) > _FLAT * abs(known[-1, 1]):
@@ -212,7 +214,7 @@ def searched(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, 
 
 
 def convergence(histories: dict[str, np.ndarray]) -> "Figure":
-    """Draw the cost of the best path over iterations, both relative to their last."""
+    """Draw the cost of the best path over iterations, both relative to their final values."""
     figure, axis = chart(6, 3.2, "iterations", "cost / final cost", has_grid=True)
     for key, history in histories.items():
         axis.plot(*history.T, color=PATH_COLOURS[key], label=_LABELS[key])
@@ -221,7 +223,7 @@ def convergence(histories: dict[str, np.ndarray]) -> "Figure":
 
 
 def certificate(plan: PlanFile) -> "Figure":
-    """Draw how the lower and the upper bound on the best path's cost close, grid by grid."""
+    """Draw how the lower and upper bounds on the best path's cost converge, grid by grid."""
     levels = plan.summary["certificate"]["levels"]
     of_energy = plan.summary["certificate"].get("quantity") == "energy_integral_jm"
     figure, axis = chart(6, 3.2, "cell size of the grid [mm]",
@@ -242,7 +244,8 @@ def certificate(plan: PlanFile) -> "Figure":
 
 
 def trade_off(plan: PlanFile) -> "Figure":
-    """Draw energy against length of the gentlest paths, and below which no path is."""
+    """Draw energy against length of the gentlest paths, and the limit below which no path exists.
+    """
     detour = plan.summary["detour"]
     curve = sorted(detour["curve"], key=lambda point: point["length_m"])
     length = 1e3 * np.array([point["length_m"] for point in curve])
@@ -253,7 +256,8 @@ def trade_off(plan: PlanFile) -> "Figure":
     floor = np.maximum(np.max(lines, axis=0), 0.0)
     figure, axis = chart(6, 3.6, "length of the path [mm]", "energy along the path [mJ m]",
                          has_grid=True)
-    # A path that is allowed to be longer may be any shorter one: the curve only falls.
+    # The set of paths with a larger length limit includes the shorter ones, so the curve only
+    # falls.
     best = np.minimum.accumulate(energy)
     axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
                       color=PATH_COLOURS["plan"], alpha=0.15, label="range of the best path")
@@ -270,11 +274,12 @@ def _ways(plan: PlanFile) -> dict[str, Way]:
 
 
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return origin and two axes of the plane that fits points best, the second upwards."""
+    """Return origin and two axes of the plane that best fits the points, the second axis upwards.
+    """
     origin = points.mean(axis=0)
     directions = principal_axes(points)
     normal = directions[2]
-    # A plane of paths is seldom horizontal; where it is, any second axis does.
+    # A plane of paths is rarely horizontal; if it is, any second axis will do.
     up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.2 else directions[1]
     return origin, np.cross(up, normal), up

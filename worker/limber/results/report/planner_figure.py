@@ -16,7 +16,7 @@ _SHELL = 600  # poses of the field that are drawn behind the paths
 
 
 def planner_figure(field: EnergyField, trials: Sequence[ComparedTrial]) -> "Figure":
-    """Draw each planner's paths in a view of its own, over the field's energy."""
+    """Draw the paths of each planner in a separate view, over the field's energy."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.0 * len(_SHOWN), 4.2), layout="constrained")

@@ -9,12 +9,12 @@ from limber.results.findings import ASSUMED, remarks_on
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
                  ) -> list[list[str]]:
-    """Return estimated Young's modulus a control point, with truth and error where known.
+    """Return estimated Young's modulus per control point, with truth and error if known.
 
     Args:
         estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa].
-        pull: What ``limber virtual-pull`` returned (``young_true_pa`` [K], and ``young_assumed``
-            where these are of a scan that nobody pulled), or None.
+        pull: Result of ``limber virtual-pull`` (``young_true_pa`` [K], and ``young_assumed`` if
+            these are of a scan without a real pull), or None.
     """
     truth = (pull or {}).get("young_true_pa")
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
@@ -30,7 +30,7 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
 
 
 def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
-    """How many 95 % intervals hold the truth, in words; arguments of :func:`modulus_rows`."""
+    """How many 95 % intervals contain the truth, in words; arguments of :func:`modulus_rows`."""
     truth = pull["young_true_pa"]
     held = sum(_holds(estimate, number, value) for number, value in enumerate(truth))
     return f"{held} of {len(truth)} intervals (95 %) contain the " + (
@@ -38,13 +38,15 @@ def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
 
 
 def is_assumed(pull: Mapping[str, Any] | None) -> bool:
-    """Whether a simulated pull's modulus is assumed, and no truth about the scanned branch."""
+    """Whether the modulus of a simulated pull is assumed, not the true one of the scanned branch.
+    """
     return bool((pull or {}).get("young_assumed"))
 
 
 def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
-    """Return shortest against gentle path, with peaks and changes in percent; a last column says
-    what is beyond an arm's or the wood's reach, where anything is."""
+    """Return shortest against gentle path, with peaks and changes in percent. A last column states
+    which limits of arm or wood are exceeded, if any.
+    """
     rows = [["measure", "shortest", "gentle", "change"]]
     remarks, told = remarks_on(plan), []
     for label, key, unit in [
@@ -68,7 +70,7 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _below(plan: Mapping[str, Any]) -> list[list[str]]:
-    """Rows of what is known of the gentle path alone."""
+    """Rows with values of the gentle path alone."""
     rows = []
     gap = (plan.get("certificate") or {}).get("gap_percent")
     if gap is not None:
@@ -88,7 +90,7 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
     Args:
         estimate: ``young_deviation`` with ``sensor``, ``geometry``, ``mesh`` and ``total``, each
-            [K] of log E or None where that was not examined; ``fractions`` [K].
+            [K] of log E or None if not examined; ``fractions`` [K].
     """
     parts = estimate.get("young_deviation") or {}
     known = {"sensor": "from sensors", "geometry": "from the scan's shape", "mesh": "from the mesh",
@@ -125,11 +127,11 @@ def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return how well each pull is predicted by a fit without it.
+    """Return how well a fit without a pull predicts that pull.
 
     Args:
         estimate: ``held_out``, pull's name to ``rms_m``, ``rms_force_n``, ``relative_distance``,
-            ``relative_force`` (each None where not measured) and ``in_fit``.
+            ``relative_force`` (each None if not measured) and ``in_fit``.
     """
     scores = estimate.get("held_out") or {}
     if not scores:
@@ -154,7 +156,7 @@ def share_rows(shares: Mapping[str, float]) -> list[list[str]]:
 
 
 def order_rows(orders: Sequence[Mapping[str, float]]) -> list[list[str]]:
-    """Return branches, length, volume and taper of each branching order, and of all."""
+    """Return branches, length, volume and taper of each branching order, and in total."""
     def row(name: str, part: Mapping[str, float]) -> list[str]:
         return [name, f"{part['branch_count']:.0f}", f"{part['length_m']:.3f}",
                 f"{1e6 * part['volume_m3']:.1f}", f"{1e3 * part['taper']:.2f}"]
@@ -188,8 +190,8 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the uncertain parts of a skeleton.
 
     Args:
-        doubtful: Each with ``kind``, ``branch``, ``at`` [3], ``length_m``, ``radius_m`` and
-            ``value`` (see :class:`limber.geometry.skeleton.doubtful_parts.Doubt`).
+        doubtful: Uncertain parts, each with ``kind``, ``branch``, ``at`` [3], ``length_m``,
+            ``radius_m`` and ``value`` (see :class:`limber.geometry.skeleton.doubtful_parts.Doubt`).
     """
     told = {"unlikely branch": "probability {:.2f}",
             "unresolved radius": "sigma {:.0%} of the radius",
@@ -212,7 +214,7 @@ def _holds(estimate: Mapping[str, Any], number: int, truth: float) -> bool:
 
 
 def _mpa(value: float) -> str:
-    """Four digits [MPa], the unit of the column."""
+    """Four digits, in the unit of the column [MPa]."""
     return f"{float(f'{value / 1e6:.4g}'):,.10g}"
 
 

@@ -8,7 +8,7 @@ from limber.core.files.reading import FileContent, read_json_as
 
 
 class VibrationFile(FileContent):
-    """Content of ``vibration.json`` as far as it is shown."""
+    """Content of ``vibration.json`` that is shown."""
 
     young_pa: float = Field(gt=0)
     young_interval_pa: tuple[float, float]

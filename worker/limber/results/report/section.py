@@ -1,4 +1,4 @@
-"""A part of the report: text, tables, and pictures that are inside the page."""
+"""Sections of the report: text, tables and embedded pictures."""
 
 import base64
 import io
@@ -11,7 +11,7 @@ from limber.core.errors import InputError
 
 @dataclass
 class Section:
-    """One part of the page; ``missing`` is the command that would fill it."""
+    """One section of the page; ``missing`` is the command that would fill it."""
 
     title: str
     text: list[str] = field(default_factory=list)
@@ -20,7 +20,7 @@ class Section:
     missing: str = ""
 
     def draw(self, figure: Any, caption: str) -> None:
-        """Add a matplotlib figure, as a PNG inside the page."""
+        """Add a matplotlib figure as an embedded PNG."""
         self.pictures.append((inline_png(_png(figure)), caption))
 
 

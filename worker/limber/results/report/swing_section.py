@@ -1,4 +1,4 @@
-"""The report's section on a free swing to which the branch was fitted."""
+"""The report's section on the free swing used in a fit."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ _Track = list[list[tuple[float | None, float | None, float | None]]]
 
 
 class SwingFile(FileContent):
-    """Content of ``swing.json`` as far as it is shown."""
+    """Content of ``swing.json`` that is shown."""
 
     pull: str
     young_pa: float = Field(gt=0)
@@ -37,7 +37,7 @@ class SwingFile(FileContent):
 
 
 def read_swing(path: Path) -> SwingFile:
-    """Read what ``limber swing`` wrote.
+    """Read the output of ``limber swing``.
 
     Raises:
         InputError: it cannot be read, has other content, or its tracks have unequal lengths.
@@ -75,8 +75,9 @@ def swing_rows(swing: SwingFile) -> list[list[str]]:
 
 
 def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacement [m] of the marker that swings most, along its path: observed (NaN
-    where it was not) and simulated, shape [f] each."""
+    """Return the displacement [m] along its path of the marker with the largest swing: observed
+    (NaN if not observed) and simulated, shape [f] each.
+    """
     seen, simulated = np.array(swing.seen_m, float), np.array(swing.simulated_m, float)
     most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
     way = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
@@ -84,7 +85,7 @@ def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
 
 
 def swing_over_time(swing: SwingFile) -> "Figure":
-    """Draw observed and simulated displacement of the marker that swings most."""
+    """Draw observed and simulated displacement of the marker with the largest swing."""
     from limber.results.report.estimate_figures import OBSERVED, SIMULATED
 
     figure, axes = chart(5.2, 3.0, "time [s]", "displacement [mm]")

@@ -1,4 +1,4 @@
-"""The moving parts of a scene: frames with their values, and marks along them."""
+"""The moving parts of a scene: frames with their values, and marks that move with them."""
 
 import numpy as np
 
@@ -19,17 +19,17 @@ _FRAME_SCALARS = {
 """Arrays of ``frames/NAME.npz`` [frames, vertices]: name in the scene, title, unit, colours."""
 _FRAME_VALUES = {"energies_j": "frame_energy", "kinetic_energies_j": "frame_kinetic_energy",
                  "min_det_f": "frame_min_det_f", "largest_principal_strains": "frame_strain"}
-"""Lists of ``frames/NAME.json`` with a number a frame, and the arrays they become."""
+"""Lists of ``frames/NAME.json`` with one number per frame, and their arrays in the scene."""
 
 
 def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | None,
                strength: float | None = None) -> None:
-    """Add the frames of ``motion``, of the plan by default, else the newest there are.
+    """Add the frames of ``motion``; by default those of the plan, else the newest.
 
-    ``strength`` [Pa] is the stress that breaks the wood; assumed where it is not given.
+    ``strength`` [Pa] is the breaking stress of the wood; assumed if not given.
 
     Raises:
-        BranchFolderError: no such frames, or of another mesh.
+        BranchFolderError: the frames do not exist or belong to another mesh.
     """
     names = [name.removesuffix(".pc2") for name in branch.names("frames") if name.endswith(".pc2")]
     data.info["motions"] = names
@@ -70,7 +70,7 @@ def _finished(branch: Branch, name: str) -> str:
 
 
 def _is_of_an_earlier_mesh(branch: Branch, name: str) -> bool:
-    """Whether the mesh has been made again since the frames were written."""
+    """Whether the mesh was made again after the frames were written."""
     stages = branch.manifest.stages
     meshed = max((stages[key].finished for key in ("reconstruct", "mesh") if key in stages),
                  default="")
@@ -90,7 +90,7 @@ def _about(branch: Branch, name: str, count: int) -> FramesFile:
 
 
 def _add_times(data: SceneData, name: str, about: FramesFile, count: int) -> None:
-    """Say when each frame is; a path without times plays one pose a frame."""
+    """Add the time of each frame; a path without times plays one pose per frame."""
     times, rate = about.times_s, about.rate
     is_timed = times is not None
     data.arrays["frame_times"] = np.asarray(times, float) if is_timed else np.arange(count) / rate
@@ -109,7 +109,7 @@ def _add_values(data: SceneData, branch: Branch, name: str, about: FramesFile,
     path = branch.path(f"frames/{name}.npz")
     content = read_arrays(path, "the values of a motion's frames")
     for key, (scalar, title, unit, colours) in _FRAME_SCALARS.items():
-        # Those of another motion, or of a part of it, are left out.
+        # Lists of another motion, or of a part of it, are left out.
         if key not in content or content[key].shape != (count, vertex_count):
             continue
         require_shapes(path, content, {key: (count, vertex_count)},
@@ -118,7 +118,7 @@ def _add_values(data: SceneData, branch: Branch, name: str, about: FramesFile,
 
 
 def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
-    """Add the stress of each frame over the stress that breaks the wood."""
+    """Add each frame's ratio of stress to the breaking stress of the wood."""
     stress, young = data.arrays.get("frame_scalar:stress"), data.arrays.get("scalar:young")
     if stress is None or young is None:
         return
@@ -130,7 +130,7 @@ def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
 
 def add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
                      colours: str, *, is_from_zero: bool = False) -> None:
-    """Add a value in each frame [frames, v], and the worst of all frames, both on one scale."""
+    """Add a value in each frame [frames, v], and the worst of all frames, on one scale."""
     values = values.astype(np.float32)
     worst, word = (values.min(axis=0), "least") if name == "det_f" else (
         values.max(axis=0), "peak")
@@ -149,15 +149,15 @@ def _add_carried(data: SceneData, positions: np.ndarray, is_plan: bool) -> None:
             moved = carried(data.arrays[name], vertices, positions)
             data.arrays[f"{name}_motion"] = moved[:, 0] if name == "grasp" else moved
     if is_plan and "path:plan" in data.arrays:
-        # The path is where the gripper is, which its patch follows.
+        # The path is that of the gripper, which the grasp patch follows.
         data.arrays["grasp_motion"] = _along(data.arrays["path:plan"], len(positions))
 
 
 def carried(points: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Return where ``points`` inside the branch go: as the surface around them; [frames, k, 3].
+    """Return the motion of ``points`` inside the branch with the surface, [frames, k, 3].
 
-    By inverse-distance weights of a high power: the ring of vertices about a point counts, and
-    both rings where a point lies between two.
+    Inverse-distance weights of a high power: the ring of vertices around a point dominates, or both
+    rings if the point is between two.
     """
     distance = np.linalg.norm(points[:, None] - vertices, axis=2)
     weights = np.maximum(distance, 1e-9) ** -4

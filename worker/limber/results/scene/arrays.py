@@ -12,7 +12,7 @@ from limber.core.files.atomic import write_atomically
 from limber.core.json_values import plain
 
 FORMAT = 2
-"""Of the .npz file; the add-on refuses another one."""
+"""Version of the .npz file; the add-on refuses any other."""
 
 
 @dataclass
@@ -25,12 +25,12 @@ class SceneData:
     def write(self, path: Path) -> None:
         """Write one .npz file that ``numpy.load(path, allow_pickle=False)`` reads.
 
-        A path without the suffix gets it.
+        A path without the suffix is given it.
         """
         text = json.dumps(plain(self.info), allow_nan=False)
         path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
-        # Not into the file itself: an archive that cannot be written complains once more when it
-        # is forgotten.
+        # Not directly into the file: an archive that cannot be written raises again when it is
+        # garbage-collected.
         content = io.BytesIO()
         np.savez(content, info=np.array(text), **self.arrays)
         write_atomically(path, content.getvalue())

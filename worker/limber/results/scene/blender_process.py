@@ -1,6 +1,7 @@
-"""The process that has bpy and makes a scene: the add-on's ``make_scene.py`` on prepared data.
+"""The process with bpy that makes a scene: the add-on's ``make_scene.py`` on prepared data.
 
-The core never imports bpy: the ``bpy`` package in this Python, or a Blender program, runs it.
+The core never imports bpy. The ``bpy`` package in this Python, or a Blender program, runs the
+script.
 """
 
 import importlib.metadata
@@ -22,7 +23,7 @@ _ANSWER_SECONDS = 20.0
 
 
 def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
-    """Run the script with ``arguments``; returns what it made and with which Blender."""
+    """Run the script with ``arguments``; return its output and the Blender used."""
     from limber.core.processes.stage_process import run_json_process
 
     progress(0.0, "starting Blender")
@@ -35,7 +36,8 @@ def blender_command() -> list[str]:
     """Return the command that runs the add-on's script in a process with bpy.
 
     Raises:
-        MissingDependencyError: neither the bpy package nor a Blender is there, or no script.
+        MissingDependencyError: neither the bpy package nor Blender is installed, or the script is
+        missing.
     """
     script = str(scene_script())
     named = os.environ.get("LIMBER_SCENE_BLENDER")
@@ -53,8 +55,9 @@ def blender_command() -> list[str]:
 
 
 def _is_older_than_bpy(blender: str | None) -> bool:
-    """Whether a Blender shows our scenes but may not open what the bpy package writes: then it is
-    the one that writes them."""
+    """Whether a Blender shows our scenes but may be unable to open files of the bpy package. That
+    Blender then writes them.
+    """
     if not blender:
         return False
     try:
@@ -63,7 +66,7 @@ def _is_older_than_bpy(blender: str | None) -> bool:
         versions = [re.match(r"(?:Blender )?(\d+)\.(\d+)", text)
                     for text in (told, importlib.metadata.version("bpy"))]
     except (OSError, subprocess.TimeoutExpired, importlib.metadata.PackageNotFoundError):
-        # A Blender that does not answer writes nothing.
+        # A Blender that does not respond cannot write.
         return False
     own, bpy = ((0, 0) if found is None else (int(found[1]), int(found[2])) for found in versions)
     return _OLDEST <= own < bpy

@@ -1,10 +1,10 @@
-"""Colour scales: their units, the labels of their ticks, and the colours themselves."""
+"""Colour scales: units, tick labels and colours."""
 
 from typing import Any
 
 import numpy as np
 
-# Colours as sRGB, evenly spaced; both maps keep their order when seen in grey.
+# Colours as sRGB, evenly spaced; both maps stay monotonic in greyscale.
 _COLOUR_MAPS = {
     "viridis": ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962",
                 "#addc30", "#fde725"),
@@ -16,8 +16,8 @@ _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, 
 
 
 def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dict[str, Any]:
-    """Return a scale that spans ``values``: title, unit, low, high, log, ticks, stops,
-    colours; and ``is_one``: all values are the middle one.
+    """Return a scale that spans ``values``: title, unit, low, high, log, ticks, stops, colours; and
+    ``is_one``: all values are mid-scale.
 
     Args:
         colours: ``viridis`` or ``inferno``.
@@ -25,7 +25,7 @@ def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dic
     low, high = float(values.min()), float(values.max())
     is_one = high - low <= 1e-6 * abs(high)
     if is_one:
-        # One value everywhere: put it in the middle, so that it has a colour and a label.
+        # A single value: put it mid-scale, so that it has a colour and a label.
         low, high = (0.5 * low, 1.5 * low) if low > 0 else (low - 0.5, low + 0.5)
     log = low > 0 and high / low > 10.0
     if log:
@@ -53,7 +53,7 @@ def css_colours(values: np.ndarray, scale: dict[str, Any]) -> list[str]:
 
 
 def linear_of(srgb: np.ndarray) -> np.ndarray:
-    """Return linear values of sRGB ones between 0 and 1, as Blender wants colours."""
+    """Return linear values of sRGB values between 0 and 1, as Blender expects colours."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
@@ -77,12 +77,12 @@ def _places(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
 
 
 def with_unit(value: float, unit: str, size: float) -> str:
-    """Return ``value`` in words, with the prefix that suits ``size``; a fraction may be in %."""
+    """Return ``value`` as text, with the prefix for ``size``; a fraction may be in %."""
     if not unit:
         return f"{value:.3g}"
     if unit == "%":
         return f"{100 * value:.3g} %"
-    # What rounds up to a prefix gets it: 1 MPa, not 1e+03 kPa.
+    # A value that rounds up to a prefix gets it: 1 MPa, not 1e+03 kPa.
     factor, prefix = next((p for p in _PREFIXES if 1.0005 * abs(size) >= p[0]), (1.0, ""))
     return f"{value / factor:.3g} {prefix}{unit}"
 

@@ -1,7 +1,7 @@
-"""What a Blender scene shows of a branch folder: arrays ready to show, and what they mean.
+"""Content of a Blender scene of a branch folder: arrays ready for display, and their meaning.
 
-The add-on computes nothing, so colours, tick labels and the direction of view are worked out
-here. One ``.npz`` file carries them to Blender's process: plain arrays (nothing pickled), and
+The add-on computes nothing. Colours, tick labels and the view direction are therefore computed
+here. One ``.npz`` file passes them to Blender's process: plain arrays (nothing pickled), and
 ``info``, a JSON text. Vertices are those of the mesh's surface in the order of the PC2 frames:
 ``mesh.surface_faces()`` compacted by ``numpy.unique``.
 
@@ -86,16 +86,17 @@ __all__ = ["FORMAT", "SceneData", "scene_data"]
 
 def scene_data(branch: Branch, plan: str | None = None, motion: str | None = None,
                targets: Sequence[NamedTarget] = (), strength: float | None = None) -> SceneData:
-    """Gather what there is to show of ``branch``.
+    """Collect what can be shown of ``branch``.
 
     Args:
-        plan: Which path; the newest by default.
-        motion: Which frames; the plan's by default, else the newest.
+        plan: Which plan's paths to show; by default the newest.
+        motion: Which frames; by default those of the plan, else the newest.
         targets: Named positions on the branch.
-        strength: Stress that breaks the wood [Pa]; assumed where it is not given.
+        strength: Breaking stress of the wood [Pa]; assumed if not given.
 
     Raises:
-        BranchFolderError: no mesh yet, no such plan or frames, or frames of another mesh.
+        BranchFolderError: there is no mesh, no such plan or no such frames, or the frames belong to
+        another mesh.
     """
     mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
     faces = mesh.surface_faces()

@@ -1,4 +1,4 @@
-"""Measured against simulated: distances to the estimated branch at the moments of a pull."""
+"""Measured against simulated: distances to the estimated branch during a pull."""
 
 from typing import Any
 
@@ -15,13 +15,14 @@ from limber.store import Branch
 
 
 def add_fit(data: SceneData, branch: Branch, shown: str | None) -> None:
-    """Add Young's modulus along the branch as a graph, and how well the simulation meets a pull.
+    """Add Young's modulus along the branch as a graph, and the fit of the simulation to a pull.
 
     Args:
         data: Gets ``rods:fit`` (lines along simulated points, balls at measured ones, coloured by
             the distance between them), scalar ``residual`` and graphs.
-        branch: Whose ``estimate.json`` is read, where there is one.
-        shown: The pull whose measurement is shown; the first of the estimate where it is not one.
+        branch: The branch whose ``estimate.json`` is read, if present.
+        shown: The pull whose measurement is shown; the first of the estimate if it is not one of
+        them.
 
     Raises:
         InputError: ``estimate.json`` is damaged.
@@ -51,7 +52,7 @@ def _add_distances(data: SceneData, pull: dict[str, Any]) -> None:
         return
     scale = colour_scale(distance[known], f"{RESIDUAL}, pull {pull['name']}", "m", "inferno")
     size = float(np.ptp(data.arrays["vertices"], axis=0).max())
-    # Simulated points of a moment are joined along the branch; measured ones are balls upon them.
+    # Simulated points of a moment are joined along the branch; measured ones are balls.
     number = np.cumsum(known).reshape(known.shape) - 1
     joined = known[:, :-1] & known[:, 1:]
     lines = np.column_stack([number[:, :-1][joined], number[:, 1:][joined]])
@@ -61,7 +62,7 @@ def _add_distances(data: SceneData, pull: dict[str, Any]) -> None:
              ball_radius=0.009 * size)
     seen = known.any(axis=0)
     if "residual" in data.info["frame_scalars"]:
-        # Of each frame of the pull that is played, which says more.
+        # The residual of each played frame is there already and says more.
         return
     if len(data.arrays.get("control_points", ())) == measured.shape[1] and seen.all():
         mean = np.sqrt((np.where(known, distance, 0.0)**2).sum(axis=0) / known.sum(axis=0))
@@ -70,7 +71,7 @@ def _add_distances(data: SceneData, pull: dict[str, Any]) -> None:
 
 
 def _around(points: np.ndarray, values: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Return values of a few points at all vertices, by the inverse square of the distance."""
+    """Return values of a few points interpolated at all vertices, by inverse squared distance."""
     distance = np.linalg.norm(vertices[:, None] - points, axis=2)
     weights = np.maximum(distance, 1e-9) ** -2
     return (weights @ values) / weights.sum(axis=1)

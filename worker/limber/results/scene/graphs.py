@@ -1,10 +1,10 @@
 """Graphs beside a branch: Young's modulus along it, energy along paths, the force of a pull.
 
-The viewer draws a graph in a frame: all positions are fractions of the frame's width and height
-from its lower left corner, ticks are labels. Lines are ``{"label", "color", "points",
-"is_dotted"}``, bands ``{"label", "color", "rows"}`` with rows ``[x, low, high]``; colours
-are sRGB. ``cursor`` has the position of each frame of the plan's or the pull's motion, if the
-graph shows one.
+The viewer draws a graph in a frame. All positions are fractions of the frame's width and height
+from its lower left corner; ticks are labels. Lines are ``{"label", "color", "points",
+"is_dotted"}``, bands ``{"label", "color", "rows"}`` with rows ``[x, low, high]``; colours are sRGB.
+``cursor`` has the position of each frame of the plan's or the pull's motion, if the graph shows
+one.
 """
 
 import math
@@ -18,18 +18,19 @@ from limber.planning.cost import arc_lengths
 from limber.results.scene.colours import with_unit
 
 MEASURED, SIMULATED, TRUE = (0.25, 0.85, 0.95), (0.95, 0.95, 0.95), (1.0, 0.62, 0.30)
-"""As in the report (:data:`limber.core.constants.DATA_COLOURS`), on the graph's dark ground."""
+"""Colours as in the report (:data:`limber.core.constants.DATA_COLOURS`), for a dark background."""
 FIRST, SECOND = (0.93, 0.36, 0.42), (0.45, 0.62, 1.0)
-"""Of the planned path and of the one that it is compared with: as the paths themselves
-(:data:`limber.core.constants.PATH_COLOURS`), lighter on the graph's dark ground."""
+"""Colours of the planned path and of its baseline: as for the paths themselves
+(:data:`limber.core.constants.PATH_COLOURS`), lighter for the graph's dark background.
+"""
 _MOST_POINTS = 400
 _LOG_FROM = 5.0
-"""Times that a quantity above zero grows by before its axis is logarithmic."""
+"""Growth factor of a positive quantity above which its axis is logarithmic."""
 
 
 @dataclass
 class Axis:
-    """An axis: what it means, its unit, and the values it spans."""
+    """An axis: its meaning, unit and range."""
 
     title: str
     unit: str
@@ -40,7 +41,7 @@ class Axis:
     @classmethod
     def over(cls, title: str, unit: str, values: Sequence[np.ndarray], *,
              log: bool = False) -> "Axis":
-        """Return an axis over all values; from zero where they do not fall below it."""
+        """Return an axis over all values; it starts at zero unless there are negative values."""
         given = np.concatenate([np.ravel(part) for part in values]).astype(float)
         given = given[np.isfinite(given)]
         low, high = (float(given.min()), float(given.max())) if len(given) else (0.0, 1.0)
@@ -61,7 +62,7 @@ class Axis:
         """Return ``[fraction, label]`` of a few round values."""
         values = _decades(self.low, self.high) if self.log else _steps(self.low, self.high)
         largest = max((abs(value) for value in values), default=1.0)
-        # On a logarithmic axis each tick has a prefix of its own.
+        # On a logarithmic axis each tick has its own prefix.
         return [[float(self.place(value)),
                  with_unit(value, self.unit, abs(value) if self.log else largest)]
                 for value in values]
@@ -69,7 +70,7 @@ class Axis:
 
 @dataclass
 class Graph:
-    """A graph that is being put together."""
+    """A graph under construction."""
 
     title: str
     x: Axis
@@ -80,7 +81,7 @@ class Graph:
 
     def line(self, label: str, color: tuple[float, float, float], x: np.ndarray, y: np.ndarray,
              *, is_dotted: bool = False) -> None:
-        """Add a line, or single points; values that are not numbers are omitted."""
+        """Add a line, or single points; values that are not finite are omitted."""
         x, y = np.asarray(x, float), np.asarray(y, float)
         known = np.isfinite(x) & np.isfinite(y)
         chosen = np.flatnonzero(known)
@@ -99,7 +100,7 @@ class Graph:
                            "rows": np.clip(rows, 0.0, 1.0).round(4).tolist()})
 
     def told(self) -> dict[str, Any]:
-        """Return the graph as the scene's file has it."""
+        """Return the graph as the scene's file stores it."""
         return {"title": self.title, "lines": self.lines, "bands": self.bands,
                 "cursor": self.x.place(self.cursor).round(4).tolist(),
                 **{name: {"title": axis.title, "ticks": axis.ticks()}
@@ -115,7 +116,8 @@ def _steps(low: float, high: float) -> list[float]:
 
 
 def _decades(low: float, high: float) -> list[float]:
-    """Return 1, 2 and 5 of each power of ten from ``low`` to ``high``; over three decades 1."""
+    """Return 1, 2 and 5 of each power of ten from ``low`` to ``high``; above three decades only 1.
+    """
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     factors = (1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)
     values = [factor * 10.0**power for power in powers for factor in factors]
@@ -123,7 +125,7 @@ def _decades(low: float, high: float) -> list[float]:
 
 
 def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
-    """Return Young's modulus along the branch with its interval, and the truth where known.
+    """Return Young's modulus along the branch with its interval, and the truth if known.
 
     Args:
         estimate: Content of ``estimate.json``.
@@ -135,7 +137,7 @@ def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
         # One modulus for the whole branch.
         place, young, interval = np.array([0.0, 1.0]), np.repeat(young, 2), np.repeat(
             interval, 2, axis=0)
-    # A modulus that nothing tells has no interval; its line stays.
+    # A modulus that is not determined has no interval; its line stays.
     is_known = np.isfinite(interval).all(axis=1)
     truth = estimate.get("truth") or {}
     true = np.array(truth.get("young_pa") or [], float)
@@ -156,7 +158,7 @@ def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[s
     """Return the energy along paths.
 
     Args:
-        paths: By ``plan`` and ``baseline``: title, points [p, 3] m and energies [p] J.
+        paths: For ``plan`` and ``baseline``: title, points [p, 3] m and energies [p] J.
     """
     along = {key: arc_lengths(points) for key, (_, points, _) in paths.items()}
     graph = Graph("Energy along the paths",
@@ -171,14 +173,14 @@ def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[s
 def force_graph(name: str, times: np.ndarray, measured: np.ndarray,
                 simulated: np.ndarray | None = None, cursor: np.ndarray | None = None,
                 ) -> dict[str, Any] | None:
-    """Return the force of a pull over time; None where none was measured.
+    """Return the force of a pull over time; None if it was not measured.
 
     Args:
-        name: Of the pull.
+        name: Name of the pull.
         times: [s], shape [n].
         measured: Force of the gripper [N], shape [n, 3]; NaN where it was not measured.
-        simulated: What the estimate has there, likewise.
-        cursor: When each frame of the motion in sight is [s], on the same clock.
+        simulated: Force by the estimate, likewise.
+        cursor: Time of each frame of the shown motion [s], on the same clock.
     """
     known = {"measured": measured, "simulated": simulated}
     forces = {label: np.linalg.norm(np.asarray(values, float).reshape(-1, 3), axis=1)

@@ -1,4 +1,4 @@
-"""What was measured in a pull: points and gripper over time, over the branch that moves so."""
+"""Measurements of a pull: points and gripper over time, on the moving branch."""
 
 import numpy as np
 
@@ -11,19 +11,20 @@ from limber.results.scene.graphs import force_graph
 from limber.store import Branch
 
 RESIDUAL = "measured to simulated"
-"""Title of the distance between where a point was seen and where the simulation has it."""
+"""Title of the distance between observed and simulated position of a point."""
 
 
 def add_observation(data: SceneData, branch: Branch) -> None:
-    """Add what was measured over time in the pull whose motion is shown, else in the newest.
+    """Add the measurements of the pull whose motion is shown, else of the newest pull.
 
     ``observation`` [t, m, 3] m (the last observed position where ``observation_visible`` [t, m] is
     false), ``observation_times`` [t] s; ``observation_grasp`` [g, 3] m of the gripper, and
     ``observation_grasp_times`` [g] s, on the same clock. ``info["pulls"]`` names all recordings.
 
-    Where the frames are those of this pull (``limber simulate --pull`` replays it under its name),
-    ``observation_motion`` [frames, m, 3] is where each point was in each, ``observation_seen``
-    [frames, m] whether it was observed then; scalar ``residual`` is its distance to the simulation.
+    If the frames are those of this pull (``limber simulate --pull`` replays it under its name),
+    ``observation_motion`` [frames, m, 3] is the position of each point in each frame,
+    ``observation_seen`` [frames, m] whether it was observed then. Scalar ``residual`` is its
+    distance to the simulation.
     """
     pulls = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
     data.info["pulls"] = pulls
@@ -54,18 +55,18 @@ def add_observation(data: SceneData, branch: Branch) -> None:
 
 
 def times_of_frames(data: SceneData, pull: str) -> np.ndarray:
-    """Return when each frame is on the clock of a pull [s]; none where the frames are not its own.
+    """Return the time of each frame on the clock of a pull [s]; none if the frames are not its own.
     """
     about = data.info.get("observation") or {}
     if about.get("pull") != pull or not about["is_shown"]:
         return np.empty(0)
     times = data.arrays["frame_times"]
-    # A replay begins with the gripper's first pose.
+    # A replay starts at the gripper's first pose.
     return times - times[0] + data.arrays["observation_grasp_times"][0]
 
 
 def _add_frames(data: SceneData, branch: Branch, pull: Pull, count: int) -> None:
-    """Say where each point was in each frame, and how far it then is from the simulation."""
+    """Add the position of each point in each frame, and its distance to the simulation."""
     if "observation" not in data.arrays:
         return
     places, seen = _in_frames(data, times_of_frames(data, pull.name))
@@ -81,7 +82,7 @@ def _add_frames(data: SceneData, branch: Branch, pull: Pull, count: int) -> None
 
 
 def _rest_points(data: SceneData, entry: PullEntry, count: int) -> np.ndarray | None:
-    """Return where the observed points are at rest [m], shape [count, 3]; None where that is open.
+    """Return the rest positions of the observed points [m], shape [count, 3]; None if unknown.
     """
     rest = entry.rest_points_m
     found = np.array(rest, float) if rest is not None else data.arrays.get("control_points")
@@ -89,10 +90,10 @@ def _rest_points(data: SceneData, entry: PullEntry, count: int) -> np.ndarray | 
 
 
 def _in_frames(data: SceneData, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points were at ``times`` [s], [frames, m, 3], and whether seen, [frames, m].
+    """Return positions of points at ``times`` [s], [frames, m, 3], and whether seen, [frames, m].
 
-    Between two looks at a point on the line between them; where the nearest look did not find it,
-    and before the first look and after the last, it counts as not seen.
+    Positions are interpolated linearly between two observations of a point. A point counts as not
+    seen where the nearest observation lacks it, and before the first and after the last.
     """
     found, visible, at = (data.arrays[f"observation{part}"] for part in ("", "_visible", "_times"))
     nearest = np.abs(times[:, None] - at).argmin(axis=1)
@@ -109,7 +110,8 @@ def _in_frames(data: SceneData, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _around(points: np.ndarray, distance: np.ndarray, seen: np.ndarray, vertices: np.ndarray,
             ) -> np.ndarray:
-    """Return distances [frames, m] at all vertices, by the inverse square; 0 where not observed."""
+    """Return distances [frames, m] at all vertices, by inverse squared distance; 0 if not observed.
+    """
     weights = np.maximum(np.linalg.norm(vertices[:, None] - points, axis=2), 1e-9) ** -2
     total = seen @ weights.T
     values = np.where(seen, distance, 0.0) @ weights.T
@@ -117,7 +119,8 @@ def _around(points: np.ndarray, distance: np.ndarray, seen: np.ndarray, vertices
 
 
 def _held_on(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Return positions with those not seen where the point was seen last, or first."""
+    """Return positions; an unobserved one is replaced by the last, or else the first, observed one.
+    """
     found = positions.copy()
     found[~visible] = 0.0
     for point in range(positions.shape[1]):

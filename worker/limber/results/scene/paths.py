@@ -20,10 +20,10 @@ _ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 
 
 def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
-    """Add the paths of ``plan``, the newest by default, and its goal; return its name.
+    """Add the paths of ``plan``, by default the newest, and its goal; return its name.
 
     Raises:
-        BranchFolderError: no such plan, or a damaged one.
+        BranchFolderError: the plan does not exist or is damaged.
     """
     plans = [key.split(":", 1)[1] for key in branch.manifest.stages if key.startswith("plan:")]
     data.info["plans"] = plans
@@ -58,7 +58,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
 
 
 def add_hemisphere(data: SceneData, branch: Branch) -> None:
-    """Add the half ball about the base in which the grasp may be taken, once it was sampled."""
+    """Add the hemisphere about the base that bounds the sampled grasp positions, if any."""
     if not branch.has("energy.npz"):
         return
     path = branch.path("energy.npz")
@@ -83,7 +83,7 @@ def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:
 
 
 def _add_trees(data: SceneData, branch: Branch, plan: str) -> None:
-    """Add the search trees; plans of older programs have none."""
+    """Add the search trees; plans of older versions have none."""
     data.info["trees"] = {}
     if not branch.has(f"plans/{plan}-trees.csv"):
         return
@@ -125,7 +125,7 @@ def _path_note(summary: dict[str, Any]) -> str:
 
 
 def _goal(goal: dict[str, Any], path: np.ndarray | None) -> dict[str, Any] | None:
-    """Return what is to reach the goal region, its centre [m] and its radius [m] or None."""
+    """Return what must reach the goal region, its centre [m], and its radius [m] or None."""
     centre = goal.get("position_m")
     if centre is None:
         if path is None:

@@ -1,4 +1,4 @@
-"""The robot along a path: pose of its links in each frame, from the joints of a dry run."""
+"""The robot along a path: poses of its links in each frame, from the joints of a dry run."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from limber.robot.known_arms import arm_named
 from limber.store import Branch
 
 _FARTHEST_M = 0.02
-"""A frame whose grasp is farther from every pose of the dry run is of another motion."""
+"""Distance to the dry run above which a frame's grasp belongs to another motion."""
 _GRIPPER = 0.9  # radius of its body in those of the thinnest link
 _PALM = 0.65  # how far from the flange to the grasp its body reaches
 _FINGER = 0.3  # radius of a finger in those of the body
@@ -21,7 +21,7 @@ _POSE = ("x_m", "y_m", "z_m")
 
 
 def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
-    """Add the arm in each frame of the plan's motion, once `limber execute` has checked it.
+    """Add the arm in each frame of the plan's motion, if `limber execute` has checked it.
 
     Raises:
         InputError: the dry run's table is damaged.
@@ -29,7 +29,7 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     entry = branch.manifest.stages.get(f"execute-preview:{plan}")
     name = f"executions/{plan}-preview.csv"
     grasps = data.arrays.get("grasp_motion")
-    # A dry run of an older Limber does not say which arm it was.
+    # A dry run of an older version does not state its arm.
     if entry is None or grasps is None or "model" not in entry.result or not branch.has(name):
         return
     if (data.info.get("frames") or {}).get("name") != plan:
@@ -37,7 +37,7 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     try:
         arm = arm_named(entry.result["model"])
     except InputError:
-        # The arm's file, or the package that has the arm, is on another computer.
+        # The arm's file, or the package that provides the arm, is on another computer.
         return
     names = tuple(f"q{number + 1}_rad" for number in range(len(arm.joint_names)))
     table = read_columns(branch.path(name), (*_POSE, *names), "the table of a dry run")
@@ -58,7 +58,7 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
 
 def _arm_rods(arm: Arm, base: np.ndarray, joints: np.ndarray,
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the rods of foot and links begin and end [m], [n, rods, 3], and their radii.
+    """Return the ends of the rods of foot and links [m], [n, rods, 3], and their radii.
 
     Args:
         base: Frame of the arm's base, shape [4, 4].
@@ -76,9 +76,9 @@ def _gripper_rods(flange: np.ndarray, grasps: np.ndarray, radius: float,
     """Return a body and two fingers between flange and grasp, as :func:`_arm_rods` does.
 
     Args:
-        flange: Its frames, shape [n, 4, 4].
+        flange: Frames of the flange, shape [n, 4, 4].
         grasps: Middle between the fingers [m], shape [n, 3].
-        radius: Of the body [m].
+        radius: Radius of the body [m].
     """
     place = flange[:, :3, 3]
     way = grasps - place
@@ -93,11 +93,11 @@ def _gripper_rods(flange: np.ndarray, grasps: np.ndarray, radius: float,
 
 
 def _rows(places: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:
-    """Return which row of the dry run each frame is nearest to, never going back; or None.
+    """Return the row of the dry run nearest to each frame, in ascending order; or None.
 
     Args:
-        places: Of the grasp in the dry run [m], shape [rows, 3].
-        grasps: Of the grasp in the frames [m], shape [frames, 3].
+        places: Positions of the grasp in the dry run [m], shape [rows, 3].
+        grasps: Positions of the grasp in the frames [m], shape [frames, 3].
     """
     first, rows = 0, []
     for grasp in grasps:

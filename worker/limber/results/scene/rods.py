@@ -18,13 +18,13 @@ def add_rods(data: SceneData, name: str, title: str, points: np.ndarray, lines: 
     Args:
         data: Gets ``rods:NAME`` and ``rod_faces:NAME``, ``rod_color:NAME``; and
             ``info["rods"][NAME]``.
-        name: Of the rods in the file.
-        title: What the user reads.
-        points: [m], shape [n, 3].
-        lines: Which two points each line joins, shape [l, 2].
-        radius: Of the rods [m], or one for each point.
+        name: Name of the rods in the file.
+        title: Title that the user reads.
+        points: Positions [m], shape [n, 3].
+        lines: Indices of the two points that each line joins, shape [l, 2].
+        radius: Radius of the rods [m], or one per point.
         values: At each point, shape [n].
-        scale: What the values' colours mean.
+        scale: Colour scale of the values.
         ball_from: Points from this one on are balls of ``ball_radius`` [m].
     """
     parts = [(*rods(points, np.asarray(lines, int).reshape(-1, 2), radius), 0)]
@@ -70,7 +70,7 @@ def rods(points: np.ndarray, lines: np.ndarray, radius: float | np.ndarray,
     way = points[lines[:, 1]] - points[lines[:, 0]]
     length = np.linalg.norm(way, axis=1)
     lines, way = lines[length > 0], way[length > 0] / length[length > 0, None]
-    # Across a line: from the axis that it is least along.
+    # Perpendicular to a line: built from the axis least along it.
     least = np.eye(3)[np.abs(way).argmin(axis=1)]
     first = np.cross(way, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

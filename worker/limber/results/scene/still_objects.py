@@ -22,9 +22,9 @@ ROOT, FORK, TIP, RADIUS_LIMITED, RADIUS_INTERPOLATED = 1, 2, 4, 8, 16
 RADIUS_UNRESOLVED, BRIDGE, EDITED = 32, 64, 128
 """Bits of ``skeleton_flags``."""
 _WRIST_RODS = 2
-"""Rods before the gripper's that belong in the picture with it."""
+"""Rods before those of the gripper that belong in the picture with it."""
 CLOUD_LIMIT = 2_000_000
-"""Most points of a scan that are handed on; of more, evenly chosen ones."""
+"""Most points of a scan that are passed on; of more, an even selection."""
 
 
 def add_scalar(data: SceneData, name: str, values: np.ndarray, scale: dict[str, Any]) -> None:
@@ -70,7 +70,7 @@ def add_skeleton(data: SceneData, branch: Branch) -> None:
 
 
 def add_skeleton_rods(data: SceneData) -> None:
-    """Add the centreline as thick as it was found to be, coloured by its radius."""
+    """Add the centreline with its reconstructed thickness, coloured by its radius."""
     if "skeleton" not in data.arrays:
         return
     parent, radius = data.arrays["skeleton_parent"], data.arrays["skeleton_radius"]
@@ -90,7 +90,7 @@ def _edited(branch: Branch, skeleton: Skeleton) -> np.ndarray:
 
 
 def add_marks(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
-    """Add control points, grasp and base, as far as the mesh names them."""
+    """Add control points, grasp and base, if the mesh names them."""
     points = mesh.point_data
     if "control_point" in points:
         index = np.asarray(points["control_point"]).astype(int)
@@ -121,7 +121,7 @@ def add_targets(data: SceneData, targets: Sequence[NamedTarget]) -> None:
 
 
 def add_radii(data: SceneData, name: str, share: float) -> None:
-    """Add the radii [m] of balls that mark points: seen, and not inside the branch."""
+    """Add the radii [m] of balls that mark points: large enough to be seen outside the branch."""
     points, vertices = data.arrays.get(name, np.empty((0, 3))), data.arrays["vertices"]
     if not len(points):
         return
@@ -141,16 +141,16 @@ def alignment(branch: Branch) -> np.ndarray:
 
 
 def map_offset(matrix: np.ndarray) -> list[float]:
-    """Return where the branch's origin is in the scan's coordinates, in their unit, shape [3].
+    """Return the branch's origin in the scan's coordinates and unit, shape [3].
 
-    Double precision: the add-on keeps it on the object, since map coordinates collapse in the
-    single precision of a viewport.
+    Double precision: the add-on stores it on the object, since map coordinates lose their digits in
+    the single precision of a viewport.
     """
     return np.linalg.solve(matrix[:3, :3], -matrix[:3, 3]).tolist()
 
 
 def add_view(data: SceneData) -> None:
-    """Add what the camera must see, and its direction: across the plane of the motion."""
+    """Add what the camera must see, and its direction: perpendicular to the plane of the motion."""
     arrays = data.arrays
     vertices = arrays["vertices"]
     paths = [arrays[f"path:{name}"] for name in data.info["paths"]]
@@ -167,7 +167,7 @@ def add_view(data: SceneData) -> None:
     data.info["ground_m"] = branch[:, 2].min()
     gripper = _gripper_points(data)
     arrays["view_points"] = np.vstack([branch, gripper])
-    # Seen from where the arm stands behind the branch.
+    # View in which the arm is behind the branch.
     behind = (gripper.mean(axis=0) - arrays["grasp"][0])[:2] if len(gripper) else np.zeros(2)
     arrays["view_direction"] = _view_direction(np.vstack(paths or [vertices])[:, :2], behind)
 
@@ -185,10 +185,10 @@ def _view_direction(points: np.ndarray, behind: np.ndarray) -> np.ndarray:
     """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards.
 
     Args:
-        behind: Direction of what shall stand behind them [2]; zeros where nothing does.
+        behind: Direction of what should be behind them [2]; zeros if nothing should.
     """
     across = principal_axes(points)[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    # Of the two sides, always the same one, so that a picture made twice is the same picture.
+    # The same side is always chosen, so that a picture can be reproduced.
     side = behind @ across if np.any(behind) else across[1]
     across = across if side >= 0 else -across
     turned = np.array([across[0] - 0.3 * across[1], across[1] + 0.3 * across[0], -0.22])

@@ -1,1 +1,1 @@
-"""The cell: where the robot stands, what it holds, what is in its way, and their calibration."""
+"""The cell: robot base, gripper, obstacles and their calibration."""

@@ -1,4 +1,4 @@
-"""Where the robot stands: its base in the branch's frame, from points that it has touched."""
+"""Position of the robot's base in the branch's frame, from points that the robot touched."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ class BaseFit:
     """The base's pose and how well the touched points agree.
 
     Attributes:
-        pose: Of the robot's base in the branch's frame [m, rad], shape [6].
+        pose: Pose of the robot's base in the branch's frame [m, rad], shape [6].
         residuals: Distance of each point after the fit [m], shape [n].
-        position_sigma: Standard error of the base's position where the points are [m].
+        position_sigma: Standard error of the base's position at the points [m].
         rotation_sigma: Standard error of its rotation about its worst axis [rad].
     """
 
@@ -40,24 +40,24 @@ class BaseFit:
 
 
 def least_depth(largest_residual: float) -> float:
-    """Return how far points have to spread out of their plane [m] for a mirror to show.
+    """Return how far out of plane points must spread [m] to reveal a mirrored fit.
 
-    Mirrored points are off by twice that spread, which has to exceed the residual that is allowed.
+    A mirrored fit has residuals of twice that spread, which must exceed the allowed residual.
     """
     return max(_LEAST_OUT_OF_PLANE, 0.5 * largest_residual)
 
 
 def require_frame(points: np.ndarray, names: Sequence[str], which: str,
                   largest_residual: float = 0.01) -> None:
-    """Refuse points that leave the frame open, or its handedness.
+    """Refuse points that do not determine the frame, or its handedness.
 
     Three points, or any number in a plane, fit a mirrored frame without a residual.
 
     Args:
-        points: [m], shape [n, 3].
-        names: Of the points.
-        which: What they are, for the message: ``on the branch`` or ``as they were touched``.
-        largest_residual: That :func:`fit_base` allows [m].
+        points: Positions [m], shape [n, 3].
+        names: Names of the points.
+        which: Description for the message: ``on the branch`` or ``as they were touched``.
+        largest_residual: Largest residual that :func:`fit_base` allows [m].
 
     Raises:
         InputError: too few, no numbers, too close to each other, in a line or in a plane.
@@ -96,16 +96,16 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
 
 
 def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
-    """Return where the middle of the gripper is by :func:`gripper_pose` [m], shape [3]."""
+    """Return the position of the gripper's middle by :func:`gripper_pose` [m], shape [3]."""
     return gripper_pose(cell, sample)[:3]
 
 
 def gripper_pose(cell: Cell, sample: Sample) -> np.ndarray:
     """Return the pose of the gripper's middle by the controller's own pose, base frame [m, rad, 6].
 
-    The controller knows the arm's true measures. Its pose is that of the tool that is set there:
-    newer controllers tell that tool. With others the nominal measures tell which it is, the
-    cell's ``tool.grasp_pose`` or none, but nothing of the place.
+    The controller knows the arm's true dimensions. Its pose is that of the tool set there, and
+    newer controllers report that tool. With others the nominal dimensions show which tool it is,
+    the cell's ``tool.grasp_pose`` or none. They are not used for the position.
 
     Raises:
         InputError: another tool is set.
@@ -133,14 +133,14 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
     """Fit the rigid transform from the robot's base to the branch's frame (Kabsch 1976).
 
     Args:
-        touched: Points as the robot's tip touched them, base frame [m], shape [n, 3].
+        touched: Points touched by the robot's tip, base frame [m], shape [n, 3].
         on_branch: The same points in the branch's frame [m], shape [n, 3].
-        largest_residual: A point that is farther off than this [m] was mixed up or mistouched.
-        names: Of the points, for messages; by default their numbers from 1 on.
+        largest_residual: A point farther away than this [m] was mixed up or touched wrongly.
+        names: Names of the points, for messages; by default their numbers from 1 on.
 
     Raises:
         InputError: fewer than four points, points in a plane or too close to each other, mirrored
-            points, or a point far off.
+            points, or an outlier.
     """
     touched, on_branch = np.asarray(touched, float), np.asarray(on_branch, float)
     if touched.shape != on_branch.shape or touched.ndim != 2 or touched.shape[1] != 3:
@@ -153,14 +153,14 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
     frame, residuals = _registered(touched, on_branch)
     if residuals.max() > largest_residual:
         raise _off(residuals, touched, on_branch, names, largest_residual)
-    # Six unknowns come out of 3 n numbers.
+    # Six unknowns are fitted to 3 n numbers.
     sigma = float(np.sqrt((residuals**2).sum() / (3 * len(touched) - 6)))
     return BaseFit(pose_vectors(frame), residuals, sigma / np.sqrt(len(touched)),
                    sigma / (np.sqrt(len(touched)) * float(spreads(on_branch)[1])))
 
 
 def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame [4, 4] that fits points [n, 3] best, and what is left of each [m, n]."""
+    """Return the frame [4, 4] that best fits points [n, 3], and the residuals [m, n]."""
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = rigid_fit(touched, on_branch)
     return frame, np.linalg.norm(touched @ frame[:3, :3].T + frame[:3, 3] - on_branch, axis=1)
@@ -168,7 +168,7 @@ def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray,
 
 def _off(residuals: np.ndarray, touched: np.ndarray, on_branch: np.ndarray,
          names: Sequence[str], largest_residual: float) -> InputError:
-    """Return why points [n, 3] do not fit: what would have to be done to them so that they do."""
+    """Return why points [n, 3] do not fit: the change that would make them fit."""
     off = ", ".join(f"{name} {1000 * value:.1f}"
                     for name, value in zip(names, residuals, strict=True))
 

@@ -1,4 +1,4 @@
-"""The cell: where the robot stands beside the branch, what it holds and what is in its way.
+"""The cell: robot base beside the branch, gripper and obstacles.
 
 ``cell.toml`` is written by ``limber robot calibrate`` and by hand. All lengths are in metres,
 angles in radians, masses in kilograms. The branch's frame is that of its folder (z up).
@@ -46,7 +46,7 @@ class _Entry(BaseModel):
 
 
 class RobotEntry(_Entry):
-    """Which robot, and at which address."""
+    """Robot model and address."""
 
     model: str = Field(description="ur3, ur5, ur10, ur3e, ur5e, ur10e or "
                        "ur16e; the URDF file of another arm, beside the cell file.")
@@ -76,7 +76,7 @@ class BaseEntry(_Entry):
 
 
 class CapsuleEntry(_Entry):
-    """A rod with round ends, in the frame of the flange: one part of the gripper's shape."""
+    """A capsule in the frame of the flange: one part of the gripper's shape."""
 
     start_m: Vector
     end_m: Vector
@@ -84,7 +84,7 @@ class CapsuleEntry(_Entry):
 
 
 class ToolEntry(_Entry):
-    """The gripper: where it holds, what it weighs, its shape."""
+    """The gripper: its grasp pose, weight and shape."""
 
     grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's frame.")
     mass_kg: float | None = Field(
@@ -104,7 +104,7 @@ class ToolEntry(_Entry):
 
 
 class ApproachEntry(_Entry):
-    """How the gripper comes to the branch and leaves it."""
+    """Approach and departure of the gripper."""
 
     direction: Vector = Field((0.0, 0.0, 1.0), description="Direction in the grasp's frame.")
     distance_m: float = Field(0.08, gt=0, le=1)
@@ -140,7 +140,7 @@ class SensorEntry(_Entry):
 
 
 class LimitsEntry(_Entry):
-    """What no motion may exceed; clamped far below what the robot itself allows."""
+    """Limits of every motion, clamped far below what the robot itself allows."""
 
     speed_m_s: float = Field(0.05, gt=0, le=MOST_SPEED)
     acceleration_m_s2: float = Field(0.3, gt=0, le=2.0)
@@ -192,7 +192,7 @@ class SecondArmEntry(_Entry):
 
 
 class WorkspaceEntry(_Entry):
-    """The box that the grasp stays in, branch frame."""
+    """The box that contains the grasp, branch frame."""
 
     low_m: Vector
     high_m: Vector
@@ -207,7 +207,7 @@ class WorkspaceEntry(_Entry):
 
 
 class BoxEntry(_Entry):
-    """A box in the way."""
+    """A box as an obstacle."""
 
     kind: Literal["box"] = "box"
     name: str = ""
@@ -223,7 +223,7 @@ class BoxEntry(_Entry):
 
 
 class MeshEntry(_Entry):
-    """A closed surface in the way, branch frame."""
+    """A closed surface as an obstacle, branch frame."""
 
     kind: Literal["mesh"] = "mesh"
     name: str = ""
@@ -316,7 +316,7 @@ def read_cell(path: str | Path) -> Cell:
     content = read_toml(path, "the description of a robot's cell (TOML; `limber "
                               "robot calibrate` makes one)", finite=False)
     for entry in (content.get("robot"), content.get("second_arm")):
-        # An arm's file lies beside the cell file, as those of obstacles do.
+        # An arm's file is relative to the cell file, as those of obstacles are.
         if isinstance(entry, dict) and str(entry.get("model", "")).lower().endswith(ENDING):
             entry["model"] = str(path.absolute().parent / entry["model"])
     try:
@@ -341,7 +341,7 @@ def write_cell(path: str | Path, cell: Cell) -> None:
 def _told(path: Path, item: dict) -> str:
     place = ".".join(str(part) for part in item["loc"])
     message = item["msg"].removeprefix("Value error, ")
-    # What several entries together make wrong begins with the name of one.
+    # An error that several entries cause together begins with the name of one of them.
     named = tuple(re.match(r"[\w.]+", message)[0].split(".")) if not item["loc"] else item["loc"]
     line = _line_of(path, named)
     where = f"{path}, line {line}" if line else f"{path}"
@@ -349,7 +349,7 @@ def _told(path: Path, item: dict) -> str:
 
 
 def _line_of(path: Path, location: tuple) -> int | None:
-    """The line of an entry: its key within its table. A table's own line where it is missing."""
+    """Line of an entry: its key within its table, or the table's own line if the key is missing."""
     names = [part for part in location if isinstance(part, str)]
     table, found = "", None
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):

@@ -1,4 +1,4 @@
-"""A cell file to fill in: every section and key, each with what it means."""
+"""A cell file to fill in: every section and key with its meaning."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -23,7 +23,7 @@ _EXAMPLES: dict[str, Any] = {
     "obstacles": [{"kind": "box", "name": "table", "size_m": [1.0, 1.0, 0.04],
                    "pose": [0.5, 0.0, -0.02, 0.0, 0.0, 0.0]},
                   {"kind": "mesh", "name": "pot", "file": "pot.stl", "unit": "mm"}]}
-"""Values that a user has to replace: they stand behind a comment sign."""
+"""Values that a user has to replace; they are commented out."""
 
 _HEAD = """\
 # The cell: which robot stands where beside the branch, what it holds, what it must not exceed.
@@ -56,7 +56,7 @@ def cell_template(cell: Cell) -> str:
 
 def _lines(kind: type[BaseModel], stated: dict[str, Any], examples: dict[str, Any],
            is_example: bool) -> Iterator[str]:
-    """The keys of a section; those that are not stated are examples behind a comment sign."""
+    """The keys of a section; those that are not stated are examples, commented out."""
     for name, entry in kind.model_fields.items():
         value, mark = stated.get(name), ""
         if value is None or value == [] or is_example:

@@ -1,4 +1,4 @@
-"""Whether a cell, a branch and what was made for them belong together."""
+"""Checks that a cell, a branch and the files made for them belong together."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def require_payload(cell: Cell) -> None:
 
 
 def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
-    """Return a warning where a plan was made in no robot's cell.
+    """Return a warning if a plan was made without a robot's cell.
 
     Args:
         made_for: What the plan's file states about its robot.
@@ -58,7 +58,7 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
 
 
 def check_branch(cell: Cell, uuid: str | None, folder: object) -> str | None:
-    """Return a warning where the cell names no branch.
+    """Return a warning if the cell names no branch.
 
     Raises:
         InputError: the cell was calibrated for another branch.

@@ -1,4 +1,4 @@
-"""What a controller has set, beside what the cell file states: tool, payload, slider, program."""
+"""Settings of a controller compared with the cell file: tool, payload, slider, program."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.cell.cell import Cell
 from limber.robot.interface import Sample
 
-# A tool that the controller tells of is known to rounding, one that follows from nominal joints
-# to millimetres: so much real arms differ from their nominal measures.
+# A tool that the controller reports is known up to rounding. One computed from nominal joints is
+# known to millimetres, since real arms differ that much from their nominal dimensions.
 _TOLD_M, _TOLD_RAD = 1e-4, 1e-3
 NOMINAL_M, NOMINAL_RAD = 0.01, np.radians(2.0)
 _SAME_KG, _SAME_CENTRE_M = 0.005, 0.001
@@ -19,12 +19,12 @@ _PLAYING = 2
 
 @dataclass(frozen=True)
 class Difference:
-    """One thing in which a controller differs from the cell file.
+    """One difference between a controller and the cell file.
 
     Attributes:
         what: Its name.
-        seen, wanted: In the controller, and in the cell file.
-        is_set: Whether a motion sets it by itself, and puts it back.
+        seen, wanted: Value in the controller, and in the cell file.
+        is_set: Whether a motion sets it automatically, and restores it.
     """
 
     what: str
@@ -40,8 +40,8 @@ class Difference:
 def tool_in_controller(cell: Cell, sample: Sample) -> np.ndarray:
     """Return the tool [m, rad, 6] that is set in the controller, in the flange's frame.
 
-    Newer controllers tell it. Else it follows from joints and pose by the nominal measures of the
-    arm, to some millimetres.
+    Newer controllers report it. Otherwise it is computed from joints and pose with the nominal
+    dimensions of the arm, to some millimetres.
     """
     if sample.tool is not None:
         return sample.tool
@@ -57,7 +57,7 @@ def is_tool(cell: Cell, sample: Sample, tool: np.ndarray) -> bool:
 
 
 def differences(cell: Cell, sample: Sample) -> list[Difference]:
-    """Return in what the controller differs from the cell; what it does not tell is left out."""
+    """Return the differences between controller and cell; values not reported are omitted."""
     found, grasp = [], np.array(cell.tool.grasp_pose)
     if not is_tool(cell, sample, grasp):
         found.append(Difference("tool centre point",

@@ -1,9 +1,10 @@
-"""Where a camera is that sees the robot, or that it carries, from a board seen in several poses.
+"""Pose of a camera, fixed or on the robot, from a board seen in several poses.
 
-The camera stands and the gripper holds the board, or the gripper carries the camera and the board
-stands. Both are one problem: X o_i = M_i Y with the camera's frame X, the board's frame Y, what the
-camera saw o_i and where the robot was, M_i or its inverse (Dornaika and Horaud 1998, "Simultaneous
-robot-world and hand-eye calibration"). A marker of which only the place is seen has no turn in Y.
+Either the camera is fixed and the gripper holds the board, or the gripper carries the camera and
+the board is fixed. Both are one problem: X o_i = M_i Y with the camera's frame X, the board's frame
+Y, the camera's observation o_i and the robot's pose M_i or its inverse (Dornaika and Horaud 1998,
+"Simultaneous robot-world and hand-eye calibration"). For a marker of which only the position is
+seen, Y has no rotation.
 """
 
 from collections.abc import Callable
@@ -32,11 +33,11 @@ class CameraFit:
     """The camera, the board, and how well the views agree.
 
     Attributes:
-        camera: Its pose, in the base's frame where it stands, else in the gripper's [m, rad],
-            shape [6].
+        camera: Pose of the camera, in the base's frame if it is fixed, else in the gripper's [m,
+            rad], shape [6].
         board: Its pose in the other of the two, shape [6]; of a marker the turn is zero.
         residuals: Distance of each view's board from where it should be seen [m], shape [n].
-        covariance: Of what was fitted, shape [k, k].
+        covariance: Covariance of the fitted parameters, shape [k, k].
     """
 
     camera: np.ndarray
@@ -51,11 +52,11 @@ class CameraFit:
 
     def deviations(self, frame: Callable[[np.ndarray, np.ndarray], np.ndarray],
                    point: np.ndarray) -> tuple[float, float]:
-        """Return standard errors of a frame that is made of both: of where it takes ``point``
-        [m, 3], and of its turn about the worst axis [rad].
+        """Return standard errors of a frame composed of both: of its image of ``point`` [m, 3], and
+        of its rotation about the worst axis [rad].
 
         Args:
-            frame: Gives it, shape [4, 4], for frames of camera and board.
+            frame: Computes it, shape [4, 4], from the frames of camera and board.
         """
         known = np.r_[self.camera, self.board][:len(self.covariance)]
         middle = frame(*_frames(known))
@@ -77,12 +78,13 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
 
     Args:
         robot: Poses of the gripper's middle in the base's frame [m, rad], shape [n, 6].
-        seen: The board's poses in the camera's frame, shape [n, 6]; or places of a marker, [n, 3].
+        seen: The board's poses in the camera's frame, shape [n, 6]; or positions of a marker, [n,
+        3].
         camera_on: What carries the camera.
-        largest_residual: A view that is farther off than this [m] was mixed up.
+        largest_residual: A view with a larger residual than this [m] was mixed up.
 
     Raises:
-        InputError: too few views, the arm turned about one axis alone, or a view far off.
+        InputError: too few views, the arm rotated about one axis only, or an outlier.
     """
     robot, seen = np.asarray(robot, float), np.asarray(seen, float)
     if not (np.isfinite(robot).all() and np.isfinite(seen).all()):
@@ -127,7 +129,7 @@ def _require_turns(moves: np.ndarray, what: str) -> None:
 
 
 def _require_depth(places: np.ndarray, largest_residual: float) -> None:
-    """Refuse places [n, 3] in a plane, which fit as well where the camera's axes are mirrored."""
+    """Refuse positions [n, 3] in a plane: they fit equally well with mirrored camera axes."""
     spread = spreads(places)[2]
     needed = least_depth(largest_residual)
     if spread < needed:
@@ -139,9 +141,10 @@ def _require_depth(places: np.ndarray, largest_residual: float) -> None:
 
 
 def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return how far off the best frames are whose camera is turned so [3, 3], and those frames.
+    """Return the squared error of the best frames with this camera rotation [3, 3], and them.
 
-    With that turn given all places follow linearly: R x_i + x = R_i y + t_i for what is seen x_i.
+    With that rotation given the positions are a linear problem: R x_i + x = R_i y + t_i for the
+    observations x_i.
     """
     count = len(moves)
     left = np.hstack([np.tile(-np.eye(3), (count, 1)), moves[:, :3, :3].reshape(-1, 3)])
@@ -155,7 +158,7 @@ def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[flo
 
 
 def _off(values: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Distances and turns [m] between boards as seen and as they should be, flat."""
+    """Distances and rotations [m] between boards as seen and as expected, flat."""
     camera, board = _frames(values)
     there, should = camera @ matrices(_whole(seen)), moves @ board
     off = there[:, :3, 3] - should[:, :3, 3]
@@ -171,24 +174,24 @@ def _frames(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _whole(poses: np.ndarray) -> np.ndarray:
-    """Poses [n, 6] of poses or places [n, 3]."""
+    """Poses [n, 6] of poses or positions [n, 3]."""
     return np.hstack([poses, np.zeros((len(poses), 6 - poses.shape[1]))])
 
 
 def base_from_camera(fit: CameraFit, scan: np.ndarray, camera_on: CameraOn,
                      scan_pose: np.ndarray | None, near: np.ndarray,
                      ) -> tuple[np.ndarray, float, float]:
-    """Return the robot's base in the branch's frame [m, rad, 6], its standard errors of position
-    [m] and turn [rad] where the branch is.
+    """Return the robot's base in the branch's frame [m, rad, 6], and its standard errors of
+    position [m] and rotation [rad] at the branch.
 
     Args:
-        scan: Takes the scan's coordinates [m] to the branch's, shape [4, 4]. They are the standing
-            camera's; or those of the carried one while the gripper was at ``scan_pose`` [6];
-            without that, the standing board's.
-        near: Place of the branch, branch frame [m], shape [3].
+        scan: Transform from the scan's coordinates [m] to the branch's, shape [4, 4]. The scan's
+            coordinates are those of the fixed camera; or of the carried one while the gripper was
+            at ``scan_pose`` [6]; without that, of the fixed board.
+        near: Position of the branch, branch frame [m], shape [3].
 
     Raises:
-        InputError: the scan is in the frame of a marker, which has no turn.
+        InputError: the scan is in the frame of a marker, which has no rotation.
     """
     if camera_on == "gripper" and scan_pose is None and len(fit.covariance) < 12:
         raise InputError("The scan is in the board's frame, but only the position of a marker was "

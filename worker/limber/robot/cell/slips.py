@@ -1,7 +1,7 @@
-"""Slips in a cell file: numbers that no arm and no bench can have, and the slip that is likely.
+"""Slips in a cell file: numbers impossible for an arm or a bench, and the probable slip.
 
-A number in millimetres, degrees, grams or millinewtons is valid TOML and often still within what
-one entry allows. Held against the arm and against each other most of them show.
+A number in millimetres, degrees, grams or millinewtons is valid TOML and often still within the
+range of one entry. Compared with the arm and with each other most of them show.
 """
 
 import math
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell, SensorEntry
 
 FAR = 20.0
-"""Farther [m] than this from the branch nothing is that an arm works with."""
+"""Greatest distance from the branch [m] of any object that an arm works with."""
 _FAR_FROM_ARM = 10.0  # m that the branch's origin may be beyond the arm's reach
 _AT_FLANGE = 1.0  # m; what an arm carries is nearer to its flange
 _WHOLE_TURN = 2 * math.pi + 1e-6
@@ -26,7 +26,8 @@ _LARGEST_RANGE = {"force": 1e4, "torque": 1e3}  # [N], [N m]
 
 
 def slips(cell: "Cell") -> Iterator[str]:
-    """Yield what cannot be in a cell whose entries are valid each: "limits.hard_force_n is ..."."""
+    """Yield contradictions of a cell with individually valid entries: "limits.hard_force_n is ...".
+    """
     yield from _joint_slips(cell)
     yield from _pose_slips(cell)
     yield from _limit_slips(cell)
@@ -133,14 +134,14 @@ def _camera_slips(cell: "Cell") -> Iterator[str]:
 
 
 def _place_slips(cell: "Cell") -> Iterator[str]:
-    """What the arm is to reach, against what it reaches from its base."""
+    """Distances that the arm is to reach, compared with its reach from the base."""
     if cell.workspace is None:
         return
     low, high = np.array(cell.workspace.low_m), np.array(cell.workspace.high_m)
     shoulder = matrices(np.array(cell.base.pose)) @ np.r_[cell.arm.shoulder, 1.0]
     away = float(np.linalg.norm(shoulder[:3] - np.clip(shoulder[:3], low, high)))
     grasp = math.hypot(*cell.tool.grasp_pose[:3])
-    # The flange is beyond the wrist by less than the reach of any arm.
+    # The distance from wrist to flange is less than the reach of any arm.
     most = 1.5 * cell.arm.reach + grasp
     if away > most:
         yield (f"workspace is {away:.3g} m from the arm's shoulder, but a {cell.arm.name} reaches "

@@ -31,14 +31,14 @@ from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory
 
 PARENT_SECONDS = 1.0
-"""The parent says something at least this often, or the robot stops."""
+"""Longest time between messages of the parent before the robot stops."""
 
 _PROGRAM_SECONDS = 1.5
 _GONE_SECONDS = 1.0  # of silence; from the first of them on the arm is being stopped
 _LOOP_PRIORITY = 22
 
 Orders = queue.SimpleQueue[dict[str, Any] | None]
-"""What the parent orders; None: it is gone."""
+"""Orders of the parent; None: the parent has ended."""
 
 
 class Driver:
@@ -46,7 +46,7 @@ class Driver:
 
     Args:
         cell: Robot, tool, sensor and limits.
-        words: What it says goes through them.
+        words: Channel for the driver's messages.
 
     Raises:
         LimberError: the robot does not answer, or is not in a state to be moved.
@@ -58,7 +58,7 @@ class Driver:
         sensor = open_sensor(cell)
         self.guard = _guard_of(cell, self._control)
         _warm_up(cell, self._control, sensor)
-        # Now: where it has just compiled this takes longer than the watchdog would wait.
+        # Now: if it has just compiled, this takes longer than the watchdog would wait.
         self.facts = self._control.facts | {
             "real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
             "kept_awake": keep_awake()}
@@ -66,7 +66,7 @@ class Driver:
         self._control.connect()
         self._deadline = RenewedDeadline()
         self._deadline.renew()
-        # Before the control's own threads, which have what was claimed before they began.
+        # Before the control starts its own threads: they inherit the priority set before.
         claim_real_time(_LOOP_PRIORITY)
         self._quiet = 2.0 / self._control.rate + 0.005
         self._hold_ups = HoldUps(self._quiet, self.tell)
@@ -103,13 +103,13 @@ class Driver:
         for sample in samples:
             self._senses.look(sample)
         self._last = samples[-1]
-        # What came while they were judged need not wait for the next target as well.
+        # Readings that arrived during the judgement need not wait for the next target either.
         beside = self._senses.connections
         if beside and select.select(beside, [], [], 0.0)[0]:
             self._senses.feel(self._last)
 
     def _bears_silence(self, last: Sample) -> bool:
-        """Judge that no sample came since ``last``; returns whether the robot may still be there.
+        """Judge the silence since ``last``; returns whether the robot may still be connected.
         """
         age = time.monotonic() - last.arrived
         if not self._hold_ups.has_just_woken:
@@ -180,7 +180,7 @@ class Driver:
 
     def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
         sample = self._require_sample()
-        # Poses that come of joint angles have the nominal measures of the arm, not its own.
+        # Poses computed from joint angles have the arm's nominal dimensions, not its own.
         start = sample.pose if trajectory.by_joints else trajectory.poses[0]
         require_start(sample.pose, sample.joints, start, start_joints, self.cell.arm.joint_names)
         self._require_program(sample)
@@ -210,7 +210,7 @@ class Driver:
             self._start_program()
 
     def _start_program(self) -> None:
-        """Start the control program once more, and see that it runs."""
+        """Start the control program once more, and check that it runs."""
         started = self._control.start_program()
         self._deadline.renew()
         given_up = time.monotonic() + _PROGRAM_SECONDS
@@ -222,7 +222,7 @@ class Driver:
             for sample in self._control.read(1.0 / self._control.rate):
                 self._senses.look(sample)
                 self._last = sample
-        # Each program begins without one.
+        # Each program begins without a watchdog.
         self._control.watch()
 
     def _move(self, step: float) -> None:
@@ -240,12 +240,12 @@ class Driver:
             target = following.trajectory.pose(following.time)
             self._command = self.guard.permit(self._command, target, 1.2 * step)
             if following.trajectory.by_joints and self._command is not target:
-                # Joint angles cannot be slowed down as a pose can.
+                # Joint angles cannot be slowed down like a pose.
                 self._under_way.judge(self.guard.event(
                     "the joints' motion is faster than the cell's limits"))
                 return
         else:
-            # Braked where it was; from there it goes on.
+            # It was braked here and continues from here.
             self._command = following.trajectory.pose(following.time)
         moves = self.guard.state == State.MOVING
         if not (self._sent(following) if moves else self._control.keep_alive()):
@@ -275,7 +275,7 @@ class Driver:
         return self._last
 
     def close(self) -> None:
-        """Stop what moves and let go of the robot."""
+        """Stop the motion and release the robot."""
         set_deadline()
         self._under_way.give_up()
         self._senses.close()
@@ -303,7 +303,7 @@ def _guard_of(cell: Cell, control: ArmControl) -> Guard:
 
 
 def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None:
-    """Go through what the loop does once: compiling on the way would starve the watchdog."""
+    """Run the loop's functions once: compiling during a motion would starve the watchdog."""
     samples: list[Sample] = []
     while len(samples) < 3:
         samples += control.read(1.0)
@@ -324,7 +324,7 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None
 
 
 def _walk_back(sample: Sample, way: WayBack) -> None:
-    """Go a millimetre and the way back in thought, so that all that it takes is loaded."""
+    """Simulate a millimetre and the return, so that everything needed for it is loaded."""
     there = replace(sample, pose=sample.pose + np.r_[0.002, np.zeros(5)])
     way.begin(sample, Trajectory(np.array([0.0, 1.0]), np.array([sample.pose, there.pose])))
     way.note(there)

@@ -25,7 +25,7 @@ _CONTROLS: dict[str, Callable[[Cell], ArmControl]] = {"ur": UrControl, "virtual"
 
 
 def register_control(kind: str, opened: Callable[[Cell], ArmControl]) -> None:
-    """Let arms whose ``controller`` is ``kind`` be driven by what ``opened`` returns.
+    """Register ``opened`` to drive arms whose ``controller`` is ``kind``.
 
     Args:
         opened: Takes the cell, connects to its controller, and raises if the arm cannot move now.
@@ -40,7 +40,7 @@ def stop_from_outside(cell: Cell, seconds: float) -> bool:
         seconds: Longest wait for the connection [s].
 
     Returns:
-        Whether the stop was sent; a controller of another kind has no such way.
+        Whether the stop was sent; a controller of another kind has no such channel.
     """
     if _CONTROLS.get(cell.arm.controller) not in (UrControl, _virtual):
         return False

@@ -1,4 +1,4 @@
-"""The motion under way, and what ends it: decisions of the guard over two ways to stop an arm."""
+"""The motion under way and its end: the guard's decisions over two channels to stop an arm."""
 
 import time
 from collections.abc import Callable
@@ -16,12 +16,12 @@ _LONG_STEP_SECONDS = 0.004
 
 @dataclass
 class Following:
-    """A trajectory that is followed.
+    """A trajectory being followed.
 
     Attributes:
-        trajectory: Where to.
-        time: How far along it the target is [s].
-        rate: How fast its time runs, 0 to 1.
+        trajectory: Its trajectory.
+        time: Time of the target along it [s].
+        rate: Rate of its time, 0 to 1.
     """
 
     trajectory: Trajectory
@@ -30,15 +30,15 @@ class Following:
 
 
 class UnderWay:
-    """What the arm follows now, if it does, and whether it was stopped.
+    """The trajectory that the arm follows now, if any, and whether it was stopped.
 
     Args:
         control: Moves the arm.
         guard: Decides.
-        tell: Reports what happened.
+        tell: Reports events.
 
     Attributes:
-        following: None where nothing is followed.
+        following: None if no trajectory is followed.
     """
 
     def __init__(self, control: ArmControl, guard: Guard, tell: Callable[..., None]):
@@ -64,7 +64,7 @@ class UnderWay:
         """Act on a decision.
 
         Args:
-            at_once: Stop by the second channel as well: no step of the controller is near.
+            at_once: Stop by the second channel as well, since no step of the controller is near.
         """
         if decision.verdict == Verdict.STOP and self._stopped_at is None:
             if self.following is not None:
@@ -79,8 +79,8 @@ class UnderWay:
                 self._stopped_at = time.monotonic()
                 self._tell(event="stopped", reason=str(decision), moving=False)
         elif decision.verdict == Verdict.PAUSE and self.following is not None and decision.limit:
-            # Before the brake, as with a stop. A target that is held is ahead of the arm by the
-            # look-ahead: at 50 mm/s it would go on into a wall for 3 mm.
+            # Before the brake, as with a stop. A held target is ahead of the arm by the look-ahead:
+            # at 50 mm/s the arm would continue into a wall for 3 mm.
             self._tell(event="paused", reason=str(decision))
             following = self.following
             following.time = max(following.time - self._control.lookahead * following.rate, 0.0)
@@ -92,7 +92,7 @@ class UnderWay:
         self._stopped_at = time.monotonic()
         came = sample.arrived if sample is not None else self._stopped_at
         latency = self._stopped_at - came
-        # Before the arm's stop, from which this process does not come back where no answer comes.
+        # Before the arm's stop: without an answer this process does not return from it.
         self._tell(event="stopped", reason=str(decision), moving=True, value=decision.value,
                    limit=decision.limit, command_after_s=latency,
                    clock=sample.clock if sample is not None else None,
@@ -100,7 +100,7 @@ class UnderWay:
         self._stop_arm()
 
     def _stop_arm(self) -> None:
-        """First channel: the control program; second, where it fails: :meth:`_stop_at_once`."""
+        """First channel: the control program; second, if it fails: :meth:`_stop_at_once`."""
         stopped = False
         try:
             stopped = self._control.end_motion()
@@ -119,14 +119,15 @@ class UnderWay:
                        f"controller's watchdog ends its program in {self._control.silence:.2f} s")
 
     def lose(self, reason: str) -> None:
-        """The data connection was lost: nothing is known, so every means to stop is used."""
+        """The data connection was lost: the state is unknown, so every means to stop is used."""
         moving = self.following is not None
         decision = self._guard.event(reason)
         self._stop_at_once("the data connection was lost")
         self._tell(event="stopped", reason=str(decision), moving=moving)
 
     def stand(self, last: Sample | None) -> None:
-        """Nothing is followed: keep the program alive, and see that a stopped arm stands."""
+        """No trajectory is followed: keep the program alive; check that a stopped arm is at rest.
+        """
         if not self._control.keep_alive() and self._stopped_at is None:
             self.judge(self._guard.event("the control program is not running"))
         if self._stopped_at is not None and last is not None:
@@ -137,7 +138,7 @@ class UnderWay:
                 self._stopped_at = time.monotonic()
 
     def give_up(self) -> None:
-        """Stop what moves: the driver ends."""
+        """Stop the motion: the driver ends."""
         if self.following is not None:
             self.following = None
             self._stop_arm()

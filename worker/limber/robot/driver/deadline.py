@@ -1,8 +1,8 @@
 """A time limit on calls into ur-rtde, kept by the system: it ends this process.
 
-ur-rtde waits in C++, for minutes and with the interpreter's lock, for an answer that never comes
-where a connection carries one way alone. No thread of Python can act then. The controller's own
-watchdog ends its program a tenth of a second after this process said its last word.
+ur-rtde waits in C++, for minutes and with the interpreter's lock, for an answer that never comes if
+a connection works in one direction only. No Python thread can act then. The controller's own
+watchdog ends its program a tenth of a second after the last message of this process.
 """
 
 import faulthandler
@@ -20,14 +20,14 @@ _RENEWED_SECONDS = 0.2
 def set_deadline(seconds: float = CALL_SECONDS) -> None:
     """End this process in ``seconds`` unless a new deadline is set by then."""
     if hasattr(signal, "setitimer"):
-        # Nobody handles the alarm, so that the kernel ends the process.
+        # The alarm has no handler, so that the kernel ends the process.
         signal.setitimer(signal.ITIMER_REAL, seconds)
     else:
         faulthandler.dump_traceback_later(seconds, exit=True)
 
 
 def clear_deadline() -> None:
-    """Let this process end by itself."""
+    """Cancel the deadline."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     else:
@@ -35,14 +35,14 @@ def clear_deadline() -> None:
 
 
 def ended_by_deadline(exit_code: int | None) -> bool:
-    """Whether an exit code of a process is what its deadline leaves."""
+    """Whether an exit code of a process is that of its deadline."""
     if hasattr(signal, "setitimer"):
         return exit_code == -signal.SIGALRM
     return exit_code == 1
 
 
 class RenewedDeadline:
-    """The deadline of a loop, set anew some times a second rather than in each turn."""
+    """The deadline of a loop, renewed some times a second rather than in each cycle."""
 
     def __init__(self) -> None:
         self._set_at = -float("inf")

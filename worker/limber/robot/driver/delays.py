@@ -1,4 +1,4 @@
-"""Times in which the computer held the driver's loop up."""
+"""Delays of the driver's loop by the computer."""
 
 import time
 from collections.abc import Callable
@@ -8,14 +8,14 @@ _GRACE_SECONDS = 0.015
 
 
 class HoldUps:
-    """Sees that the loop was held up, and gives it time to read what came meanwhile.
+    """Detects a delay of the loop, and gives it time to read the messages from that time.
 
-    What came waits in the connections, and is read and judged. That nothing came tells of no
-    silence yet: it is listened for once more, and no second time without a sample.
+    Messages that arrived wait in the connections, and are read and judged. Their absence does not
+    prove silence yet: the loop listens once more, and not a second time without a sample.
 
     Args:
-        quiet: How long the loop listens at a time [s].
-        tell: Says what happened.
+        quiet: Time for which the loop listens at once [s].
+        tell: Reports events.
     """
 
     def __init__(self, quiet: float, tell: Callable[..., None]):
@@ -23,7 +23,7 @@ class HoldUps:
         self._woke, self._listened = -float("inf"), time.monotonic()
 
     def set_off(self) -> None:
-        """Starting a program took its time, and is no hold-up."""
+        """Starting a program took this time; it is no delay."""
         self._listened = time.monotonic()
 
     def note(self, last_arrived: float | None, *, moving: bool) -> None:
@@ -31,7 +31,7 @@ class HoldUps:
 
         Args:
             last_arrived: When the last sample came, on the monotonic clock [s].
-            moving: Whether anything is followed.
+            moving: Whether a trajectory is followed.
         """
         before, self._listened = self._listened, time.monotonic()
         overslept = self._listened - before - self._quiet
@@ -45,5 +45,5 @@ class HoldUps:
 
     @property
     def has_just_woken(self) -> bool:
-        """Whether a hold-up is just over."""
+        """Whether a delay has just ended."""
         return time.monotonic() - self._woke < _GRACE_SECONDS

@@ -1,9 +1,9 @@
 """The process that moves the robot: ``python -m limber.robot.driver.driver``.
 
-ur-rtde has wheels for Python 3.11 and 3.12 only, holds the interpreter while it connects and ends
-the whole process when a connection breaks in a bad moment. So it lives here, alone. Orders come as
-JSON lines on standard input, samples and events go out as JSON lines; when the input ends, as when
-the parent is killed, the robot is stopped and the process ends.
+ur-rtde has wheels for Python 3.11 and 3.12 only, holds the interpreter while it connects, and ends
+the whole process if a connection breaks at a bad moment. So it has a process of its own. Orders
+come as JSON lines on standard input, samples and events go out as JSON lines. When the input ends,
+for example because the parent is killed, the robot is stopped and the process ends.
 """
 
 import json
@@ -30,27 +30,27 @@ def _read_orders(orders: Orders) -> None:
         except json.JSONDecodeError:
             orders.put({"order": line.strip()[:40]})
     orders.put(None)
-    # ur-rtde may wait for ever for a robot that went away as well: nobody is left who could end
-    # this process, and it has priority over all others.
+    # ur-rtde may wait for ever for a lost robot too: no other process is left to end this one, and
+    # it has priority over all others.
     time.sleep(_LAST_SECONDS)
     os._exit(3)
 
 
 def main() -> int:
     """Read the cell from the first line of standard input, then serve; returns an exit code."""
-    # ur-rtde prints on standard output; what is ours goes through a copy of it.
+    # ur-rtde prints on standard output; the driver's messages go through a copy of it.
     words = Words(os.fdopen(os.dup(1), "w", encoding="utf-8"))
     os.dup2(2, 1)
     driver: Driver | None = None
-    # From here on it is the robot that is waited for, not this computer.
+    # From here on the process waits for the robot, not for this computer.
     words.tell(event="starting")
     try:
         driver = Driver(Cell.model_validate_json(sys.stdin.readline()), words)
         driver.tell(event="connected", **driver.facts)
         orders: Orders = queue.SimpleQueue()
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
-        # Where a whole group of processes is asked to end, the arm is stopped in order, not by its
-        # watchdog; this one then ends with whoever gives it orders.
+        # If a whole process group is asked to end, the arm is stopped in order, not by its
+        # watchdog. This process then ends with the one that gives it orders.
         signal.signal(signal.SIGTERM, lambda *_: orders.put({"order": "stop"}))
         driver.run(orders)
     except (LimberError, RuntimeError, ConnectionError, ImportError) as error:
@@ -59,10 +59,10 @@ def main() -> int:
     finally:
         if driver is not None and not driver.ended:
             driver.close()
-        # From here on nothing waits for the robot: the last words may take their time.
+        # From here on nothing waits for the robot: the last messages may take their time.
         clear_deadline()
         words.close()
-    # What ur-rtde's threads still wait for is not waited for.
+    # Do not wait for ur-rtde's threads.
     os._exit(0)
 
 

@@ -1,10 +1,10 @@
 """Force-torque sensors: from a reading to the wrench of the gripper on the branch.
 
-The frames: the controller reports what the surroundings exert on the tool, in the base's axes,
+The frames: the controller reports the wrench of the surroundings on the tool, in the base's axes,
 about the tool's centre. An FT300 and a replayed file report the same in the sensor's own frame.
-What the guard and recordings want is the opposite: what the gripper exerts on the branch, about
-the grasp's centre, in the branch's frame. A tare takes away bias and weight at the orientation at
-which it is done; what the gripper's weight changes when it turns is taken away by computation.
+The guard and recordings need the opposite: the wrench of the gripper on the branch, about the
+grasp's centre, in the branch's frame. A tare removes bias and weight at its orientation. The change
+of the gripper's weight with rotation is removed by computation.
 """
 
 import re
@@ -24,7 +24,7 @@ from limber.robot.interface import Sample
 
 FT300_PORT = 63351
 INDEPENDENT_READINGS = 2
-"""At least so many are in a smoothed wrench: an FT300 sends fewer than a controller asks for."""
+"""Least readings in a smoothed wrench: an FT300 sends fewer than a controller requests."""
 
 _MESSAGE = re.compile(r"\(([^()]*)\)")
 
@@ -34,9 +34,10 @@ class Reading:
     """One reading.
 
     Attributes:
-        wrench: Of the surroundings on the tool, flange axes, about the flange [N, N m], shape [6].
+        wrench: Wrench of the surroundings on the tool, flange axes, about the flange [N, N m],
+        shape [6].
         age: [s].
-        raw: As the sensor sent it, shape [6].
+        raw: Numbers as the sensor sent them, shape [6].
     """
 
     wrench: np.ndarray
@@ -45,10 +46,10 @@ class Reading:
 
 
 class ForceTorqueSensor(Protocol):
-    """Where readings come from.
+    """A source of readings.
 
     Attributes:
-        connections: Its own, over which readings come between the robot's samples.
+        connections: Its own connections, over which readings arrive between the robot's samples.
     """
 
     connections: tuple[socket.socket, ...]
@@ -62,7 +63,7 @@ class ForceTorqueSensor(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the sensor."""
+        """Release the sensor."""
         ...
 
 
@@ -88,7 +89,7 @@ class Ft300Sensor:
     """A Robotiq FT300 by the text stream of its URCap: about 100 readings a second.
 
     Raises:
-        WorkError: nothing answers at the port.
+        WorkError: the port does not answer.
     """
 
     def __init__(self, cell: Cell, timeout: float = 2.0):
@@ -133,7 +134,7 @@ class Ft300Sensor:
 class ReplayedSensor:
     """Readings from a CSV file: ``t_s`` and six columns, in the sensor's frame.
 
-    Time runs from the first sample on.
+    Time starts at the first sample.
     """
 
     connections = ()
@@ -166,8 +167,8 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
     """Return the cell's sensor.
 
     Raises:
-        InputError: the cell names none, or a CB3's own estimate, which is no sensor, or a replay
-            for a robot that is not the virtual one.
+        InputError: the cell names no sensor, or names a CB3's own estimate, which is no sensor, or
+            a replay for a real robot.
         WorkError: it does not answer.
     """
     if cell.sensor.kind == "replay":
@@ -194,12 +195,12 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
 
 @dataclass
 class WrenchChain:
-    """Tare, weight, range and filter: from readings to what the gripper exerts on the branch.
+    """Tare, weight, range and filter: from readings to the wrench of the gripper on the branch.
 
     Attributes:
         cell: Gripper's mass, ranges, frames.
-        bias, bias_sigma: What the tare found, flange frame, and its standard error, shape [6].
-        count: Readings that the slower output averages; it is late by half of them.
+        bias, bias_sigma: Bias from the tare, flange frame, and its standard error, shape [6].
+        count: Readings that the slower output averages; its delay is half of them.
     """
 
     cell: Cell
@@ -216,7 +217,7 @@ class WrenchChain:
         self._own_weight = self.cell.sensor.kind != "controller"
 
     def delay(self, rate: float) -> float:
-        """Return by how much the smoothed wrench is late [s]."""
+        """Return the delay of the smoothed wrench [s]."""
         return 0.5 * (self.count - 1) / rate
 
     def start_tare(self) -> None:
@@ -224,10 +225,10 @@ class WrenchChain:
         self._taring = []
 
     def end_tare(self, least: int = 20) -> np.ndarray:
-        """Take the mean of what was collected as bias; returns its standard error [6].
+        """Take the mean of the collected readings as bias; returns its standard error [6].
 
         Raises:
-            WorkError: too few readings, or the gripper was touched: they spread over their noise.
+            WorkError: too few readings, or the gripper was touched: their spread exceeds the noise.
         """
         readings, self._taring = np.array(self._taring or []), None
         if len(readings) < least:
@@ -262,8 +263,7 @@ class WrenchChain:
         return now, sum(self._recent) / len(self._recent)
 
     def between(self, sample: Sample, reading: Reading) -> np.ndarray:
-        """Return the wrench of a reading that came after ``sample``, shape [6]; it is not
-        averaged.
+        """Return the wrench of a reading that arrived after ``sample``, shape [6], not averaged.
         """
         flange = frame_of(sample.pose) @ self._from_tool
         return self._on_branch(reading.wrench - self._weight(flange), reading, flange)
@@ -278,7 +278,7 @@ class WrenchChain:
         return -turned_wrench(rotation, raw - self.bias, lever)
 
     def _weight(self, flange: np.ndarray) -> np.ndarray:
-        """The gripper's weight where the sensor does not take it away itself, flange frame."""
+        """The gripper's weight if the sensor does not subtract it itself, flange frame."""
         if not self._own_weight:
             return np.zeros(6)
         tool = self.cell.tool
@@ -286,7 +286,7 @@ class WrenchChain:
 
 
 def parsed_message(message: str) -> np.ndarray | None:
-    """Return the six numbers of one FT300 message (without brackets), or None if it is torn."""
+    """Return the six numbers of one FT300 message (no brackets), or None if it is incomplete."""
     parts = message.split(",")
     if len(parts) != 6:
         return None

@@ -1,11 +1,12 @@
-"""The guard: one object that every motion of the robot passes.
+"""The guard: one object that checks every motion of the robot.
 
-It is a pure state machine: samples and wishes go in, decisions come out; it opens no connection
-and reads no clock. After a stop nothing goes on by itself: a person acknowledges it and chooses.
+It is a pure state machine: samples and requests go in, decisions come out; it opens no connection
+and reads no clock. After a stop nothing continues automatically: a person acknowledges it and
+chooses.
 
 This is software on a computer that can stall, behind a network that can break. It is no certified
 safety function and claims no standard: the controller's own limits and the button on the pendant
-are what protects people.
+protect people.
 """
 
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,7 @@ _FELL = "the predicted force dropped suddenly: the branch slipped, broke or came
 
 
 class State(Enum):
-    """What the guard allows."""
+    """What the guard currently allows."""
 
     IDLE = "idle"
     MOVING = "moving"
@@ -42,7 +43,7 @@ class State(Enum):
 
 
 class Verdict(Enum):
-    """What is to be done after a sample."""
+    """Action to take after a sample."""
 
     GO = "go"
     PAUSE = "pause"
@@ -72,22 +73,22 @@ class GuardSettings:
     """Limits of the guard.
 
     Attributes:
-        limits: The cell's. The guard takes what the arm's table allows of them, whoever set them.
-        workspace: Box that the grasp stays in, branch frame, or None.
+        limits: Limits of the cell. The guard reduces them to what the arm's table allows.
+        workspace: Box that contains the grasp, branch frame, or None.
         joint_limits: [rad], shape [6, 2].
         longest_silence: Age at which data is lost [s].
-        frozen_time: How long a wrench may repeat to the last digit [s]; a living sensor's noise
-            never does.
+        frozen_time: Longest time for which a wrench may repeat to the last digit [s]; a working
+            sensor's noise never does.
         filter_time: Time constant of the force that is compared with the predicted one [s]. The
-            hard limits look at every reading as it comes.
-        off_path: Distance from where the robot was sent [m].
+            hard limits apply to every single reading.
+        off_path: Largest distance from the target [m].
         lost_share: Fraction of its force that a held branch loses when it slips or breaks.
         loss_time: Time in which such a loss counts as sudden [s].
-        least_force: Force below which a loss is not told from noise [N].
-        largest_torque_error: Of the torque against the predicted one [N m].
-        relief_way: Way of a retreat on which a force over the soft limit falls by ``least_force``
-            at least [m].
-        relief_time: The same for a slow one [s].
+        least_force: Force below which a loss cannot be distinguished from noise [N].
+        largest_torque_error: Largest difference between the torque and the predicted one [N m].
+        relief_way: Path of a retreat over which a force above the soft limit falls by at least
+            ``least_force`` [m].
+        relief_time: The same for a slow retreat [s].
     """
 
     limits: LimitsEntry
@@ -107,12 +108,12 @@ class GuardSettings:
 
 @dataclass
 class _Relief:
-    """What a retreat has brought down of what was over its limit.
+    """Progress of a retreat in reducing the values that exceeded their limits.
 
     Attributes:
-        force, torque: Least ones since it began [N], [N m].
-        excess: Least excess over each limit of the arm's place.
-        marked_force, marked_clock, marked_grasp: From where a fall is measured next.
+        force, torque: Least values since it began [N], [N m].
+        excess: Least excess over each limit of the arm's position.
+        marked_force, marked_clock, marked_grasp: Start of the next measurement of a fall.
     """
 
     force: float
@@ -125,7 +126,7 @@ class _Relief:
 
 @dataclass
 class _Memory:
-    """What the guard remembers of the last samples."""
+    """The guard's record of the last samples."""
 
     clock: float | None = None
     raw: np.ndarray | None = None
@@ -143,8 +144,8 @@ class Guard:
     """Watches one robot.
 
     Attributes:
-        state: What it allows now.
-        reason: Why it stopped or paused last.
+        state: What it currently allows.
+        reason: Reason of its last stop or pause.
     """
 
     def __init__(self, arm: Arm, settings: GuardSettings, rate: float):
@@ -159,17 +160,17 @@ class Guard:
         self._memory = _Memory()
         self._is_tared = False
 
-    # What a person does
+    # Actions of a person
 
     def tared(self) -> None:
-        """The force sensor has been tared: from now on its limits hold."""
+        """The force sensor has been tared: from now on its limits apply."""
         self._is_tared = True
 
     def begin(self, *, by_joints: bool = False) -> None:
         """Allow a motion.
 
         Args:
-            by_joints: It goes from joint angles to joint angles: singularities are no limit.
+            by_joints: The motion is in joint space: singularities are no limit.
 
         Raises:
             SafetyStop: after a stop that was not acknowledged, while one is paused, or before the
@@ -186,14 +187,14 @@ class Guard:
         self._memory = _Memory(by_joints=by_joints)
 
     def begin_retreat(self, wrench: np.ndarray) -> None:
-        """Allow a motion back along the way that was followed: a person has chosen it.
+        """Allow a motion back along the path that was followed: a person has chosen it.
 
-        It is needed where something is over its limit. So each limit that is passed when it begins
-        gives way to the least value since then, plus what is allowed of a force that differs from
-        the predicted one: the motion stops where a force rises, or does not fall.
+        It is needed when a value exceeds its limit. So each limit exceeded at its start is replaced
+        by the least value since then, plus the allowed difference between measured and predicted
+        force. The motion stops if a force rises, or does not fall.
 
         Args:
-            wrench: What the gripper exerts on the branch, smoothed [N, N m], shape [6].
+            wrench: Wrench of the gripper on the branch, smoothed [N, N m], shape [6].
 
         Raises:
             SafetyStop: the robot moves, or the force is not known.
@@ -215,7 +216,7 @@ class Guard:
             self.state = State.IDLE
 
     def resume(self) -> None:
-        """Go on after a pause.
+        """Continue after a pause.
 
         Raises:
             SafetyStop: it is not paused.
@@ -227,14 +228,14 @@ class Guard:
         self._memory.peak = 0.0
 
     def acknowledge(self) -> None:
-        """A person has seen the stop; a new motion may be asked for."""
+        """A person has seen the stop; a new motion may be requested."""
         if self.state in (State.STOPPED, State.PAUSED):
             self.state = State.IDLE
 
-    # What happens
+    # Events
 
     def silence(self, age: float) -> Decision:
-        """No sample has come for ``age`` [s]."""
+        """No sample has arrived for ``age`` [s]."""
         if age > self._settings.longest_silence:
             return self._stop("no data from the robot [s]", age, self._settings.longest_silence)
         return _GO
@@ -249,15 +250,15 @@ class Guard:
         """Judge a sample.
 
         Args:
-            wrench: What the gripper exerts on the branch by the sensor in use, tared, branch
-                frame [N, N m], shape [6].
-            raw: The reading as it came and turned to the flange's axes, shape [2, 6]. A frozen
-                sensor repeats one of them to the last digit, whatever the robot turns.
-            expected: The same as the model predicts it, or None.
-            doubt: Covariance of that prediction, shape [6, 6]: what is allowed of the difference is
-                wider by twice its deviations, never by more than the soft force limit.
-            grasp: Where the grasp is, branch frame [m], shape [3].
-            sent: Where the tool was sent to be by now, base frame [m], shape [3], or None.
+            wrench: Wrench of the gripper on the branch by the sensor in use, tared, branch frame
+                [N, N m], shape [6].
+            raw: The reading as received and rotated to the flange's axes, shape [2, 6]. A frozen
+                sensor repeats one of them to the last digit, however the robot rotates.
+            expected: The same wrench as predicted by the model, or None.
+            doubt: Covariance of that prediction, shape [6, 6]: it widens the allowed difference by
+                twice its standard deviations, but never by more than the soft force limit.
+            grasp: Position of the grasp, branch frame [m], shape [3].
+            sent: Target of the tool at this time, base frame [m], shape [3], or None.
         """
         last, self._memory.grasp = self._memory.grasp, grasp
         self._memory.way = None if last is None or grasp is None else grasp - last
@@ -280,10 +281,10 @@ class Guard:
         return _GO
 
     def permit(self, current: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
-        """Return a target [6] that keeps the speed limits, on the way from ``current`` to it.
+        """Return a target [6] that keeps the speed limits, on the path from ``current`` to it.
 
         Raises:
-            SafetyStop: nothing may move now, or the target is no pose.
+            SafetyStop: no motion is allowed now, or the target is no pose.
         """
         if self.state != State.MOVING:
             raise SafetyStop(f"The robot is {self.state.value}.", self.reason, "")
@@ -327,7 +328,7 @@ class Guard:
         if not np.isfinite(numbers).all():
             return self._stop("a sensor gives no number")
         memory = self._memory
-        # Turning a wrench to other axes and back leaves rounding in its last digits.
+        # Rotating a wrench to other axes and back leaves rounding errors in its last digits.
         if memory.raw is None or np.abs(raw - memory.raw).max(axis=1).min() > _SAME:
             memory.frozen_since = sample.clock
         memory.raw = raw.copy()
@@ -337,10 +338,10 @@ class Guard:
         return self.feel(wrench)
 
     def feel(self, wrench: np.ndarray) -> Decision:
-        """Judge a force [6] by the hard limits alone: it came between two samples."""
+        """Judge a force [6] by the hard limits alone: it arrived between two samples."""
         limits = self._settings.limits
         if not self._is_tared:
-            # Nothing moves yet, and what a sensor shows before its tare is its bias.
+            # No motion yet, and before its tare a sensor shows its bias.
             return _GO
         if np.isnan(wrench).any():
             return self._stop("a sensor gives no number")
@@ -366,7 +367,7 @@ class Guard:
 
     def _check_relief(self, relief: _Relief, sample: Sample, wrench: np.ndarray,
                       grasp: np.ndarray | None) -> Decision:
-        """Judge a sample of a retreat: what is over a limit falls, or it stops."""
+        """Judge a sample of a retreat: a value over its limit falls, or the retreat stops."""
         settings, limits = self._settings, self._settings.limits
         smooth = self._filtered(wrench)
         force, torque = length(smooth[:3]), length(smooth[3:])
@@ -389,8 +390,9 @@ class Guard:
         return _GO
 
     def _is_over(self, name: str, excess: float, slack: float) -> bool:
-        """Whether the arm is past a limit of its place by ``excess``; on a retreat it may be, as
-        long as that does not grow by more than ``slack``."""
+        """Whether a limit of the arm's position is exceeded by ``excess``; a retreat allows this
+        while the excess does not grow by more than ``slack``.
+        """
         relief = self._memory.relief
         if excess <= 0 or relief is None:
             return excess > 0
@@ -398,7 +400,7 @@ class Guard:
         return excess > least + slack
 
     def _filtered(self, wrench: np.ndarray) -> np.ndarray:
-        """Return the force [6] that is compared with the predicted one; ``wrench`` enters it."""
+        """Return the force [6] to compare with the predicted one; ``wrench`` updates it."""
         kept = np.exp(-self._step / self._settings.filter_time)
         before = wrench if self._memory.filtered is None else self._memory.filtered
         self._memory.filtered = kept * before + (1 - kept) * wrench
@@ -438,13 +440,14 @@ class Guard:
         if self.state not in (State.MOVING, State.PAUSED):
             return _GO
         if memory.relief is not None:
-            # A force that falls at once is what a retreat is for.
+            # A sudden fall of the force is the purpose of a retreat.
             return _GO
         filtered = self._filtered(wrench)
         force = length(filtered[:3])
         if expected is None:
-            # Nothing is predicted while E is being measured: a sudden loss still tells a slip, but
-            # not while the branch is let back and pulls the way that the gripper goes.
+            # There is no prediction while E is being measured. A sudden loss still indicates a
+            # slip, but not while the branch is released and pulls in the gripper's direction of
+            # motion.
             if memory.way is not None and float(memory.way @ filtered[:3]) < 0:
                 memory.peak = force
             memory.peak = max(memory.peak * np.exp(-self._step / settings.loss_time), force)
@@ -478,7 +481,7 @@ class Guard:
         return _GO
 
     def _usual_off(self, off: np.ndarray) -> np.ndarray:
-        """Return the usual difference to the expected force [3] up to now; ``off`` enters it."""
+        """Return the usual difference to the expected force [3] so far; ``off`` then updates it."""
         memory = self._memory
         before = off if memory.usual_off is None else memory.usual_off
         kept = np.exp(-self._step / self._settings.loss_time)
@@ -486,11 +489,11 @@ class Guard:
         return before
 
     def _force_named(self, off: np.ndarray, expected: np.ndarray, before: np.ndarray) -> str:
-        """Return what a force [3] beside the expected one [3] is called: what it most often is.
+        """Return the most probable name of a difference to the expected force [3].
 
         Args:
             off: The difference, shape [3].
-            before: What it usually was up to now, shape [3].
+            before: The usual difference so far, shape [3].
         """
         wanted, missing = length(expected), -float(off @ expected)
         if wanted <= self._settings.least_force:
@@ -511,9 +514,10 @@ class Guard:
 
 
 def _allowed(off: np.ndarray, covariance: np.ndarray, least: float, most: float) -> float:
-    """How large a difference may be in the direction of ``off`` [3], which is not 0.
+    """Largest allowed difference in the direction of ``off`` [3], which is not 0.
 
-    The border is an ellipsoid: ``least``, wider by deviations of the prediction up to ``most``.
+    The bound is an ellipsoid: ``least``, widened by standard deviations of the prediction up to
+    ``most``.
     """
     squares, axes = np.linalg.eigh(covariance)
     radii = least**2 + np.minimum(_DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)

@@ -1,4 +1,4 @@
-"""What the driver feels: each sample's wrench, judged by the guard and sent to the parent."""
+"""The driver's force samples: each wrench, judged by the guard and sent to the parent."""
 
 import time
 from collections.abc import Callable
@@ -24,11 +24,11 @@ _UPPER = np.triu_indices(3)
 
 
 class Senses:
-    """The force sensor, its tare, and what is expected of the branch.
+    """The force sensor, its tare, and the expected wrench of the branch.
 
     Attributes:
-        smooth: Wrench that was smoothed last, branch frame [N, N m], shape [6].
-        way_back: Where the arm has come.
+        smooth: Latest smoothed wrench, branch frame [N, N m], shape [6].
+        way_back: The arm's path so far.
     """
 
     def __init__(self, cell: Cell, control: ArmControl, sensor: ForceTorqueSensor, guard: Guard,
@@ -43,7 +43,7 @@ class Senses:
         self._is_tared = False
         self._recalls_tare = followed is not None and followed.bias is not None
         if followed is not None and followed.bias is not None:
-            # What a program before this one found: a retreat is judged by it.
+            # The tare of an earlier program: a retreat is judged by it.
             self._chain.bias = followed.bias
         self.smooth = _NOTHING
         self._held_for: np.ndarray | None = None
@@ -54,7 +54,7 @@ class Senses:
 
     @property
     def connections(self) -> tuple:
-        """What the sensor's readings come through, where they do so beside the samples."""
+        """Connections of the sensor's readings, if they are separate from the samples."""
         return self._sensor.connections
 
     def begin(self, sample: Sample, trajectory: Trajectory) -> None:
@@ -62,7 +62,7 @@ class Senses:
         self.way_back.begin(sample, trajectory)
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
         if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
-            # Here the gripper closed on the resting branch: ways are measured from here.
+            # Here the gripper closed on the resting branch: displacements are measured from here.
             self._held_for, self._held_at = rest, sample.pose.copy()
 
     def look(self, sample: Sample) -> None:
@@ -73,13 +73,13 @@ class Senses:
             self._under_way.judge(self._guard.event(str(error)))
             return
         now, self.smooth = self._chain.wrench(sample, reading)
-        # First what must not wait for the rest.
+        # First the part that must not wait for the rest.
         self._under_way.judge(self._guard.feel(now), sample)
         following = self._under_way.following
         expected = uncertainty = sent = None
         if following is not None:
             self.way_back.note(sample)
-            # The arm is where its target was a look-ahead ago.
+            # The arm is at the target of one look-ahead ago.
             behind = max(following.time - self._lookahead * following.rate, 0.0)
             planned = following.trajectory.pose(behind)
             sent = planned[:3]
@@ -103,13 +103,13 @@ class Senses:
             self._end_tare()
 
     def feel(self, sample: Sample) -> None:
-        """A force that came between two samples need not wait for the next: hard limits stop."""
+        """A force that arrived between two samples need not wait for the next: hard limits stop."""
         if not self._sensor.connections:
             return
         try:
             reading = self._sensor.read(sample)
         except ConnectionError as error:
-            # A closed connection always has something to read: it would never let us wait again.
+            # A closed connection is always readable: select would never wait again.
             self._sensor.connections = ()
             self._under_way.judge(self._guard.event(str(error)))
             return
@@ -118,7 +118,7 @@ class Senses:
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
                   pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """What the branch is felt as where the gripper is, which is not quite where it was sent."""
+        """The expected wrench at the gripper's actual position, a little off the target."""
         felt = trajectory.felt(time)
         if felt is None or trajectory.expected is None:
             return None, None
@@ -130,7 +130,7 @@ class Senses:
         return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
 
     def begin_tare(self, sample: Sample, seconds: float) -> None:
-        """Take the force of the next ``seconds`` [s] as nothing.
+        """Tare the force over the next ``seconds`` [s].
 
         Raises:
             SafetyStop: the robot moves.
@@ -143,7 +143,8 @@ class Senses:
         self._tare_until = sample.clock + seconds
 
     def recall_tare(self) -> None:
-        """Judge forces by the tare of the program that followed the way, if none was done since."""
+        """Judge forces by the tare of the program that followed the path, if none was done since.
+        """
         if self._recalls_tare and not self._is_tared:
             self._guard.tared()
 
@@ -170,6 +171,6 @@ class Senses:
             self._batch, self._batch_since = [], now
 
     def close(self) -> None:
-        """Let go of the sensor, and see that the way is on disk."""
+        """Release the sensor, and make sure that the path is on disk."""
         self.way_file.close()
         self._sensor.close()

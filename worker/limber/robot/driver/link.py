@@ -1,4 +1,4 @@
-"""The other side of the driver's pipe: what `record`, `execute` and the session hold."""
+"""The parent's side of the driver's pipe: used by `record`, `execute` and the session."""
 
 import json
 import subprocess
@@ -34,8 +34,9 @@ COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
            "expected_tx_nm", "expected_ty_nm", "expected_tz_nm",
            "expected_xx_n2", "expected_xy_n2", "expected_xz_n2",
            "expected_yy_n2", "expected_yz_n2", "expected_zz_n2")
-"""What a row of samples holds: grasp pose and wrench on the branch, in the branch's frame; the
-last six are the covariance of the expected force."""
+"""Columns of a row of samples: grasp pose and wrench on the branch, in the branch's frame; the last
+six are the covariance of the expected force.
+"""
 
 
 class RobotLink:
@@ -43,8 +44,8 @@ class RobotLink:
 
     Args:
         cell: The robot's cell.
-        on_samples: Called with each batch of samples, shape [n, 37] as in :data:`COLUMNS`, from a
-            thread of its own.
+        on_samples: Called with each batch of samples, shape [n, 37] as in :data:`COLUMNS`, from its
+            own thread.
         python: Interpreter that has ur-rtde; by default this one.
 
     Raises:
@@ -84,7 +85,7 @@ class RobotLink:
 
     @property
     def has_ended(self) -> bool:
-        """Whether its process is gone; another link can then take its place."""
+        """Whether its process has ended; another link can then replace it."""
         return self._ended
 
     def __enter__(self) -> "RobotLink":
@@ -94,10 +95,10 @@ class RobotLink:
         self.close()
 
     def wait_for_samples(self, seconds: float = 5.0) -> np.ndarray:
-        """Return the last of the next samples that come, shape [37] as in :data:`COLUMNS`.
+        """Return the latest of the next samples, shape [37] as in :data:`COLUMNS`.
 
         Raises:
-            WorkError: none come.
+            WorkError: no samples arrive.
         """
         self._sampled.clear()
         if not self._sampled.wait(seconds):
@@ -106,7 +107,7 @@ class RobotLink:
         return self._latest
 
     def tare(self, seconds: float = 0.5) -> dict[str, Any]:
-        """Take the present force as nothing; the gripper hangs free and still."""
+        """Tare the present force; the gripper hangs free and still."""
         self._order(order="tare", seconds=seconds)
         return self.wait("tared", seconds=seconds + 5.0)
 
@@ -139,16 +140,16 @@ class RobotLink:
         return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
 
     def retreat(self) -> dict[str, Any]:
-        """Go back the way it came, slower; a person has asked for it.
+        """Retreat along its path, slower; a person has asked for it.
 
         Returns:
-            The event that ended it: ``reached``, or ``stopped`` with its reason, as where the force
-            does not fall on the way.
+            The event that ended it: ``reached``, or ``stopped`` with its reason, for example
+            because the force does not fall on the path.
 
         Raises:
             SafetyStop: there is no path back, or the arm left it. WorkError: the driver has ended.
         """
-        # Until the arm stands, and the smoothed force is that of where it stands.
+        # Until the arm is at rest, and the smoothed force is that of its position.
         time.sleep(_STANDS_SECONDS)
         self._order(order="retreat")
         self.wait("started", seconds=5.0)
@@ -160,7 +161,7 @@ class RobotLink:
         self.wait("acknowledged", seconds=5.0)
 
     def resume(self) -> dict[str, Any]:
-        """Go on after a pause, to the end of the trajectory."""
+        """Continue after a pause, to the end of the trajectory."""
         self._order(order="resume")
         self.wait("resumed", seconds=5.0)
         return self.wait("reached", "stopped", "paused", seconds=600.0)
@@ -219,14 +220,14 @@ class RobotLink:
                          "Check the robot; its own watchdog has stopped it.")
 
     def abandon(self) -> None:
-        """Close the pipe without a word, as a program does that is killed."""
+        """Close the pipe without a message, as a killed program does."""
         self._closing.set()
         with self._write_lock:
             assert self.process.stdin is not None
             self.process.stdin.close()
 
     def close(self) -> None:
-        """Stop what moves and end the process; its last warnings are kept."""
+        """Stop the motion and end the process; its last warnings are kept."""
         self._closing.set()
         with self._write_lock:
             end_by_closing(self.process)
@@ -275,7 +276,7 @@ class RobotLink:
             self._stop_from_outside()
 
     def _stop_from_outside(self) -> None:
-        """The driver got no answer and could send no stop: try the dashboard anew."""
+        """The driver got no answer and could send no stop: try the dashboard again."""
         sent = stop_from_outside(self._cell, _DASHBOARD_SECONDS)
         self.warnings.append("The driver got no answer from the controller. The dashboard was "
                              "asked to stop the arm as well." if sent else

@@ -1,7 +1,7 @@
-"""The force while a robot moves, for whoever watches: a small file that is there meanwhile.
+"""The force while a robot moves, for observers: a small file that exists meanwhile.
 
-It is rewritten ten times a second and read by the add-on; nothing is ordered by it, and nothing
-depends on its being read.
+It is rewritten ten times a second and read by the add-on. It orders nothing, and nothing depends on
+its being read.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from limber.core.files.temporary_names import owned_name
 from limber.robot.driver.link import COLUMNS
 
 FILE = ".robot-live.json"
-"""In the branch folder, beside the lock of whoever moves the robot."""
+"""In the branch folder, beside the lock of the program that moves the robot."""
 FORMAT = 1
 _INTERVAL_SECONDS = 0.1
 _KEPT = 150
-"""Forces that the file carries, the last quarter of a minute."""
+"""Number of forces in the file, those of the last quarter of a minute."""
 _FORCE, _SMOOTH, _EXPECTED = (slice(COLUMNS.index(name), COLUMNS.index(name) + 3)
                               for name in ("fx_n", "smooth_fx_n", "expected_fx_n"))
 
 
 class LiveForce:
-    """Writes what the gripper feels; a context manager, which takes the file away at its end.
+    """Writes the gripper's force; a context manager, which removes the file at its end.
 
     Args:
         folder: The branch folder.
-        title: What is done, for a person.
-        limit: At which the guard pauses [N].
+        title: Title of the motion, for a person.
+        limit: Force at which the guard pauses [N].
     """
 
     def __init__(self, folder: Path, title: str, limit: float):
@@ -50,11 +50,11 @@ class LiveForce:
         self._path.unlink(missing_ok=True)
 
     def at(self, step: str) -> None:
-        """Say what the robot is at."""
+        """State the robot's current action."""
         self._step = step
 
     def take(self, samples: np.ndarray) -> None:
-        """Take a batch of samples [n, 37], as :data:`limber.robot.driver.link.COLUMNS` says."""
+        """Take a batch of samples [n, 37], as in :data:`limber.robot.driver.link.COLUMNS`."""
         forces = np.linalg.norm(samples[:, _SMOOTH], axis=1)
         forces = np.where(np.isfinite(forces), forces,
                           np.linalg.norm(samples[:, _FORCE], axis=1))
@@ -70,7 +70,7 @@ class LiveForce:
             self._write()
 
     def _write(self) -> None:
-        """Without waiting for the disk: samples come in the meantime, and it is gone soon."""
+        """Without waiting for the disk: samples arrive meanwhile, and the file is short-lived."""
         content = {"format": FORMAT, "title": self._title, "step": self._step,
                    "force_n": _told(self._force), "expected_n": _told(self._expected),
                    "peak_n": _told(self._peak), "limit_n": self._limit, "at": time.time(),
@@ -80,8 +80,8 @@ class LiveForce:
             temporary.write_text(json.dumps(content), encoding="utf-8")
             os.replace(temporary, self._path)
         except OSError:
-            # A full disk, or a reader that holds it on Windows: the samples themselves go on, and
-            # the recording says what is wrong with the disk.
+            # A full disk, or a reader that holds it on Windows: the samples continue, and the
+            # recording reports the disk's error.
             temporary.unlink(missing_ok=True)
 
 

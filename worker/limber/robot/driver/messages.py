@@ -11,11 +11,11 @@ from limber.robot.driver.real_time import claim_real_time
 class Words:
     """The events of the driver, written by a separate thread.
 
-    A program that is slow to read fills its pipe within a third of a second; a loop that waited
-    for it would starve the controller's watchdog.
+    If the parent is slow to read, the pipe fills within a third of a second. A loop that waited for
+    it would starve the controller's watchdog.
 
     Args:
-        out: Where events go, a JSON object a line.
+        out: Destination of events, one JSON object a line.
     """
 
     def __init__(self, out: TextIO):
@@ -34,12 +34,12 @@ class Words:
         self._thread.join(seconds)
 
     def _write(self) -> None:
-        # It shares the interpreter's lock with the loop, which must not wait for it to be run.
+        # It shares the interpreter's lock with the loop, which must not wait for its turn.
         claim_real_time()
         while (line := self._lines.get()) is not None:
             try:
                 self._out.write(line + "\n")
                 self._out.flush()
             except OSError:
-                # Nobody listens; that the parent is gone the end of the orders tells.
+                # The parent does not listen; the end of the orders shows that it has ended.
                 return

@@ -1,4 +1,4 @@
-"""Real-time priority for the loops that talk to a robot, where the system grants it."""
+"""Real-time priority for the loops that talk to a robot, if the system grants it."""
 
 import ctypes
 import gc
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 VIRTUAL_ROBOT_PRIORITY = 25
-"""Before the driver it is driven by: a real controller has a computer of its own."""
+"""Before the driver that controls it: a real controller has a computer of its own."""
 
 _WAKING = Path("/dev/cpu_dma_latency")
 _ALL_PRESENT = 1  # MCL_CURRENT: not what comes later, which could then be refused
@@ -17,9 +17,9 @@ _ALL_PRESENT = 1  # MCL_CURRENT: not what comes later, which could then be refus
 def claim_real_time(priority: int = 20) -> bool:
     """Ask for round-robin real-time scheduling; returns whether it was granted.
 
-    Linux grants it to root and to users with a real-time limit. Without it other programs can
-    hold the loop up for tens of milliseconds, which ends in a stop. It is not asked for where this
-    process may use a single processor: the loop would take it from the program that gives orders.
+    Linux grants it to root and to users with a real-time limit. Without it other programs can delay
+    the loop by tens of milliseconds, which causes a stop. It is not requested if this process may
+    use only one processor: the loop would take it from the program that gives orders.
     """
     if not hasattr(os, "sched_setscheduler") or not may_use_two_processors():
         return False
@@ -38,15 +38,15 @@ def may_use_two_processors() -> bool:
 
 
 def spare_what_is_loaded() -> bool:
-    """Leave what this process holds by now out of every later search for garbage, and in memory.
+    """Exclude the present objects from every later garbage collection, and keep them in memory.
 
-    A whole search goes through all that the libraries loaded: 20 to 70 ms in a loop that must
-    not pause for 50. After this it goes through what came since, which is little. And a system
-    may take back the pages of code that was not used for a minute, as that for a motion while the
-    arm stands: the first who needs it waits for the disk.
+    A full collection visits everything that the libraries loaded: 20 to 70 ms in a loop that must
+    not pause for 50. After this it visits only newer objects, which are few. The system may also
+    evict code pages unused for a minute, such as those of a motion while the arm is at rest.
+    Their first use would then wait for the disk.
 
     Returns:
-        Whether the pages stay; Linux grants it to root and to users who may lock so much memory.
+        Whether the pages stay; Linux grants it to root and to users who may lock that much memory.
     """
     gc.collect()
     gc.freeze()
@@ -56,15 +56,15 @@ def spare_what_is_loaded() -> bool:
 def keep_awake() -> bool:
     """Keep the computer's processors from sleeping while they idle, until this process ends.
 
-    One that sleeps wakes late: by a fraction of a millisecond, and that of a virtual machine when
-    its host gives it back, which was 5 to 50 ms and made a loop that wakes every 2 ms too late
-    several times a second. Linux' own way to say so (``Documentation/power/pm_qos_interface``).
+    A sleeping processor wakes late: by a fraction of a millisecond, and that of a virtual machine
+    when its host returns it. That took 5 to 50 ms and delayed a loop with a cycle of 2 ms several
+    times a second. This is Linux's own interface for it (``Documentation/power/pm_qos_interface``).
 
     Returns:
-        Whether it was granted: to root, and to who may write to the device.
+        Whether it was granted: to root, and to users who may write to the device.
     """
     try:
-        # Left open on purpose: the request stands as long as the file is.
+        # Left open on purpose: the request holds as long as the file is open.
         device = os.open(_WAKING, os.O_WRONLY)
         os.write(device, struct.pack("i", 0))
     except OSError:

@@ -1,4 +1,4 @@
-"""A controller of Universal Robots as the driver's loop moves an arm: RTDE, ur-rtde, dashboard."""
+"""A controller of Universal Robots for the driver's loop: RTDE, ur-rtde, dashboard."""
 
 from importlib import import_module
 from typing import Any
@@ -25,7 +25,7 @@ class UrControl(SampleStream):
         cell: Robot, tool and gripper.
 
     Raises:
-        InputError: it is another robot. SafetyStop: nobody may move it now. WorkError: no data.
+        InputError: it is another robot. SafetyStop: it must not be moved now. WorkError: no data.
     """
 
     lookahead = 0.06
@@ -46,7 +46,7 @@ class UrControl(SampleStream):
         import_module("rtde_control")
 
     def _identified(self) -> dict[str, Any]:
-        """What the controller reports about itself, after a check against the cell."""
+        """The controller's description, after a check against the cell."""
         version = ".".join(map(str, self.version[:3]))
         arm, calibrated = self._cell.arm, self._cell.robot.version
         if self.rate != arm.rate:
@@ -81,7 +81,7 @@ class UrControl(SampleStream):
         """Connect with ur-rtde, set tool, payload and watchdog.
 
         Raises:
-            SafetyStop: another program runs. WorkError: the robot does not take its settings.
+            SafetyStop: another program runs. WorkError: the robot rejects its settings.
             RuntimeError: ur-rtde's own.
         """
         from rtde_control import RTDEControlInterface
@@ -107,11 +107,11 @@ class UrControl(SampleStream):
         self.watch()
 
     def watch(self) -> None:
-        """Let the controller end its program when it hears nothing for :attr:`silence`."""
+        """Let the controller end its program when it receives nothing for :attr:`silence`."""
         _require(self._control.setWatchdog(_WATCHDOG_HZ), "start its watchdog")
 
     def program_runs(self) -> bool:
-        """Whether there is a program that takes targets."""
+        """Whether a program runs that accepts targets."""
         return self._control.isProgramRunning()
 
     def start_program(self) -> bool:
@@ -131,18 +131,18 @@ class UrControl(SampleStream):
         return bool(self._control.servoStop(_STOP_DECELERATION))
 
     def stop_at_once(self) -> None:
-        """Stop by the dashboard: it waits for no step of the controller, nor for the program."""
+        """Stop by the dashboard: it depends on no step of the controller, nor on the program."""
         self._dashboard.stop()
 
     def keep_alive(self) -> bool:
-        """Tell the controller that this process lives."""
+        """Signal to the controller that this process is alive."""
         return self._control.kickWatchdog()
 
     def grip(self, close: bool) -> None:
         """Close or open the gripper.
 
         Raises:
-            InputError: it is not driven from here. WorkError: the robot does not.
+            InputError: its gripper is not driven from here. WorkError: the robot does not do it.
         """
         tool = self._cell.tool
         if self._outputs is None:
@@ -152,12 +152,12 @@ class UrControl(SampleStream):
                  "drive its gripper")
 
     def put_back(self) -> str | None:
-        """Set tool and payload as they were; returns in words where that failed."""
+        """Restore tool and payload; returns in words what failed."""
         if not self._before:
             return None
         before, self._before = self._before, {}
         try:
-            # A program that was stopped takes nothing, and is not started for this alone.
+            # A stopped program accepts nothing, and is not started for this alone.
             done = (self._control.isProgramRunning() and "payload" in before
                     and self._control.setTcp(before["tool"])
                     and self._control.setPayload(*before["payload"]))
@@ -169,7 +169,7 @@ class UrControl(SampleStream):
             "needs others.")
 
     def close(self) -> None:
-        """Let go of the robot."""
+        """Release the robot."""
         for interface in (self._outputs, self._control):
             if interface is not None:
                 interface.disconnect()
@@ -178,7 +178,7 @@ class UrControl(SampleStream):
 
 
 def _first_sample(stream: SampleStream) -> Sample:
-    """Where the arm stands, if it may be moved."""
+    """The first sample, if the arm may be moved."""
     samples: list[Sample] = stream.read(1.0)
     if not samples:
         raise WorkError("The robot sends no data.", "", "Restart its controller.")
@@ -195,7 +195,7 @@ def _first_sample(stream: SampleStream) -> Sample:
 
 
 def _require(done: bool, what: str) -> None:
-    """Raise a WorkError where an order of ur-rtde returned no success."""
+    """Raise a WorkError if an order of ur-rtde returned no success."""
     if not done:
         raise WorkError(f"The robot did not {what}.", "It returned no success.",
                         "See the controller's log, and restart the program.")

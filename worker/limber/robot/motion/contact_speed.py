@@ -1,4 +1,4 @@
-"""How fast a gripper may go so that a contact stays below the hard limit until the arm stands."""
+"""Speed at which a contact stays below the hard limit until the arm is at rest."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ from limber.core.errors import InputError
 from limber.robot.cell.cell import Cell
 
 OVER_HARD = 1.1
-"""Of the hard limit: what a contact may come to."""
+"""Largest contact force as a multiple of the hard limit."""
 
-# From a force to the brake: half a smoothing of the sensor's own, what the loop takes, and two
-# steps of the controller. Measured with the virtual one: 4 ms at 500 Hz, 14 ms at 125 Hz.
+# Time from a force to the brake: half of the sensor's own smoothing, the loop's time, and two steps
+# of the controller. Measured with the virtual one: 4 ms at 500 Hz, 14 ms at 125 Hz.
 _LOOP_SECONDS = 0.002
 _STEPS = 2.0
 _FT300_SECONDS = 0.010  # between two of its readings
-# The joints brake at 8 rad/s^2; the joint that moves a gripper is seldom nearer than this.
+# The joints brake at 8 rad/s^2; the joint that moves a gripper is rarely nearer than this.
 _BRAKING_M_S2 = 8.0 * 0.3
 _SLOWEST_M_S = 1e-3
 
@@ -27,11 +27,11 @@ def reaction_seconds(cell: Cell) -> float:
 def contact_speed(cell: Cell, stiffness: float) -> float:
     """Return the greatest speed [m/s] at which a contact stays below the hard limit plus a tenth.
 
-    The arm brakes from the soft limit on: v t + v^2 / 2a of way, times the stiffness, may add no
-    more than is between the two.
+    The arm brakes from the soft limit on. The path v t + v^2 / 2a times the stiffness may add no
+    more than the difference between the two.
 
     Args:
-        stiffness: Of the contact [N/m].
+        stiffness: Stiffness of the contact [N/m].
 
     Raises:
         InputError: not even a millimetre a second is slow enough.
@@ -50,7 +50,7 @@ def contact_speed(cell: Cell, stiffness: float) -> float:
 
 
 def speed_within(cell: Cell, speed: float) -> float:
-    """Return ``speed`` [m/s], or less where the cell states a contact that needs less.
+    """Return ``speed`` [m/s], or less if the cell states a contact that requires it.
 
     Raises:
         InputError: as :func:`contact_speed`.

@@ -18,20 +18,20 @@ _TURNS = 12  # directions about the branch from which the gripper may come
 _MOST_TRIED = 24  # ways of taking the path that are held against obstacles
 
 Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
-"""What is in the way of flange frames [n, 4, 4] at joint angles [n, joints]; None: nothing."""
+"""Obstacles to flange frames [n, 4, 4] at joint angles [n, joints]; None if there are none."""
 
 
 @dataclass(frozen=True)
 class RobotMotion:
-    """What a robot will do to take a branch along a path.
+    """A robot's motion that takes a branch along a path.
 
     Poses are of the gripper's middle in the robot's base frame.
 
     Attributes:
-        approach: From before the branch to the grasp.
-        path: With the branch held.
-        joints: Of approach and path together, one continuous branch.
-        rotation: Of the gripper at the grasp, branch frame, as a rotation vector [rad].
+        approach: Motion from a start before the branch to the grasp.
+        path: Motion with the branch held.
+        joints: Joint angles of approach and path together, one continuous branch.
+        rotation: Rotation of the gripper at the grasp, branch frame, as a rotation vector [rad].
     """
 
     approach: Trajectory
@@ -41,7 +41,7 @@ class RobotMotion:
 
     @property
     def way_back(self) -> Trajectory:
-        """The path reversed, with what is expected on it."""
+        """The path reversed, with the expected wrench along it."""
         return self.path.backwards()
 
     @property
@@ -52,7 +52,7 @@ class RobotMotion:
 
 @dataclass(frozen=True)
 class _Way:
-    """One way of taking the path: approach and steps of the gripper's middle, base frame."""
+    """One option for the path: approach and steps of the gripper's middle, base frame."""
 
     rotation: np.ndarray
     approach: np.ndarray
@@ -67,19 +67,20 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
                  blocked: Blocked | None = None) -> RobotMotion:
     """Turn a path of the grasped piece of branch into motion of the robot.
 
-    Of all directions of approach across the branch and all branches of the inverse kinematics
-    that one is taken which keeps farthest from singularities, and is not blocked.
+    Of all directions of approach across the branch and all branches of the inverse kinematics, the
+    unblocked one that stays farthest from singularities is chosen.
 
     Args:
-        predicted: The grasped piece from its rest pose on, and what is felt of it.
+        predicted: Poses of the grasped piece from its rest pose on, and their predicted wrenches.
         axis: Direction of the branch at the grasp, branch frame, shape [3].
-        speed: Of the gripper [m/s].
-        rotation: Of the gripper at the grasp, branch frame [rad], shape [3], if it is given.
+        speed: Speed of the gripper [m/s].
+        rotation: Rotation of the gripper at the grasp, branch frame [rad], shape [3], if it is
+        given.
 
     Raises:
-        InputError: the speed is over the cell's.
-        NoPathError: no branch of the inverse kinematics carries the motion, or all are blocked;
-            says where and why.
+        InputError: the speed exceeds the cell's limit.
+        NoPathError: no branch of the inverse kinematics follows the motion, or all are blocked;
+            states where and why.
     """
     if speed > cell.limits.speed_m_s:
         raise InputError(f"{speed:g} m/s exceeds the cell's {cell.limits.speed_m_s:g} m/s.",
@@ -107,9 +108,9 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
 
 
 def across(axis: np.ndarray) -> list[np.ndarray]:
-    """Return rotations [rad] of a gripper that comes across a branch along ``axis`` [3].
+    """Return rotations [rad] of a gripper that approaches across a branch along ``axis`` [3].
 
-    The gripper's z is the way it comes, its y lies along the branch.
+    The gripper's z is its direction of approach; its y is along the branch.
     """
     y = np.asarray(axis, float) / np.linalg.norm(axis)
     side = np.cross(y, [0.0, 0.0, 1.0])
@@ -126,7 +127,7 @@ def across(axis: np.ndarray) -> list[np.ndarray]:
 
 
 def _ways(cell: Cell, poses: np.ndarray, rotation: np.ndarray) -> list[_Way] | NoPathError:
-    """Return the ways of taking the grasp along ``poses`` [n, 6], or why there is none."""
+    """Return the options for the grasp along ``poses`` [n, 6], or why there is none."""
     grip = inverted(matrices(poses[0])) @ matrices(np.r_[poses[0, :3], rotation])
     held = matrices(poses) @ grip
     back = held[0].copy()
@@ -147,10 +148,10 @@ def _ways(cell: Cell, poses: np.ndarray, rotation: np.ndarray) -> list[_Way] | N
 
 
 def _timed(cell: Cell, predicted: Predicted, way: _Way, speed: float) -> RobotMotion:
-    """Return the motion on a way, with what is expected along it."""
+    """Return the motion on a path, with the expected wrench along it."""
     limits, steps, path = cell.limits, way.steps, way.path
     times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
-    # What is predicted stands at the plan's poses: carried to the dense ones by the way between.
+    # Predictions are at the plan's poses; they are interpolated to the dense poses along the path.
     ways = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
     dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
     expected = at_places(predicted, ways, dense).felt(cell, path[0])
@@ -165,15 +166,15 @@ def _timed(cell: Cell, predicted: Predicted, way: _Way, speed: float) -> RobotMo
 
 @dataclass(frozen=True)
 class Followed:
-    """How well a robot followed a path, from its samples.
+    """Accuracy of a robot in following a path, from its samples.
 
     Attributes:
         peak_force: Greatest force on the branch [N].
         path_error: Greatest distance of the grasp from the path [m].
-        force_error: Share of the peak force by which the smoothed force differs from the
-            expected one, 95 % of the samples below it; NaN without expected forces.
-        force_within: Share of the samples whose force differs from the expected one by less than
-            5 % of the peak, or lies in the 95 % interval of the two together; NaN likewise.
+        force_error: 95th percentile of the difference between the smoothed and the expected force,
+            as a fraction of the peak force; NaN without expected forces.
+        force_within: Fraction of the samples whose force differs from the expected one by less than
+            5 % of the peak, or is within the 95 % interval of the two together; NaN likewise.
     """
 
     peak_force: float
@@ -183,12 +184,13 @@ class Followed:
 
 
 def followed(samples: np.ndarray, path: np.ndarray, force_sigma: float = 0.0) -> Followed:
-    """Compare what a robot did with what was planned and expected.
+    """Compare a robot's motion with the planned and expected one.
 
     Args:
         samples: As in :data:`limber.robot.driver.link.COLUMNS`.
         path: [m], branch frame, shape [n, 3].
-        force_sigma: Of the smoothed force: noise, tare and drift of the sensor [N].
+        force_sigma: Standard deviation of the smoothed force: noise, tare and drift of the sensor
+        [N].
     """
     force = samples[:, 13:16]
     # Distance from segments, not from points.

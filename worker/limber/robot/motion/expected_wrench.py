@@ -1,10 +1,12 @@
-"""What a model expects the gripper to feel along a path: wrench, its slope, and how sure it is.
+"""The wrench that a model expects along a path: its value, slope and uncertainty.
 
-A branch is stiff along its axis: there a tenth of a millimetre of the gripper's place is newtons.
-So what is expected is the wrench where the gripper *is*: that at the planned pose and the tangent
-stiffness times the way from there. And what is not known of the way (the arm's own repeatability, a
-base that is turned against its calibration) is known of the wrench as little as the stiffness
-makes of it: a covariance, which the guard and the report allow for.
+A branch is stiff along its axis: a tenth of a millimetre of the gripper's position is newtons
+there.
+So the expected wrench is that at the gripper's *actual* position: the wrench at the planned pose
+plus the tangent stiffness times the displacement from there. Errors of that displacement (the arm's
+own repeatability, a base that is rotated against its calibration) times the stiffness are errors of
+the wrench.
+The covariance states them, and the guard and the report allow for it.
 """
 
 from dataclasses import dataclass
@@ -17,13 +19,13 @@ from limber.robot.cell.cell import Cell
 
 @dataclass(frozen=True)
 class ExpectedWrench:
-    """Along a path of the gripper, branch frame.
+    """Expected wrenches along a path of the gripper, branch frame.
 
     Attributes:
-        wrenches: Of the gripper on the branch, about its middle [N, N m], shape [n, 6].
+        wrenches: Wrenches of the gripper on the branch, about its middle [N, N m], shape [n, 6].
         slopes: Their derivative to the gripper's position [m] and rotation [rad], shape [n, 6, 6].
-        covariance: Of what is not known of them, shape [n, 6, 6].
-        rest_pose: Of the gripper, the robot's base frame, where it closes on the resting branch
+        covariance: Covariance of the wrenches, shape [n, 6, 6].
+        rest_pose: Pose of the gripper when it closes on the resting branch, the robot's base frame
             [m, rad], shape [6].
     """
 
@@ -34,13 +36,13 @@ class ExpectedWrench:
 
     @classmethod
     def nothing(cls, poses: np.ndarray) -> "ExpectedWrench":
-        """Return what a gripper feels that goes through ``poses`` [n, 6] with nothing in it."""
+        """Return the wrenches of an empty gripper that passes through ``poses`` [n, 6]."""
         count = len(poses)
         return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)),
                    poses[0])
 
     def reversed(self) -> "ExpectedWrench":
-        """Return the same from the end on."""
+        """Return the same in reverse order."""
         return ExpectedWrench(self.wrenches[::-1], self.slopes[::-1], self.covariance[::-1],
                               self.rest_pose)
 
@@ -53,13 +55,15 @@ class ExpectedWrench:
 
 @dataclass(frozen=True)
 class Predicted:
-    """A clamped grasp along a path, as the model has it.
+    """A clamped grasp along a path, as predicted by the model.
 
     Attributes:
-        poses: Of the grasped piece from its rest pose on, branch frame [m, rad], shape [n, 6].
-        wrenches: Of a gripper that gives nothing [N, N m], shape [n, 6].
+        poses: Poses of the grasped piece from its rest pose on, branch frame [m, rad], shape [n,
+        6].
+        wrenches: Wrenches of a rigid gripper [N, N m], shape [n, 6].
         stiffness: Their derivative to the pose, shape [n, 6, 6].
-        young_covariance: Of the forces for what is not known of Young's modulus, [n, 3, 3].
+        young_covariance: Covariance of the forces from the uncertainty of Young's modulus, [n, 3,
+        3].
     """
 
     poses: np.ndarray
@@ -69,16 +73,16 @@ class Predicted:
 
     @classmethod
     def of_forces(cls, poses: np.ndarray, forces: np.ndarray) -> "Predicted":
-        """Return forces [n, 3] at poses [n, 6] of which nothing else is known."""
+        """Return a prediction from forces [n, 3] at poses [n, 6] alone."""
         count = len(poses)
         return cls(poses, np.hstack([forces, np.zeros((count, 3))]), np.zeros((count, 6, 6)),
                    np.zeros((count, 3, 3)))
 
     def felt(self, cell: Cell, rest_pose: np.ndarray) -> ExpectedWrench:
-        """Return what a cell's gripper will feel, which gives way a little itself.
+        """Return the wrench expected at a cell's gripper, which has some compliance itself.
 
         Args:
-            rest_pose: Of the gripper where it closes, base frame [m, rad], shape [6].
+            rest_pose: Pose of the gripper when it closes, base frame [m, rad], shape [6].
         """
         count = len(self.poses)
         yielding = np.tile(np.eye(6), (count, 1, 1))
@@ -93,7 +97,8 @@ class Predicted:
         return ExpectedWrench(wrenches, slopes, covariance, rest_pose)
 
     def _way_covariance(self, cell: Cell) -> np.ndarray:
-        """Of the gripper's way since it closed, shape [n, 6, 6] in m and rad."""
+        """Covariance of the gripper's displacement since it closed, shape [n, 6, 6] in m and rad.
+        """
         ways = self.poses[:, :3] - self.poses[0, :3]
         turns = turn_between(self.poses[0, 3:], self.poses[:, 3:])
         by_base = np.concatenate([_crossing(ways), _crossing(turns)], axis=1)
@@ -103,7 +108,7 @@ class Predicted:
 
 
 def at_places(predicted: Predicted, places: np.ndarray, wanted: np.ndarray) -> Predicted:
-    """Return a prediction carried from ``places`` [n] along its path to others [m]."""
+    """Return a prediction interpolated from ``places`` [n] along its path to others [m]."""
     def carried(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
         return np.column_stack([np.interp(wanted, places, column) for column in flat.T]
@@ -119,7 +124,7 @@ def at_places(predicted: Predicted, places: np.ndarray, wanted: np.ndarray) -> P
 
 
 def _crossing(vectors: np.ndarray) -> np.ndarray:
-    """Matrices that turn a small rotation into what it moves ``vectors`` [n, 3] by, [n, 3, 3]."""
+    """Matrices from a small rotation to the displacement of ``vectors`` [n, 3], [n, 3, 3]."""
     x, y, z = vectors.T
     nothing = np.zeros_like(x)
     return np.stack([np.stack([nothing, z, -y], axis=-1), np.stack([-z, nothing, x], axis=-1),

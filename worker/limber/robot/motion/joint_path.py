@@ -8,7 +8,7 @@ import numpy as np
 from limber.core.errors import InputError, NoPathError
 from limber.robot.interface import Arm
 
-# Between neighbouring poses of a path a joint turns little; more is a jump to another solution.
+# Between neighbouring poses of a path a joint rotates little; more is a jump to another solution.
 _LARGEST_STEP = 0.35  # rad
 _OUT_OF_REACH = "out of the arm's reach"
 
@@ -37,7 +37,7 @@ class JointPath:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why one branch does not carry a path: at which pose, and the reason."""
+    """Why one branch does not follow a path: the pose, and the reason."""
 
     branch: int
     index: int
@@ -47,9 +47,9 @@ class Refusal:
 def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
            joint_margin: float = 0.05, joint_limits: np.ndarray | None = None,
            ) -> tuple[list[JointPath], list[Refusal]]:
-    """Return the joint paths along which the flange goes through ``frames``, the best first.
+    """Return the joint paths along which the flange passes ``frames``, the best first.
 
-    Best is the one farthest from singularities. Whole turns are chosen so that the joints stay
+    Best is the one farthest from singularities. Full turns are chosen so that the joints stay
     farthest from their limits.
 
     Args:
@@ -59,7 +59,7 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
         joint_limits: Least and greatest angles [rad], shape [joints, 2]; else the arm's own.
 
     Returns:
-        The paths, and for every other branch why it was refused.
+        The paths, and for every other branch the reason of its rejection.
     """
     frames = np.asarray(frames, float)
     if frames.ndim != 3 or frames.shape[1:] != (4, 4) or not np.isfinite(frames).all():
@@ -75,7 +75,7 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
 
 def joint_path(arm: Arm, frames: np.ndarray, *, start: np.ndarray | None = None,
                joint_limits: np.ndarray | None = None, **margins: float) -> JointPath:
-    """Return the joint path to take along ``frames`` [n, 4, 4].
+    """Return the joint path along ``frames`` [n, 4, 4].
 
     Args:
         start: Joint angles [rad] where the robot is, shape [joints]: the branch nearest to them is
@@ -122,7 +122,8 @@ def _one_branch(arm: Arm, branch: int, joints: np.ndarray, limits: np.ndarray,
 
 
 def _whole_turns(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Turns [joints] that bring the middle of each range nearest to the middle of its limits."""
+    """Full turns [joints] that bring the middle of each range nearest to the middle of its limits.
+    """
     middle = 0.5 * (joints.max(axis=0) + joints.min(axis=0))
     bounded = np.isfinite(limits).all(axis=1)
     wanted = np.where(bounded, 0.5 * np.where(bounded[:, None], limits, 0.0).sum(axis=1), 0.0)
@@ -130,11 +131,11 @@ def _whole_turns(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:
 
 
 def _turned_near(path: JointPath, start: np.ndarray, limits: np.ndarray) -> JointPath:
-    """The same path by the whole turns nearest to ``start`` that keep the limits."""
+    """The same path with the full turns nearest to ``start`` that keep the limits."""
     turns = 2 * np.pi * np.round((start - path.joints[0]) / (2 * np.pi))
     moved = path.joints + turns
     inside = _margins(moved, limits).min(axis=0) >= path.limit_margin
-    # An arm that is a turn away from the limits' middle may stay there as long as it fits.
+    # An arm a full turn away from the limits' middle may stay there if it fits.
     fits = inside | (_margins(moved, limits).min(axis=0) > 0.05)
     joints = path.joints + np.where(fits, turns, 0.0)
     return JointPath(path.branch, joints, path.singularity,

@@ -1,7 +1,7 @@
-"""A way of an arm from joint angles to joint angles past what is in its way (RRT-Connect).
+"""Path of an arm between joint angles that avoids obstacles (RRT-Connect).
 
 Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning". The
-straight way is taken where it is free. The way found is shortened, not optimal.
+straight path is used if it is free. The path found is shortened, not optimal.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ _MOST = 1500  # branches of the two trees
 _SHORTCUTS = 80
 
 Free = Callable[[np.ndarray], np.ndarray]
-"""Whether an arm with joint angles [n, joints] meets nothing, shape [n]."""
+"""Whether an arm with joint angles [n, joints] is free of collisions, shape [n]."""
 
 
 @dataclass
@@ -40,16 +40,16 @@ class _Tree:
 
 def joint_way(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free, *,
               seed: int = 0) -> np.ndarray:
-    """Return joint angles from ``start`` [n] to ``goal`` [n] on a free way, shape [k, n].
+    """Return joint angles from ``start`` [n] to ``goal`` [n] on a free path, shape [k, n].
 
     Neighbours are at most :data:`STEP_RAD` apart.
 
     Args:
         limits: Least and greatest angles [rad], shape [n, 2].
-        free: Tells what is free.
+        free: Returns which joint angles are free.
 
     Raises:
-        NoPathError: start or goal is not free, or no way was found.
+        NoPathError: start or goal is not free, or no path was found.
     """
     for name, angles in (("start", start), ("goal", goal)):
         if not free(angles[None])[0]:
@@ -89,7 +89,7 @@ def densely_turned(corners: list[np.ndarray]) -> np.ndarray:
 
 
 def _grown(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
-    """Grow a tree one step towards ``wanted``; returns the new entry, None where it is blocked."""
+    """Grow a tree one step towards ``wanted``; returns the new entry, None if blocked."""
     near = tree.nearest(wanted)
     way = wanted - tree.angles[near]
     size = float(np.abs(way).max())
@@ -102,7 +102,7 @@ def _grown(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
 
 
 def _connected(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
-    """Grow a tree until it is at ``wanted``; returns the entry there, None where it is blocked."""
+    """Grow a tree until it reaches ``wanted``; returns the entry there, None if blocked."""
     while (last := _grown(tree, wanted, free)) is not None:
         if np.array_equal(tree.angles[last], wanted) or (
                 np.abs(tree.angles[last] - wanted).max() < 1e-9):
@@ -112,7 +112,7 @@ def _connected(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
 
 def _shortened(corners: list[np.ndarray], free: Free, rng: np.random.Generator,
                ) -> list[np.ndarray]:
-    """Leave out corners between two that see each other."""
+    """Remove corners between two that are connected by a free path."""
     for _ in range(_SHORTCUTS):
         if len(corners) < 3:
             break

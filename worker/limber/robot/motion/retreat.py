@@ -1,4 +1,4 @@
-"""The way that an arm has come, as it was measured, for a retreat along it."""
+"""An arm's measured path, for a retreat along it."""
 
 from collections.abc import Sequence
 
@@ -19,12 +19,12 @@ _LEAST_SPEEDS = np.array([1e-3, 1e-2])  # m/s, rad/s
 
 
 class WayBack:
-    """Where an arm was since the gripper closed, or since the motion began.
+    """Positions of an arm since the gripper closed, or since the motion began.
 
     Args:
-        names: Of the arm's joints.
-        followed: The way of a program before this one, to begin with.
-        kept: Called with each place that is kept, and with what a way begins with.
+        names: Names of the arm's joints.
+        followed: The path of an earlier program, to begin with.
+        kept: Called with each position that is kept, and with the data at the start of a path.
     """
 
     def __init__(self, names: Sequence[str], followed: FollowedWay | None = None,
@@ -39,7 +39,7 @@ class WayBack:
     def begin(self, sample: Sample, trajectory: Trajectory) -> None:
         """A trajectory is followed from ``sample`` on.
 
-        Legs on which the same branch is held, from the same pose of rest, are one way.
+        Legs on which the same branch is held, from the same rest pose, are one path.
         """
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
         if rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0:
@@ -53,7 +53,7 @@ class WayBack:
         self._keep(sample)
 
     def note(self, sample: Sample) -> None:
-        """The arm is followed to ``sample``; it is kept where it moved."""
+        """The arm was followed to ``sample``; it is kept if the arm moved."""
         last = self._poses[-1]
         if (length(sample.pose[:3] - last[:3]) > _APART_M
                 or length(turn_between(last, sample.pose)) > _APART_RAD):
@@ -66,10 +66,10 @@ class WayBack:
             self._kept.add(pose=self._poses[-1], joints=self._joints[-1])
 
     def from_here(self, sample: Sample, acceleration: float) -> Trajectory:
-        """Return the path from ``sample`` back to its start, at half the speed of the way there.
+        """Return the path from ``sample`` back to its start, at half the speed of the first pass.
 
-        What lies between the first and the last time that the arm was here is left out: a pull
-        that was stopped on its own way back is not pulled out again.
+        The part between the first and the last time that the arm was here is omitted: a pull that
+        was stopped on its own return is not pulled out again.
 
         Args:
             acceleration: [m/s^2].
@@ -83,7 +83,7 @@ class WayBack:
                              "")
         poses = np.array(self._poses)
         off = np.linalg.norm(poses[:, :3] - sample.pose[:3], axis=1) / POSITION_M
-        # Turns of those alone that are near: a long way has many, and the watchdog waits.
+        # Rotations of the near poses only: a long path has many, and the watchdog waits.
         for number in np.flatnonzero(off <= max(1.0, float(off.min()))):
             turn = length(turn_between(poses[number], sample.pose)) / ROTATION_RAD
             off[number] = max(off[number], turn)
@@ -102,14 +102,14 @@ class WayBack:
         if length(sample.pose - poses[0]) < _STANDS:
             raise SafetyStop("There is no path to return "
                              "along.", "The arm is at its starting point.", "")
-        # At least to the start: against something stiff a fraction of a millimetre is a way.
+        # At least to the start: against a stiff object even a fraction of a millimetre is a path.
         back = np.vstack([sample.pose, poses[:max(_first_time(off), 1)][::-1]])
         speed, turn_speed = _SLOWER * self._speeds
         return Trajectory(along(back, speed, acceleration, turn_speed=turn_speed), back)
 
 
 def _first_time(off: np.ndarray) -> int:
-    """Return the nearest place of a way when it first passed here, from its distances [n]."""
+    """Return the nearest position of a path at its first pass here, from its distances [n]."""
     near = off <= off.min() + _SAME
     begin = int(near.argmax())
     gone = np.flatnonzero(~near[begin:])

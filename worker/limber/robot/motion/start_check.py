@@ -1,9 +1,9 @@
 """Checks that an arm is at the start of a motion, in the configuration that was checked.
 
-Several joint poses bring the gripper to the same place, and each of them again with joints a
-whole turn on. Reach, limits, singularities and obstacles were checked for one of them, so every
-motion compares position, rotation and joints. A whole turn counts as a difference: the joint is
-nearer to its limit, and the cables are wound up otherwise.
+Several joint poses bring the gripper to the same position, and each of them again with joints a
+full turn further. Reach, limits, singularities and obstacles were checked for one of them, so every
+motion compares position, rotation and joints. A full turn counts as a difference: the joint is
+nearer to its limit, and the cables are wound differently.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from limber.core.numerics.rigid_kernels import length, turn_between
 
 POSITION_M = 0.005
 ROTATION_RAD = np.radians(2.0)
-# Arms differ from their nominal measures by some milliradians. Half of what two configurations
-# differ by at the usual distance from a singularity (limits.singularity).
+# Arms differ from their nominal dimensions by some milliradians. Half of the difference between two
+# configurations at the usual distance from a singularity (limits.singularity).
 JOINT_RAD = 0.05
 
 
@@ -29,10 +29,10 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
         joints: Measured [rad], shape [n].
         start: Pose with which the motion begins, shape [6].
         start_joints: Joint angles for which it was checked [rad], shape [n]; None: it was not.
-        names: Of the joints.
+        names: Names of the joints.
 
     Raises:
-        SafetyStop: names what differs, with both values.
+        SafetyStop: states the differences, with both values.
     """
     away = length(start[:3] - pose[:3])
     if away > POSITION_M:
@@ -57,7 +57,7 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
 
 
 def different_joints(joints: np.ndarray, wanted: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Say which joints [rad, n] are not as ``wanted``, with both angles in degrees."""
+    """Return which joints [rad, n] differ from ``wanted``, with both angles in degrees."""
     told = []
     for number in np.flatnonzero(~(np.abs(joints - wanted) <= JOINT_RAD)):
         turns = (joints[number] - wanted[number]) / (2 * np.pi)

@@ -13,16 +13,15 @@ from limber.robot.motion.expected_wrench import ExpectedWrench
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the tool is to be when.
+    """Poses of the tool over time.
 
     Attributes:
         times: [s], from 0, ascending, shape [n].
-        poses: Of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
-        expected: What the gripper will feel of the branch at each pose, or None where nothing is
-            predicted.
+        poses: Poses of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
+        expected: Expected wrench of the branch at each pose, or None without a prediction.
         joints: Joint angles for which reach, limits and obstacles were checked at each pose [rad],
-            shape [n, joints]; None where nothing was checked.
-        by_joints: The joints go from angles to angles, and the poses are what comes of it: a way
+            shape [n, joints]; None if nothing was checked.
+        by_joints: The motion is interpolated in joint space, and the poses follow from it: a path
             of the arm alone, which may pass singularities.
     """
 
@@ -61,7 +60,7 @@ class Trajectory:
 
     @property
     def greatest_speeds(self) -> np.ndarray:
-        """Of the tool's centre [m/s] and of its turns [rad/s], shape [2]."""
+        """Greatest speeds of the tool's centre [m/s] and of its rotation [rad/s], shape [2]."""
         steps = np.diff(self.times)
         ways = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
         turns = np.array([length(turn_between(first, second))
@@ -84,7 +83,7 @@ class Trajectory:
         return None if self.expected is None else self.expected.at(*self._place(time))
 
     def backwards(self) -> "Trajectory":
-        """Return it from its end to its start, as fast, with what is expected on it."""
+        """Return it from its end to its start, at the same speed, with its expected wrench."""
         return Trajectory(self.duration - self.times[::-1], self.poses[::-1],
                           None if self.expected is None else self.expected.reversed(),
                           None if self.joints is None else self.joints[::-1], self.by_joints)
@@ -100,7 +99,7 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
     """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest, shape [n].
 
     Args:
-        speed, acceleration: Of the tool's centre [m/s], [m/s^2].
+        speed, acceleration: Limits of the tool's centre [m/s], [m/s^2].
         turn_speed: Greatest angular speed [rad/s].
         pause: Time added before the start [s].
     """
@@ -116,11 +115,11 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
 
 
 def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) -> np.ndarray:
-    """Return times [s] at which the places of a way are passed, from rest to rest, shape [n].
+    """Return times [s] at which the positions of a path are passed, from rest to rest, shape [n].
 
     Args:
-        steps: Lengths between the places [m], shape [n - 1].
-        speeds: Greatest ones at the places [m/s], shape [n].
+        steps: Distances between the positions [m], shape [n - 1].
+        speeds: Greatest speeds at the positions [m/s], shape [n].
         acceleration: [m/s^2].
     """
     steps = np.maximum(steps, 1e-9)
@@ -129,7 +128,7 @@ def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) ->
         bound[k + 1] = min(bound[k + 1], np.sqrt(bound[k]**2 + 2 * acceleration * steps[k]))
     for k in range(len(steps))[::-1]:
         bound[k] = min(bound[k], np.sqrt(bound[k + 1]**2 + 2 * acceleration * steps[k]))
-    # A single step begins and ends at rest, and is not passed at no speed.
+    # A single step begins and ends at rest, so it must not be passed at zero speed.
     durations = np.where(bound[1:] + bound[:-1] > 0, 2 * steps / np.maximum(
         bound[1:] + bound[:-1], 1e-9), 2 * np.sqrt(steps / acceleration))
     return np.r_[0.0, np.cumsum(durations)]

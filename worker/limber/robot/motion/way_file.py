@@ -1,9 +1,9 @@
-"""The way that an arm has come, on disk: a retreat finds it also when the program has crashed.
+"""An arm's path on disk: a retreat finds it even after the program has crashed.
 
-One file for each controller, in this user's state folder (``LIMBER_STATE`` names another). Each
-line is a JSON object: the first says whose way it is, the others what was passed since, or that
-the gripper moved. The driver adds to it while the arm moves; a killed driver leaves all but the
-last lines.
+There is one file per controller, in this user's state folder (``LIMBER_STATE`` names another). Each
+line is a JSON object: the first identifies the arm and tool, the others hold the poses passed
+since, or that the gripper moved. The driver adds to it while the arm moves. After the driver is
+killed, all but the last lines are there.
 """
 
 import hashlib
@@ -28,15 +28,15 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class FollowedWay:
-    """A way that was read.
+    """A path read from disk.
 
     Attributes:
-        poses: Of the tool's centre, base frame [m, rad], in order, shape [n, 6].
+        poses: Poses of the tool's centre, base frame [m, rad], in order, shape [n, 6].
         joints: [rad], shape [n, joints].
-        speeds: Greatest ones on it [m/s], [rad/s], shape [2].
-        bias: Of the force sensor by its last tare, flange frame [N, N m], shape [6]; or None.
-        gripper_closed: Whether the gripper was closed last; None: it was not moved.
-        at: When the way began, seconds since 1970.
+        speeds: Greatest speeds on it [m/s], [rad/s], shape [2].
+        bias: Bias of the force sensor by its last tare, flange frame [N, N m], shape [6]; or None.
+        gripper_closed: Whether the gripper was last closed; None: it was not moved.
+        at: Start time of the path, seconds since 1970.
     """
 
     poses: np.ndarray
@@ -48,20 +48,20 @@ class FollowedWay:
 
 
 def way_path(cell: Cell) -> Path:
-    """Return where the way of a cell's robot is kept."""
+    """Return the file of the path of a cell's robot."""
     key = hashlib.sha256(cell.robot.address.encode()).hexdigest()[:16]
     return _state_folder() / "robot-ways" / f"{key}.jsonl"
 
 
 def log_path() -> Path:
-    """Return where motions by `limber robot` are logged, a JSON object a line."""
+    """Return the log of motions by `limber robot`, one JSON object a line."""
     return _state_folder() / "robot-moves.jsonl"
 
 
 def read_way(cell: Cell) -> FollowedWay | None:
-    """Return the way that the cell's robot followed last; None where none is known.
+    """Return the path that the cell's robot followed last; None if none is known.
 
-    A line that was half written counts as not written; a way of another arm or tool is none.
+    A line that is half written is ignored; a path of another arm or tool does not count.
     """
     try:
         with open(way_path(cell), encoding="utf-8") as stream:
@@ -86,7 +86,7 @@ def read_way(cell: Cell) -> FollowedWay | None:
 
 
 class WayFile:
-    """Writes a way while it is followed, in a thread of its own: the loop waits for no disk."""
+    """Writes a path while it is followed, in its own thread: the loop waits for no disk."""
 
     def __init__(self, cell: Cell):
         self._lasting: dict[str, Any] = {}
@@ -96,22 +96,22 @@ class WayFile:
         self._thread.start()
 
     def begin(self) -> None:
-        """A new way begins; the old one is forgotten."""
+        """Begin a new path; the old one is discarded."""
         self._lines.put({"format": _FORMAT, "head": self._head, "at": time.time()})
         self.add(**self._lasting)
 
     def tared(self, bias: np.ndarray) -> None:
-        """The force sensor's bias [6] is known; it holds for the ways to come."""
+        """The force sensor's bias [6] is known; it holds for later paths."""
         self._lasting["bias"] = bias.copy()
         self.add(bias=self._lasting["bias"])
 
     def gripped(self, closed: bool) -> None:
-        """The gripper was closed or opened; it stays so for the ways to come."""
+        """The gripper was closed or opened; it stays so for later paths."""
         self._lasting["gripper_closed"] = closed
         self.add(gripper_closed=closed)
 
     def add(self, **content: Any) -> None:
-        """Add what was passed or done; returns at once."""
+        """Add new data; returns at once."""
         self._lines.put(content)
 
     def close(self, seconds: float = 1.0) -> None:
@@ -120,7 +120,7 @@ class WayFile:
         self._thread.join(seconds)
 
     def _write(self) -> None:
-        """Write what comes; a disk that refuses ends it, and a retreat then finds less."""
+        """Write data as it arrives; a disk error ends this, and a retreat then finds less."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             while (line := self._lines.get()) is not None:
@@ -143,5 +143,5 @@ def _rows(values: list[Any], count: int) -> np.ndarray:
 
 
 def _head(cell: Cell) -> dict[str, Any]:
-    """Whose way it is: poses are of this arm's tool."""
+    """Arm and tool to which the path belongs: poses are of this arm's tool."""
     return {"address": cell.robot.address, "arm": cell.arm.name, "tool": cell.tool.grasp_pose}

@@ -1,1 +1,1 @@
-"""A door to ROS 2 that needs no ROS here: rosbridge's protocol over a websocket."""
+"""A bridge to ROS 2 that needs no ROS here: rosbridge's protocol over a websocket."""

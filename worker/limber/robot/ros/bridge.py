@@ -1,6 +1,6 @@
 """A client of rosbridge: JSON over a websocket (rosbridge_suite, "rosbridge v2 Protocol").
 
-The maintained package websockets carries it, and every wait has a limit. roslibpy speaks the same
+The maintained package websockets transports it, and every wait has a limit. roslibpy has the same
 protocol, but through a reactor (Twisted) that a process can start only once and whose thread
 delivers messages without their time of arrival.
 """
@@ -25,7 +25,7 @@ class Bridge:
         url: Such as ``ws://127.0.0.1:9090``.
 
     Raises:
-        WorkError: nothing answers there, or websockets is not installed.
+        WorkError: the address does not answer, or websockets is not installed.
     """
 
     def __init__(self, url: str):
@@ -35,7 +35,7 @@ class Bridge:
 
         self.url, self._around = url, ExitStack()
         try:
-            # Uncompressed: a sample is small, and what waits for a stop is short of time.
+            # Uncompressed: a sample is small, and a stop must not be delayed.
             self._socket = self._around.enter_context(connect(
                 url, open_timeout=SECONDS, close_timeout=0.5, ping_interval=None,
                 compression=None, proxy=None))
@@ -59,7 +59,7 @@ class Bridge:
             raise ConnectionError(f"the connection to {self.url} was lost") from error
 
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next message, waiting at most ``seconds``; None where none came.
+        """Return the next message, waiting at most ``seconds``; None if none arrived.
 
         Raises:
             ConnectionError: the connection was lost.
@@ -78,11 +78,11 @@ class Bridge:
                 return content
 
     def subscribe(self, topic: str, kind: str) -> None:
-        """Ask for all messages of a topic."""
+        """Subscribe to all messages of a topic."""
         self.send(op="subscribe", topic=topic, type=kind, throttle_rate=0, queue_length=0)
 
     def advertise(self, topic: str, kind: str) -> None:
-        """Announce a topic that is published from here."""
+        """Advertise a topic that is published from here."""
         self.send(op="advertise", topic=topic, type=kind)
 
     def close(self) -> None:

@@ -1,9 +1,9 @@
 """A robot behind a rosbridge, moved by trajectories under the guard.
 
-The controller in ROS follows the whole trajectory by itself (FollowJointTrajectory). The guard
-reads joint states and wrenches as they come; where it stops, the goal is cancelled and the stop
-topic is published. That a node beside the controller acts on that topic, and on silence, is what
-``scripts/examples/ros2`` shows: a websocket is no safety channel.
+The controller in ROS follows the whole trajectory itself (FollowJointTrajectory). The guard reads
+joint states and wrenches as they arrive. If it stops the motion, the goal is cancelled and the stop
+topic is published. ``scripts/examples/ros2`` shows a node beside the controller that acts on that
+topic, and on silence: a websocket is no safety channel.
 """
 
 import time
@@ -44,7 +44,7 @@ _OFF_PATH_M = 0.02  # a controller in ROS is behind its trajectory by a time tha
 
 @dataclass(frozen=True)
 class Topics:
-    """What the robot's topics and actions are called; by default as the UR driver has them."""
+    """Names of the robot's topics and actions; by default those of the UR driver."""
 
     joint_states: str = "/joint_states"
     wrench: str = "/force_torque_sensor_broadcaster/wrench"
@@ -53,7 +53,7 @@ class Topics:
 
 
 class RosRobot:
-    """A robot and its force sensor as ROS tells of them.
+    """A robot and its force sensor as ROS reports them.
 
     Args:
         cell: Arm, tool, sensor and limits.
@@ -62,7 +62,7 @@ class RosRobot:
         on_sample: Called with time [s], pose [6] and smoothed wrench [6], branch frame.
 
     Attributes:
-        warnings: What held the loop up.
+        warnings: Delays of the loop.
 
     Raises:
         WorkError: a topic sends nothing.
@@ -104,7 +104,7 @@ class RosRobot:
             self._take(self._bridge.receive(_LISTEN_SECONDS))
 
     def _take(self, message: dict[str, Any] | None) -> Sample | None:
-        """Take a message; returns the sample that it is, if it is one."""
+        """Process a message; returns its sample, if it is one."""
         if message is None or message.get("op") != "publish":
             return None
         topic, content, arrived = message.get("topic"), message["msg"], time.monotonic()
@@ -122,7 +122,7 @@ class RosRobot:
         return self.last
 
     def watched(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Only read for ``seconds``: when samples came [s], shape [n], and raw forces, [n, 3]."""
+        """Only read for ``seconds``: samples' arrival times [s], shape [n]; raw forces, [n, 3]."""
         times, forces = [], []
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -148,7 +148,7 @@ class RosRobot:
         self.guard.tared()
 
     def tare(self, seconds: float = 0.5) -> np.ndarray:
-        """Take the present force as nothing; returns the tare's standard error [6].
+        """Tare the present force; returns the tare's standard error [6].
 
         Raises:
             WorkError: too few readings, or the gripper is touched.
@@ -169,7 +169,7 @@ class RosRobot:
         return sigma
 
     def _warm_up(self) -> None:
-        """Judge once what is here: what is compiled or loaded for it must not hold a motion up."""
+        """Judge the present samples once: compiling or loading must not delay a motion."""
         assert self.last is not None and self._reading is not None
         guard = Guard(self._cell.arm, GuardSettings(self._cell.limits, self._cell.joint_limits),
                       self._cell.arm.rate)
@@ -204,7 +204,7 @@ class RosRobot:
         self._hold_ups.set_off()
         while True:
             if time.monotonic() - beat > _BEAT_SECONDS:
-                # That we are alive; the node beside the controller stops it where this ends.
+                # Sign of life; the node beside the controller stops the arm when it ends.
                 beat = time.monotonic()
                 self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": False})
             message = self._bridge.receive(_LISTEN_SECONDS)
@@ -221,14 +221,14 @@ class RosRobot:
                 return self._stop(goal, decision)
 
     def _silence(self) -> Decision:
-        """Judge that nothing came; a loop that was held up itself listens once more."""
+        """Judge that nothing arrived; a loop that was itself delayed listens once more."""
         assert self.last is not None
         self._hold_ups.note(self.last.arrived, moving=True)
         held_up = self._hold_ups.has_just_woken
         return self.guard.silence(0.0 if held_up else time.monotonic() - self.last.arrived)
 
     def _ended(self, message: dict[str, Any] | None, goal: str) -> dict[str, Any] | None:
-        """What ended a goal from the other side: its result, or a stop by somebody."""
+        """The external end of a goal: its result, or a stop by another party."""
         if message is None:
             return None
         if message.get("op") == "action_result" and message.get("id") == goal:
@@ -272,13 +272,13 @@ class RosRobot:
 
     @staticmethod
     def _nearest(trajectory: Trajectory, joints: np.ndarray, place: int) -> int:
-        """The place on the way nearest to ``joints``, from the last one on."""
+        """The position on the path nearest to ``joints``, searched from the last one on."""
         assert trajectory.joints is not None
         ahead = trajectory.joints[place:place + 50]
         return place + int(np.abs(ahead - joints).max(axis=1).argmin())
 
     def _stop(self, goal: str, decision: Decision) -> dict[str, Any]:
-        """Stop by both ways, and see that the arm stands."""
+        """Stop on both channels, and check that the arm is at rest."""
         self.guard.event(str(decision))
         self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": True})
         self._bridge.send(op="cancel_action_goal", id=goal, action=self._topics.trajectory)

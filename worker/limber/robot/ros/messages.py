@@ -27,10 +27,10 @@ class JointStates:
 
     Args:
         cell: Its arm and tool.
-        names: As the first message has them.
+        names: Names in the first message.
 
     Raises:
-        InputError: a joint of the arm is missing, or fits two names.
+        InputError: a joint of the arm is missing, or matches two names.
 
     Attributes:
         ordered: The names in the arm's order.
@@ -51,10 +51,10 @@ class JointStates:
             self.ordered.append(names[found[0]])
 
     def sample(self, message: dict[str, Any], arrived: float) -> Sample:
-        """Return the sample of a message that came at ``arrived`` [s, monotonic]; what ROS does
-        not tell is as of a robot that runs.
+        """Return the sample of a message that arrived at ``arrived`` [s, monotonic]. Values that
+        ROS does not report are those of a running robot.
 
-        Numbers that are missing are NaN, which the guard stops for.
+        Missing numbers are NaN, for which the guard stops.
         """
         joints = self._of(message, "position")
         speeds = self._of(message, "velocity")
@@ -85,7 +85,7 @@ def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
     """Return the goal of FollowJointTrajectory for a trajectory with joints.
 
     Args:
-        names: Of the joints in ROS, in the arm's order.
+        names: Names of the joints in ROS, in the arm's order.
     """
     if trajectory.joints is None:
         raise InputError("The motion has no joint angles.", "ROS follows joint angles.", "")

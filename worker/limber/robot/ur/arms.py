@@ -1,12 +1,12 @@
 """The arms of Universal Robots: Denavit-Hartenberg tables, speeds, payloads, kinematics.
 
 Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
-is turned by 180 degrees about z) and the flange.
+is rotated by 180 degrees about z) and the flange.
 
-Lengths are the maker's nominal ones ("DH Parameters for calculations of kinematics and dynamics").
-A real arm is calibrated in the factory and its controller uses corrected tables: its poses differ
-from these by up to some millimetres. So a measured joint pose is compared with the controller's
-own pose before a motion (:mod:`limber.robot.driver.guard`), never taken as equal.
+Lengths are the manufacturer's nominal ones ("DH Parameters for calculations of kinematics and
+dynamics"). A real arm is calibrated in the factory and its controller uses corrected tables: its
+poses differ from these by up to some millimetres. So a measured joint pose is compared with the
+controller's own pose before a motion (:mod:`limber.robot.driver.guard`), never assumed to be equal.
 """
 
 import math
@@ -42,10 +42,10 @@ class UrArm:
         a: Offsets along x [m], shape [6].
         joint_speed: Greatest joint speeds [rad/s], shape [6].
         payload: Greatest mass at the flange [kg].
-        lateral: How far the axes of upper arm and forearm lie beside the shoulder's, along the
-            second joint's axis [m] (offsets of the maker's ROS 2 description).
+        lateral: Offsets of the axes of upper arm and forearm from the shoulder's, along the second
+            joint's axis [m] (from the manufacturer's ROS 2 description).
         housing: Radius of the joints' housings at shoulder, elbow and wrist [m], rounded up.
-        endless_wrist: Whether the last joint turns without end.
+        endless_wrist: Whether the last joint rotates without end.
     """
 
     name: str
@@ -66,7 +66,7 @@ class UrArm:
 
     @property
     def measures_force(self) -> bool:
-        """A CB3 estimates the force from its motors' currents, wrong by newtons that wander."""
+        """A CB3 estimates the force from its motors' currents, with drifting errors of newtons."""
         return self.series == "e"
 
     @property
@@ -79,7 +79,7 @@ class UrArm:
 
     @cached_property
     def table(self) -> np.ndarray:
-        """The Denavit-Hartenberg table: d [m], a [m] and twist [rad] a joint, shape [6, 3]."""
+        """The Denavit-Hartenberg table: d [m], a [m] and twist [rad] per joint, shape [6, 3]."""
         return np.column_stack([self.d, self.a, _TWIST])
 
     @property
@@ -89,7 +89,7 @@ class UrArm:
 
     @cached_property
     def joint_limits(self) -> np.ndarray:
-        """Least and greatest joint angles [rad], shape [6, 2]: one turn each way."""
+        """Least and greatest joint angles [rad], shape [6, 2]: one turn in each direction."""
         limits = np.tile([-2 * math.pi, 2 * math.pi], (6, 1))
         if self.endless_wrist:
             limits[5] = [-np.inf, np.inf]
@@ -97,7 +97,7 @@ class UrArm:
 
     @property
     def rate(self) -> float:
-        """Steps a second of the controller [Hz]."""
+        """Steps per second of the controller [Hz]."""
         return 125.0 if self.series == "cb3" else 500.0
 
     def forward(self, joints: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ class UrArm:
         return slopes.reshape(*joints.shape[:-1], 6, 6)
 
     def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
-        """Return how far each joint pose is from each singularity, shape [..., 3].
+        """Return the distance of each joint pose from each singularity, shape [..., 3].
 
         The Jacobian's determinant is a product of three factors, each of which vanishes at one
         singularity: the wrist's (axes of joints 4 and 6 parallel), the elbow's (arm stretched or
@@ -156,8 +156,8 @@ class UrArm:
     def rods(self, joints: np.ndarray) -> Rods:
         """Return the links at joint angles [rad], shape [n, 6].
 
-        The tubes lie beside the lines of the Denavit-Hartenberg table, by the offsets of shoulder
-        and elbow. The base's foot is left out: it stands where it is mounted, and touches that.
+        The tubes are offset from the lines of the Denavit-Hartenberg table, by the offsets of
+        shoulder and elbow. The base's foot is omitted: it touches its mount.
         """
         frames = self.link_frames(joints)
         places, axis = frames[:, :, :3, 3], frames[:, 0, :3, 2]

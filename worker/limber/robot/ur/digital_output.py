@@ -1,7 +1,7 @@
 """A digital output of a controller, switched without its control program.
 
-It works while the arm is stopped, and every wait in it has a limit: a gripper has to open also
-where nothing else does.
+It works while the arm is stopped, and every wait in it has a limit: a gripper has to open even if
+nothing else works.
 """
 
 import time
@@ -20,7 +20,7 @@ def switch_output(address: str, number: int, on: bool) -> None:
     """Switch a standard digital output.
 
     Raises:
-        WorkError: nothing answers, another program drives the outputs, or it did not switch.
+        WorkError: no answer, another program drives the outputs, or the output did not switch.
     """
     bit = 1 << number
     stream = _Outputs(address)

@@ -1,7 +1,7 @@
 """Kernels of the kinematics of an arm of Universal Robots, by its Denavit-Hartenberg table.
 
 Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
-is turned by 180 degrees about z) and the flange, as homogeneous matrices. All kernels take many
+is rotated by 180 degrees about z) and the flange, as homogeneous matrices. All kernels take many
 poses; :class:`limber.robot.ur.arms.UrArm` calls them.
 """
 
@@ -81,15 +81,15 @@ def singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) ->
 def inverse(table: np.ndarray, frames: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Analytic solution after Hawkins, "Analytic inverse kinematics for the UR-5/UR-10 arms".
 
-    Angles come from arc tangents throughout, also where the paper has arc cosines: those lose
-    half of the digits near a singularity.
+    Angles come from arc tangents throughout, even where the paper has arc cosines: those lose half
+    of the digits near a singularity.
     """
     solutions = np.full((len(frames), 8, 6), np.nan)
     d4, d5, d6 = table[3, 0], table[4, 0], table[5, 0]
     a2, a3 = table[1, 1], table[2, 1]
     for n in range(len(frames)):
         frame = frames[n]
-        # The wrist's centre seen from above lies d4 beside the plane of the arm.
+        # The wrist's centre seen from above is at distance d4 from the plane of the arm.
         px, py = frame[0, 3] - d6 * frame[0, 2], frame[1, 3] - d6 * frame[1, 2]
         across = px * px + py * py - d4 * d4
         if across < 0.0:
@@ -117,12 +117,12 @@ def inverse(table: np.ndarray, frames: np.ndarray, last: np.ndarray) -> np.ndarr
 @compiled
 def _solve_plane(table: np.ndarray, frame: np.ndarray, q1: float, q5: float, q6: float, a2: float,
                  a3: float, d5: float, rows: np.ndarray) -> None:
-    """Fill the two elbow solutions ``rows`` [2, 6], with the three parallel joints left over."""
+    """Fill the two elbow solutions ``rows`` [2, 6] with the remaining three parallel joints."""
     end = _product(_link(table, 4, q5), _link(table, 5, q6))
     middle = _product(inverse_of(_link(table, 0, q1)), _product(frame, inverse_of(end)))
-    # Frame 4 in frame 1: joints 2 to 4 turn about one direction, its z.
+    # Frame 4 in frame 1: joints 2 to 4 rotate about one direction, its z.
     x, y = middle[0, 3], middle[1, 3]
-    # Frame 4 stands after a twist of a quarter turn: its x axis carries the sum of the angles.
+    # Frame 4 follows a twist of a quarter turn: its x axis carries the sum of the angles.
     total = math.atan2(middle[1, 0], middle[0, 0])
     far = x * x + y * y
     cosine = (far - a2 * a2 - a3 * a3) / (2.0 * a2 * a3)

@@ -1,4 +1,4 @@
-"""The real-time data exchange (RTDE) protocol, version 2, as a controller speaks it.
+"""The real-time data exchange (RTDE) protocol, version 2, of a controller.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". A frame is its size (two bytes,
 big-endian, itself and the command counted), a command byte and a body.
@@ -58,7 +58,7 @@ INPUT_TYPES |= {f"input_int_register_{n}": "INT32" for n in range(48)}
 INPUT_TYPES |= {f"input_double_register_{n}": "DOUBLE" for n in range(48)}
 INPUT_TYPES |= {f"input_bit_register_{n}": "BOOL" for n in range(64, 128)}
 
-# First version of the e-Series and of CB3 that knows a name; later names are NOT_FOUND before it.
+# First version of the e-Series and of CB3 that knows a name; it is NOT_FOUND in earlier ones.
 _SINCE = {"ft_raw_wrench": ((5, 9), None), "payload": ((5, 11), (3, 15)),
           "payload_cog": ((5, 11), (3, 15)), "payload_inertia": ((5, 11), (3, 15)),
           "script_control_line": ((5, 9), (3, 14)), "tcp_offset": ((5, 23), None),
@@ -69,7 +69,7 @@ _SINCE = {"ft_raw_wrench": ((5, 9), None), "payload": ((5, 11), (3, 15)),
 
 @dataclass(frozen=True)
 class Recipe:
-    """A list of names that travel together, in order."""
+    """A list of names that are sent together, in order."""
 
     number: int
     names: tuple[str, ...]
@@ -96,8 +96,8 @@ class Recipe:
     def unpacked(self, body: bytes) -> dict[str, Any]:
         """Return the values of a data frame's body (without its recipe number).
 
-        A shorter body gives the values that are whole: ur-rtde sends some commands through a
-        recipe that has more fields than the command has arguments.
+        A shorter body gives the complete values: ur-rtde sends some commands through a recipe that
+        has more fields than the command has arguments.
         """
         values, place = {}, 0
         for name, kind in zip(self.names, self.types, strict=True):
@@ -116,10 +116,10 @@ def frame(command: int, body: bytes) -> bytes:
 
 
 def split_frames(data: bytearray) -> list[tuple[int, bytes]]:
-    """Take the whole frames off the front of ``data``: command and body of each.
+    """Remove the complete frames from the front of ``data``: command and body of each.
 
     Raises:
-        ValueError: a size that cannot be; the other side does not speak RTDE.
+        ValueError: an impossible size; the other side is not an RTDE server.
     """
     frames = []
     while len(data) >= 3:
@@ -134,7 +134,7 @@ def split_frames(data: bytearray) -> list[tuple[int, bytes]]:
 
 
 def output_types(names: Sequence[str], version: tuple[int, ...]) -> list[str]:
-    """Return the type of each output name, ``NOT_FOUND`` where this version has none."""
+    """Return the type of each output name, ``NOT_FOUND`` if this version has none."""
     def kind(name: str) -> str:
         e_series, cb3 = _SINCE.get(name, ((5, 0), (3, 0)))
         first = cb3 if version[0] == 3 else e_series
@@ -144,6 +144,6 @@ def output_types(names: Sequence[str], version: tuple[int, ...]) -> list[str]:
 
 
 def input_types(names: Sequence[str], taken: Mapping[str, object], owner: object) -> list[str]:
-    """Return the type of each input name; ``IN_USE`` where another connection writes it."""
+    """Return the type of each input name; ``IN_USE`` if another connection writes it."""
     return [INPUT_TYPES.get(name, "NOT_FOUND") if taken.get(name, owner) is owner else "IN_USE"
             for name in names]

@@ -1,8 +1,8 @@
-"""What is known of the robot at one moment, and a reader that misses none of it.
+"""State of the robot at one moment, and a reader that misses none.
 
 ur-rtde's own receiver keeps the newest package only, and its getters return the last one for ever
-when the robot is gone. This reader takes the controller's stream from a socket of its own: every
-package arrives in order, with the time when it came, and a broken connection is seen as one.
+when the robot is gone. This reader takes the controller's stream from its own socket: every package
+arrives in order, with its time of arrival, and a broken connection is detected.
 """
 
 import select
@@ -29,11 +29,11 @@ class SampleStream:
     """The controller's RTDE output, read without loss.
 
     Args:
-        address: Of the controller.
+        address: Address of the controller.
         timeout: Longest wait for an answer while connecting [s].
 
     Raises:
-        WorkError: nothing answers at the address, or it is not an RTDE server.
+        WorkError: the address does not answer, or it is not an RTDE server.
     """
 
     inputs: tuple[str, ...] = ()
@@ -106,10 +106,10 @@ class SampleStream:
     def read(self, timeout: float, beside: Sequence[socket.socket] = ()) -> list[Sample]:
         """Return the next samples, waiting at most ``timeout`` [s] for the first.
 
-        After a delay they come a few at a time, so that who reads them can act in between.
+        After a delay they arrive in small batches, so that the caller can act in between.
 
         Args:
-            beside: Other connections: what comes there ends the wait as well, without samples.
+            beside: Other connections: data there ends the wait as well, without samples.
 
         Raises:
             ConnectionError: the connection to the robot was lost.
@@ -133,7 +133,7 @@ class SampleStream:
         self._socket.sendall(self._input_recipe.packed(values))
 
     def skip(self) -> None:
-        """Drop what has come so far."""
+        """Drop the data that has arrived so far."""
         while select.select([self._socket], [], [], 0)[0]:
             self._fill()
         self._queue.clear()
@@ -161,7 +161,7 @@ def _array(numbers: Sequence[float] | None) -> np.ndarray | None:
 
 
 class Dashboard:
-    """The controller's dashboard: what it is, and the second way to stop it.
+    """The controller's dashboard: its description, and the second channel to stop it.
 
     Raises:
         WorkError: it does not answer.
@@ -184,7 +184,7 @@ class Dashboard:
         """Return the reply to a command.
 
         Raises:
-            ConnectionError: there is none.
+            ConnectionError: there is no reply.
         """
         try:
             self._socket.sendall(f"{command}\n".encode())
@@ -193,7 +193,7 @@ class Dashboard:
             raise ConnectionError(f"dashboard of {self.address}: {error}") from error
 
     def stop(self) -> None:
-        """Send the stop, and wait for nothing."""
+        """Send the stop, without waiting."""
         self._socket.sendall(b"stop\n")
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""An arm of a URDF file: the same as any other, its inverse kinematics found by iteration."""
+"""An arm of a URDF file: like any other, with iterative inverse kinematics."""
 
 import functools
 import math
@@ -61,7 +61,7 @@ class UrdfArm:
 
     @cached_property
     def shoulder(self) -> np.ndarray:
-        """On the first joint's axis, as high as the second joint."""
+        """On the first joint's axis, at the height of the second joint."""
         first, second = self.link_frames(np.zeros(len(self.chain.joints)))[:2]
         axis = first[:3, :3] @ self.chain.joints[0].axis
         return first[:3, 3] + axis * (axis @ (second[:3, 3] - first[:3, 3]))
@@ -93,8 +93,9 @@ class UrdfArm:
         return slopes.reshape(*frames.shape[:-3], 6, len(self._axes))
 
     def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return up to eight configurations for each of ``frames`` [..., 4, 4], or the one that
-        is found from ``near`` [..., n]; see :class:`limber.robot.interface.Arm`."""
+        """Return up to eight configurations for each of ``frames`` [..., 4, 4], or the one found
+        from ``near`` [..., n]; see :class:`limber.robot.interface.Arm`.
+        """
         frames = np.asarray(frames, float)
         count = len(self._axes)
         flat = for_kernels(frames.reshape(-1, 4, 4))
@@ -119,8 +120,9 @@ class UrdfArm:
         return solved(self._origins, self._axes, for_kernels(frames), for_kernels(starts), is_path)
 
     def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
-        """Return the least singular value of the Jacobian in its greatest, lengths in reaches of
-        the arm, as a fraction of its value in the arm's best pose, shape [..., 1]."""
+        """Return the ratio of the Jacobian's least to greatest singular value, lengths in reaches
+        of the arm, as a fraction of its value in the arm's best pose, shape [..., 1].
+        """
         return self._conditions(joints) / self._best_condition
 
     def _conditions(self, joints: np.ndarray) -> np.ndarray:
@@ -132,8 +134,8 @@ class UrdfArm:
     def rods(self, joints: np.ndarray) -> Rods:
         """Return the moving links: their simple shapes, or else thick lines between the joints.
 
-        What turns with the first joint alone is left out where it is such a line: it begins in the
-        base's foot, and touches what that stands on.
+        The link that moves with the first joint alone is omitted if it is such a line: it begins in
+        the base's foot, and touches the mount.
         """
         frames = self.link_frames(joints)
         names: list[str] = []
@@ -168,13 +170,14 @@ class UrdfArm:
 
     @cached_property
     def _starts(self) -> np.ndarray:
-        """From where configurations are looked for, always the same, shape [starts, n]."""
+        """Start angles of the search for configurations, always the same, shape [starts, n]."""
         low, high = np.clip(self.joint_limits, -np.pi, np.pi).T
         return np.random.default_rng(0).uniform(low, high, (_STARTS, len(low)))
 
     def _apart(self, found: np.ndarray) -> np.ndarray:
-        """Return those of solutions [k, n] that are different configurations, the best first:
-        within the limits, and far from singularities."""
+        """Return the solutions [k, n] that are different configurations, the best first: within the
+        limits, and far from singularities.
+        """
         found = found[np.isfinite(found).all(axis=1)]
         if not len(found):
             return found
@@ -209,5 +212,5 @@ def arm_of_file(name: str) -> UrdfArm:
 
 @functools.lru_cache(maxsize=16)
 def _read(name: str, _changed: int, _size: int) -> UrdfArm:
-    """The arm of a file as it is now: a cell asks for its arm many times a second."""
+    """The arm of a file in its present state: a cell asks for its arm many times a second."""
     return UrdfArm(name, read_chain(Path(name)))

@@ -1,7 +1,7 @@
 """Kernels of the kinematics of a chain of revolute joints.
 
-``origins`` [n + 1, 4, 4] are the joints' frames at angle 0, each in that of the joint before, and
-the flange's in the last one's; ``axes`` [n, 3] are those that they turn about.
+``origins`` [n + 1, 4, 4] are the joints' frames at angle 0, each in that of the previous joint, and
+the flange's in the last one's; ``axes`` [n, 3] are the joint axes.
 """
 
 import math
@@ -64,7 +64,7 @@ def _slopes(axes: np.ndarray, frames: np.ndarray, slopes: np.ndarray) -> None:
 
 @compiled
 def _off(frame: np.ndarray, flange: np.ndarray, off: np.ndarray) -> None:
-    """Fill the way [m] and the turn [rad] from the flange to where it is wanted, shape [6]."""
+    """Fill the translation [m] and rotation [rad] from the flange to its target, shape [6]."""
     off[:3] = frame[:3, 3] - flange[:3, 3]
     off[3:] = rotation_vector(frame @ inverse_of(flange))
 
@@ -92,12 +92,11 @@ def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np
            is_path: bool) -> np.ndarray:
     """Return the angles that bring the flange to ``frames`` [k, 4, 4], shape [k, n].
 
-    Gauss-Newton steps, damped as Levenberg and Marquardt do; NaN where they lead nowhere.
+    Gauss-Newton steps with Levenberg-Marquardt damping; NaN if they do not converge.
 
     Args:
-        starts: From where each is looked for, shape [k, n].
-        is_path: Look for each but the first from the one before; NaN from the first on that is not
-            reached.
+        starts: Start angles of each search, shape [k, n].
+        is_path: Search each but the first from the one before; NaN from the first unreached one on.
     """
     count = len(axes)
     found = np.full((len(frames), count), np.nan)

@@ -1,7 +1,7 @@
 """URDF files: the chain of revolute joints from an arm's base to its flange, and its links' shapes.
 
-Read with the standard library: of a URDF only links, joints and simple shapes count here, and
-Limber needs no parser of robots for that. A document type is refused, and with it every entity.
+Read with the standard library: only links, joints and simple shapes of a URDF are needed, so Limber
+needs no robot parser. A document type is refused, and with it every entity.
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from limber.core.numerics.rigid_kernels import inverse_of
 
 _BASE = "base"
 _FLANGES = ("tool0", "flange")
-"""Links as ROS-Industrial names them (REP 199): the controller's base frame and its flange."""
+"""Names of links in ROS-Industrial (REP 199): the controller's base frame and its flange."""
 _FEWEST = 6
 Element = ElementTree.Element
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A turning joint.
+    """A revolute joint.
 
     Attributes:
-        name: As in the file.
-        origin: Its frame at angle 0 in that of the joint before, shape [4, 4].
-        axis: About which it turns, its frame, unit length, shape [3].
-        limits: Least and greatest angle [rad], infinite where it turns without end.
+        name: Name in the file.
+        origin: Its frame at angle 0 in that of the previous joint, shape [4, 4].
+        axis: Axis of rotation, its frame, unit length, shape [3].
+        limits: Least and greatest angle [rad], infinite for an endless joint.
         speed: Greatest [rad/s].
     """
 
@@ -42,8 +42,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Rod:
-    """A link's simple shape within a rod with round ends, in the frame of joint number ``joint``
-    [m]."""
+    """A capsule around a link's simple shape, in the frame of joint number ``joint`` [m]."""
 
     joint: int
     name: str
@@ -57,7 +56,7 @@ class Chain:
     """An arm as its file describes it.
 
     Attributes:
-        joints: From the base on.
+        joints: Joints from the base on.
         flange: Its frame in the last joint's, shape [4, 4].
         rods: Shapes of the moving links, as far as the file has cylinders, spheres and boxes.
     """
@@ -76,7 +75,7 @@ class _WithoutDoctype(ElementTree.TreeBuilder):
 def read_chain(path: Path) -> Chain:
     """Read the arm of a URDF file.
 
-    It goes from the link ``base`` (else the root) to ``tool0``, ``flange``, or else the end of the
+    It runs from the link ``base`` (else the root) to ``tool0``, ``flange``, or else the end of the
     only chain with six or more joints.
 
     Raises:
@@ -193,7 +192,7 @@ def _rods(link: Element, name: str, frame: np.ndarray, joint: int) -> list[Rod]:
 
 
 def _axis_and_radius(shape: Element) -> tuple[np.ndarray, float]:
-    """A shape's longest axis [m, 3] and how far it reaches beside it [m]; 0 for a mesh."""
+    """A shape's longest axis [m, 3] and its greatest distance from it [m]; 0 for a mesh."""
     if shape.tag == "sphere":
         return np.zeros(3), float(_said(shape, "radius"))
     if shape.tag == "cylinder":

@@ -1,1 +1,1 @@
-"""A Universal Robots controller in software, which the real client library connects to."""
+"""A Universal Robots controller in software, to which the real client library connects."""

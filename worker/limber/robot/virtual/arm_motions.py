@@ -1,4 +1,4 @@
-"""Motions of the virtual arm: each is asked at every step for new joint angles.
+"""Motions of the virtual arm: each returns new joint angles at every step.
 
 A move is a curve sampled closely in joint space and a speed along it that keeps the tool's and
 the joints' limits; braking, servo and speed motions are integrated step by step.
@@ -16,15 +16,15 @@ from limber.robot.interface import Arm
 from limber.robot.virtual.step_kernels import servo_step
 
 JOINT_ACCELERATION = 40.0
-"""What the motors can do [rad/s^2]."""
+"""Greatest acceleration of the motors [rad/s^2]."""
 STOP_DECELERATION = 8.0
-"""Joint deceleration of protective and emergency stops, and of a program that ends [rad/s^2]."""
+"""Joint deceleration of protective and emergency stops, and at a program's end [rad/s^2]."""
 
 _SAMPLES = 300
 
 
 class Unreachable(Exception):
-    """A motion that the arm cannot do; the controller answers with a protective stop."""
+    """A motion impossible for the arm; the controller answers with a protective stop."""
 
 
 class Motion(Protocol):
@@ -43,9 +43,9 @@ class Waypoint:
     """A stop on a path.
 
     Attributes:
-        kind: ``joint`` or ``line``: how the path comes here.
+        kind: ``joint`` or ``line``: shape of the path to this stop.
         target: Joint angles [rad] or the tool's pose [m, rad], shape [6], as ``is_pose`` says.
-        speed, acceleration: Of the leading joint [rad/s], or of the tool [m/s].
+        speed, acceleration: Those of the leading joint [rad/s], or of the tool [m/s].
         blend: Radius [m] (or [rad] on joint paths) within which the corner is rounded.
     """
 
@@ -62,9 +62,9 @@ class TimedPath:
 
     Args:
         joints: Samples [rad], shape [n, 6].
-        lengths: Way along the path [m or rad], shape [n], ascending.
+        lengths: Length along the path [m or rad], shape [n], ascending.
         speeds, accelerations: Limits at each sample, shape [n].
-        passed: Index of the waypoint that a sample belongs to, shape [n].
+        passed: Index of the waypoint to which a sample belongs, shape [n].
     """
 
     def __init__(self, arm: Arm, joints: np.ndarray, lengths: np.ndarray, speeds: np.ndarray,
@@ -89,7 +89,7 @@ class TimedPath:
 
     @property
     def waypoint(self) -> int:
-        """Index of the waypoint that the motion is on its way to."""
+        """Index of the waypoint towards which the arm moves."""
         if self.finished:
             return int(self._passed[-1])
         return int(self._passed[np.searchsorted(self._times, self._time, side="right") - 1])
@@ -114,7 +114,7 @@ class TimedPath:
 
 
 class Braking:
-    """The arm slows down to standstill on the way it goes, every joint in the same time."""
+    """The arm slows down to standstill on its path, every joint in the same time."""
 
     def __init__(self, speeds: np.ndarray, deceleration: float):
         """Brake the fastest joint with ``deceleration`` [rad/s^2]."""
@@ -122,7 +122,7 @@ class Braking:
 
     @classmethod
     def of_tool(cls, speeds: np.ndarray, tool_speed: np.ndarray, deceleration: float) -> "Braking":
-        """Brake the tool with ``deceleration`` [m/s^2] (and as many rad/s^2)."""
+        """Brake the tool with ``deceleration`` [m/s^2] (and the same number in rad/s^2)."""
         braking = cls(speeds, STOP_DECELERATION)
         fastest = max(float(np.linalg.norm(tool_speed[:3])), float(np.linalg.norm(tool_speed[3:])))
         least = float(np.abs(speeds).max()) / JOINT_ACCELERATION
@@ -138,7 +138,7 @@ class Braking:
         first = self._time
         self._time = min(self._time + seconds, self._duration)
         self.finished = self._time >= self._duration
-        # Exact way under constant deceleration between the two times.
+        # Exact path under constant deceleration between the two times.
         mean = 1.0 - 0.5 * (first + self._time) / self._duration if self._duration > 0 else 0.0
         moved = self._initial * mean * (self._time - first)
         left = 1.0 - self._time / self._duration if self._duration > 0 else 0.0
@@ -146,11 +146,11 @@ class Braking:
 
 
 class Servo:
-    """Follows a target that is set anew at any rate (servoj).
+    """Follows a target that is updated at any rate (servoj).
 
-    The controller scales the time of its own motion by the speed slider, so below 1 the arm goes
-    after the target at that fraction of the target's speed and falls behind; it makes up for that
-    as soon as the slider is at 1 again.
+    The controller scales the time of its own motion by the speed slider. Below 1 the arm follows
+    the target at that fraction of the target's speed and falls behind; it catches up when the
+    slider is at 1 again.
     """
 
     def __init__(self) -> None:
@@ -166,13 +166,13 @@ class Servo:
                           self.lookahead, seconds, JOINT_ACCELERATION)
 
     def _goal(self, joints: np.ndarray, seconds: float, scale: float) -> np.ndarray:
-        """Where the arm is led to now [rad], with the slider at ``scale``."""
+        """Joint angles to which the arm is driven now [rad], with the slider at ``scale``."""
         if self._last is None:
             self._last = self._led = joints.copy()
         self._since += seconds
         moved = float(np.abs(self.target - self._last).max())
         if moved > 0.0:
-            # Targets may come less often than steps.
+            # Targets may be less frequent than steps.
             self._pace, self._since = moved / self._since, 0.0
             self._last = self.target.copy()
         if scale >= 1.0:
@@ -231,7 +231,7 @@ def line_move(arm: Arm, start: np.ndarray, start_pose: np.ndarray, waypoints: li
     """Return the tool's motion through ``waypoints`` on straight lines (movel), with blends.
 
     Raises:
-        Unreachable: part of the way is out of reach, or passes a singularity.
+        Unreachable: a section of the path is out of reach, or passes a singularity.
     """
     corners = [start_pose, *(np.asarray(waypoint.target, float) for waypoint in waypoints)]
     curve = _rounded(np.array(corners), waypoints, _pose_distance, pose_between)
@@ -265,10 +265,11 @@ def _timed(arm: Arm, joints: np.ndarray, curve: "_Curve", places: np.ndarray,
            waypoints: list[Waypoint]) -> TimedPath:
     speeds = np.array([waypoints[k].speed for k in curve.passed])
     accelerations = np.array([waypoints[k].acceleration for k in curve.passed])
-    # Where one leg ends the slower of both neighbours holds; without a blend the arm stops there.
+    # At the end of a leg the slower of both neighbours applies; without a blend the arm stops
+    # there.
     speeds = np.minimum(speeds, np.r_[speeds[1:], speeds[-1]])
     speeds[curve.stops] = 0.0
-    # In a curve the acceleration across it counts as well.
+    # In a curve the lateral acceleration counts as well.
     ways = np.diff(places, axis=0)
     steps = np.maximum(np.linalg.norm(ways, axis=1), 1e-15)
     turned = np.linalg.norm(np.diff(ways / steps[:, None], axis=0), axis=1)
@@ -279,7 +280,7 @@ def _timed(arm: Arm, joints: np.ndarray, curve: "_Curve", places: np.ndarray,
 
 def _reachable_speeds(bound: np.ndarray, accelerations: np.ndarray, steps: np.ndarray,
                       ) -> np.ndarray:
-    """The fastest speeds [n] within ``bound`` that accelerations allow, zero at both ends."""
+    """Greatest speeds [n] within ``bound`` that accelerations allow, zero at both ends."""
     speeds = bound.copy()
     speeds[0] = speeds[-1] = 0.0
     for k in range(len(steps)):
@@ -293,7 +294,7 @@ def _reachable_speeds(bound: np.ndarray, accelerations: np.ndarray, steps: np.nd
 
 @dataclass(frozen=True)
 class _Curve:
-    """Samples of a path: points [n, 6], way [n], waypoint each leads to [n], stops [n]."""
+    """Samples of a path: points [n, 6], path length [n], target waypoint of each [n], stops [n]."""
 
     points: np.ndarray
     lengths: np.ndarray
@@ -344,7 +345,7 @@ def _between_joints(first: np.ndarray, second: np.ndarray, parts: np.ndarray) ->
 
 
 def _pose_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Way of the tool [m]; its angle [rad] where it only turns, as the controller counts it."""
+    """Path length of the tool [m]; its angle [rad] if it only rotates, as in the controller."""
     way = np.linalg.norm(second[:, :3] - first[:, :3], axis=1)
     return np.where(way > 1e-9, way, angle_between(first[:, 3:], second[:, 3:]))
 

@@ -1,4 +1,4 @@
-"""The branch at one pose of the gripper, and how its wrench goes on from there."""
+"""The branch at one pose of the gripper, and the extrapolation of its wrench from there."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from limber.robot.virtual.step_kernels import led_on
 _LEAST_WAY = 2e-3  # m between two solutions whose tangents are compared
 
 Bends = tuple[np.ndarray, np.ndarray]
-"""Ways [m], shape [n, 3], and by how much the stiffness changes over each, shape [n, 6, 6]."""
+"""Displacements [m], shape [n, 3], and the change of stiffness over each, shape [n, 6, 6]."""
 NO_BENDS: Bends = np.zeros((0, 3)), np.zeros((0, 6, 6))
 
 
@@ -24,16 +24,17 @@ class Solution:
     """The branch at one pose of the held patch.
 
     Attributes:
-        frame: Of the patch, branch frame, shape [4, 4].
-        wrench: Of the gripper on the branch, about the patch's position, branch frame [N, N m].
+        frame: Frame of the patch, branch frame, shape [4, 4].
+        wrench: Wrench of the gripper on the branch, about the patch's position, branch frame [N, N
+        m].
         stiffness: Its derivative to position and rotation, shape [6, 6].
         points: Seen points [m], shape [n, 3].
         point_slopes: Their derivative to position and rotation, shape [3 n, 6].
         peak_strain: Greatest principal strain.
-        seconds: What it took.
+        seconds: Computing time.
         converged: Whether it is an equilibrium; if not, the rest is of the last one.
-        bends: Over the way from a solution before first, then over those that were tried when
-            the gripper closed.
+        bends: Changes of the stiffness, first over the displacement from an earlier solution, then
+            over those tried when the gripper closed.
     """
 
     frame: np.ndarray
@@ -47,30 +48,31 @@ class Solution:
     bends: Bends = NO_BENDS
 
     def wrench_at(self, patch: np.ndarray, compliance: float) -> np.ndarray:
-        """Return the wrench [6] with the gripper where the patch's frame would be ``patch``.
+        """Return the wrench [6] at the patch's frame ``patch`` of a rigid gripper.
 
-        The patch stays behind by ``compliance`` [m/N] times the force; near the own frame.
+        The patch stays behind by ``compliance`` [m/N] times the force; valid near its own frame.
         """
         return led_on(self.frame, self.wrench, self.stiffness, *self.bends, patch, compliance)
 
     def change_to(self, patch: np.ndarray) -> np.ndarray:
-        """Return the way [m] and the turn [rad] to another frame of the patch, shape [6]."""
+        """Return the translation [m] and rotation [rad] to another frame of the patch, shape [6].
+        """
         return np.concatenate((patch[:3, 3] - self.frame[:3, 3],
                                rotation_vector(patch @ inverse_of(self.frame))))
 
     def bend_from(self, before: "Solution") -> Bends:
-        """Return how the stiffness has changed on the way from another solution, if it tells."""
+        """Return the change of stiffness from another solution; none if it is unknown."""
         way = self.frame[:3, 3] - before.frame[:3, 3]
         if not (self.converged and before.converged and np.linalg.norm(way) > _LEAST_WAY):
             return NO_BENDS
         return way[None], (self.stiffness - before.stiffness)[None]
 
     def led_by(self, past: Sequence["Solution"], tried: Bends) -> None:
-        """Note how it goes on from ``past`` solutions, the latest first, or else as that did."""
+        """Set the bends from ``past`` solutions, the latest first; else copy the latest's."""
         for before in past:
             newest = self.bend_from(before)
             if len(newest[0]):
                 self.bends = joined(newest, tried)
                 return
-        # Where it hardly moved, what was known before still holds.
+        # It hardly moved: the earlier bends still hold.
         self.bends = past[0].bends if past else tried

@@ -1,4 +1,4 @@
-"""The process that solves the branch in the virtual gripper, and which branch that is."""
+"""The process that solves the branch in the virtual gripper, and its description."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ _TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
 
 @dataclass(frozen=True)
 class BranchSetting:
-    """Which branch stands where beside the virtual robot.
+    """A branch and its position beside the virtual robot.
 
     Attributes:
         mesh: File of the true branch: tetrahedra with ``young``, ``poisson``, ``density`` and
-            ``fixed``, as it hangs.
+            ``fixed``, in the hanging shape.
         base_pose: The robot's base in the branch's frame [m, rad], shape [6].
         grasp_pose: The gripper's middle in the flange's frame [m, rad], shape [6].
-        points: Points of the branch that are seen (markers), [m], shape [n, 3].
+        points: Visible points of the branch (markers), [m], shape [n, 3].
         gravity: In the branch's frame [m/s^2], or zeros for a branch without weight.
-        jaw: Half width of what the gripper takes hold of along the branch [m].
-        grip: Force that the grip bears before the branch slips out [N].
-        break_strain: Greatest principal strain that the branch bears.
-        compliance: What arm, fingers and bark give way by [m/N].
+        jaw: Half width of the gripped section along the branch [m].
+        grip: Force at which the branch slips out of the grip [N].
+        break_strain: Greatest principal strain before the branch breaks.
+        compliance: Compliance of arm, fingers and bark [m/N].
     """
 
     mesh: Path
@@ -62,14 +62,15 @@ class BranchSetting:
         Its mesh is written to ``path``. The seen points are the control points and the tip.
 
         Args:
-            wave: How far log E swings to and fro between the control points about the straight
-                course that a fit takes it to have.
+            wave: Deviation of log E between the control points from the linear course that a fit
+                assumes.
         """
         from limber.mechanics.materials.young_field import young_weights
 
         mesh, count = truth.mesh, truth.mesh.tet_count
         weights = young_weights(mesh, truth.control_points)
-        # 0 at the control points, largest in the middle between two of them, by turns up and down.
+        # 0 at the control points, largest in the middle between two of them, alternately up and
+        # down.
         bumps = 4.0 * weights[:, :-1] * weights[:, 1:]
         swing = wave * bumps @ (-1.0) ** np.arange(bumps.shape[1])
         mesh.with_data(cell_data={
@@ -103,7 +104,7 @@ class BranchSolver:
         self._state = np.zeros_like(mesh.nodes)
         self._last: Solution | None = None
         self._follows: np.ndarray | None = None
-        # By how much that has changed since the solution before, and over which way.
+        # Change of that since the solution before, and the displacement over which it changed.
         self._turning: tuple[np.ndarray, np.ndarray] | None = None
         self._faces: np.ndarray | None = None
         self._rng = np.random.default_rng(0)
@@ -118,15 +119,15 @@ class BranchSolver:
         self._grasp, self._last, self._state = None, None, np.zeros_like(nodes)
 
     def seen(self) -> np.ndarray:
-        """Where the seen points are now [m], shape [n, 3]."""
+        """Present positions of the seen points [m], shape [n, 3]."""
         if self._operator is None:
             return self._points
         return self._points + (self._operator @ self._state.ravel()).reshape(-1, 3)
 
     def look(self, camera: dict[str, Any], is_held: bool) -> bytes:
-        """Return what a depth camera sees of the branch, with its noise: 16 bits a pixel, packed.
+        """Return a depth camera's image of the branch, with its noise: 16 bits a pixel, packed.
 
-        Unheld the branch is at rest.
+        Not held, the branch is at rest.
         """
         from limber.geometry.cloud.camera import Camera
         from limber.perception.simulated_camera import render_depth, with_noise
@@ -155,7 +156,7 @@ class BranchSolver:
         return {"centre": self._grasp.centre, "solution": self.solve(frame)}
 
     def tried(self) -> Bends:
-        """How the stiffness changes both ways across the branch, turned as it turns by itself."""
+        """Change of stiffness in two directions across the branch, with its free rotation."""
         solution, state, follows = self._last, self._state, self._follows
         if solution is None:
             return NO_BENDS
@@ -170,7 +171,7 @@ class BranchSolver:
         return bends
 
     def solve(self, patch: np.ndarray) -> Solution:
-        """Return the solution at a frame of the patch; the last one where there is none."""
+        """Return the solution at a frame of the patch; the last one if there is none."""
         from limber.mechanics.sensitivities import grasp_slopes
         from limber.mechanics.statics.result import StaticSettings
         from limber.mechanics.statics.solve import follow_poses
@@ -201,9 +202,9 @@ class BranchSolver:
         return self._last
 
     def _guessed(self, patch: np.ndarray) -> np.ndarray | None:
-        """Where the nodes nearly are at a frame of the patch, [node_count, 3].
+        """Approximate positions of the nodes at a frame of the patch, [node_count, 3].
 
-        By the tangent of the solution before and how that changed.
+        From the tangent of the solution before and its change.
         """
         if self._last is None or self._follows is None:
             return None
@@ -217,7 +218,7 @@ class BranchSolver:
 
 def solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
     solver = BranchSolver(setting)
-    # Below the arm's own loop; above other programs, for which the branch's force would be late.
+    # Below the arm's own loop; above other programs, which would delay the branch's force.
     claim_real_time(_SOLVER_PRIORITY)
     spare_what_is_loaded()
     try:
@@ -235,5 +236,5 @@ def solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
                 pipe.send(("solved", solver.solve(content)))
                 time.sleep(_REST * (time.monotonic() - began))
     except (EOFError, OSError):
-        # The robot is gone, and nobody else asks.
+        # The robot has ended, and no other process asks.
         return

@@ -1,7 +1,7 @@
 """The virtual controller: its arm, safety and program states, step by step.
 
-It knows nothing of sockets: :mod:`limber.robot.virtual.server` brings it what clients send and
-takes away what they ask for. One call of :meth:`Controller.step` is one step of its control loop.
+It is independent of sockets: :mod:`limber.robot.virtual.server` passes on what clients send and
+returns what they request. One call of :meth:`Controller.step` is one step of its control loop.
 """
 
 from collections import deque
@@ -55,7 +55,7 @@ class SensorFault:
     """Faults of the force readings, for tests.
 
     Attributes:
-        added: Wrench added to what the sensor reports, flange frame [N, N m].
+        added: Wrench added to the sensor's report, flange frame [N, N m].
         frozen: Repeats the last reading.
         nan: Reports no numbers.
     """
@@ -70,10 +70,10 @@ class Controller:
 
     Args:
         model: Name of the arm.
-        joints: Where it stands [rad], shape [6]; at the arm's home where absent.
-        mass, centre: Of what really hangs at the flange [kg], [m].
-        seed: Of the sensors' noise.
-        load: What the gripper holds.
+        joints: Initial joint angles [rad], shape [6]; the arm's home if absent.
+        mass, centre: Actual payload at the flange [kg], [m].
+        seed: Seed of the sensors' noise.
+        load: The gripper's load.
     """
 
     def __init__(self, model: str, *, joints: np.ndarray | None = None, mass: float = 0.0,
@@ -93,12 +93,12 @@ class Controller:
         self.ft300 = ForceSensor(FT300, rng) if ft300 else None
         self.ft300_reading = np.zeros(6)
         self.tracker_off = _TRACKER_SIGMA_M * rng.standard_normal(3)
-        """By how much the simulated tracker's frame lies beside the base's [m], shape [3]."""
+        """Offset of the simulated tracker's frame from the base's [m], shape [3]."""
         self.load: Load = load or Nothing()
         self.fault = SensorFault()
         self.step_count, self.clock_offset = 0, 0.0
         self.since_step: Callable[[], float] = lambda: 0.0
-        """Wall-clock seconds since the last step, where somebody steps it by the clock."""
+        """Wall-clock seconds since the last step, if the controller is stepped by the clock."""
         self.robot_mode, self.safety_mode = RobotMode.RUNNING, SafetyMode.NORMAL
         self.remote = True
         self.slider = 1.0
@@ -187,7 +187,7 @@ class Controller:
             self._brake()
 
     def emergency_stop(self) -> None:
-        """Press the button: the arm stops, the program ends, power goes off."""
+        """Press the button: the arm stops, the program ends, power is switched off."""
         self.say("emergency stop")
         self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
         self.stop_program("emergency stop")
@@ -207,8 +207,7 @@ class Controller:
         self.safety_mode, self.robot_mode, self.motion = SafetyMode.NORMAL, RobotMode.RUNNING, None
 
     def stand(self, joints: Sequence[float] | None = None) -> None:
-        """Stand with joints [rad] at once, without a way there, as if guided by hand; at the arm's
-        home where absent."""
+        """Set the joints [rad] at once, without a path, by default to the arm's home."""
         wanted = _six(self.arm.home if joints is None else joints)
         self.stop_program("set to a pose")
         self.load.release()
@@ -238,7 +237,7 @@ class Controller:
         return self.safety_mode == SafetyMode.NORMAL and self.robot_mode == RobotMode.RUNNING
 
     def load_script(self, text: str) -> None:
-        """Run an uploaded script, ending the one that runs; refused in local control."""
+        """Run an uploaded script, ending the running one; refused in local control."""
         if not self.remote:
             self.say("script refused: not in remote control")
             return
@@ -260,7 +259,7 @@ class Controller:
             self._brake()
 
     def pause_program(self) -> None:
-        """Hold the program and brake the arm; playing it goes on with the next command."""
+        """Hold the program and brake the arm; playing it continues with the next command."""
         self.paused = True
         self._brake()
 
@@ -273,10 +272,10 @@ class Controller:
         """Write to the controller's log."""
         self.log.append(f"{self.clock + self.since_step():.4f} {text}")
 
-    # What clients write
+    # Written by clients
 
     def write_inputs(self, values: dict[str, Any]) -> None:
-        """Take values that a client sent."""
+        """Accept values that a client sent."""
         self.inputs.update(values)
         if {"input_int_register_0", "input_int_register_24"} & set(values) and self.watchdog:
             self.watchdog = (self.watchdog[0], self.step_count)
@@ -307,14 +306,15 @@ class Controller:
             self.load.release()
 
     def _check_watchdog(self) -> None:
-        """End a program whose client no longer writes: after the asked time, at least a step."""
+        """End a program whose client no longer writes: after the requested time, at least a step.
+        """
         if self.watchdog is None or self.paused:
             return
         longest, last = self.watchdog
         if (self.step_count - last) * self.seconds > max(longest, self.seconds):
             self.stop_program(f"watchdog: no input for {1000 * longest:.0f} ms")
 
-    # What clients read
+    # Read by clients
 
     def outputs(self) -> dict[str, Any]:
         """Return every RTDE output by name."""
@@ -350,7 +350,7 @@ class Controller:
 
 
 def _six(joints: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return joint angles as an array, if they are those of an arm that RTDE can tell of.
+    """Return joint angles as an array, if they are those of an arm that RTDE supports.
 
     Raises:
         InputError: they are not six finite numbers.

@@ -1,4 +1,4 @@
-"""The dashboard server's answers: a text protocol, one line a command."""
+"""The dashboard server's answers: a text protocol, one line per command."""
 
 from limber.robot.virtual.controller import (
     Controller,
@@ -12,7 +12,7 @@ GREETING = "Connected: Universal Robots Dashboard Server"
 _MODES = {RobotMode.POWER_OFF: "POWER_OFF", RobotMode.IDLE: "IDLE", RobotMode.RUNNING: "RUNNING"}
 _STATES = {RuntimeState.STOPPED: "STOPPED", RuntimeState.PLAYING: "PLAYING",
            RuntimeState.PAUSED: "PAUSED"}
-# What changes something is refused in local control, as the e-Series does.
+# Commands that change something are refused in local control, as on the e-Series.
 _CHANGES = ("play", "stop", "pause", "load", "power on", "power off", "brake release",
             "unlock protective stop", "restart safety", "shutdown", "close safety popup")
 _REFUSED = "Command is not allowed due to safety reasons"

@@ -1,4 +1,4 @@
-"""The virtual robot's depth camera, asked over its port, and a scan of the branch with it."""
+"""The virtual robot's depth camera, queried over its port, and a scan of the branch with it."""
 
 import json
 import socket
@@ -12,14 +12,16 @@ from limber.robot.virtual.server import CAMERA_PORT
 
 _SECONDS = 30.0
 _LARGEST_STEP_M = 0.01
-"""Between neighbouring pixels of one surface; more is a silhouette, where pixels fly."""
+"""Largest depth step between neighbouring pixels of one surface; more is a silhouette with flying
+pixels.
+"""
 
 
 class VirtualCamera:
-    """A depth camera that may stand anywhere; a context manager.
+    """A depth camera at any pose; a context manager.
 
     Raises:
-        WorkError: nothing answers at the port.
+        WorkError: the port does not answer.
     """
 
     def __init__(self, address: str):
@@ -39,7 +41,7 @@ class VirtualCamera:
         self._socket.close()
 
     def depth(self, camera: Camera) -> np.ndarray:
-        """Return what a camera sees: depth [m], 0 where nothing is, shape [height, width].
+        """Return a camera's depth image [m], 0 where nothing is seen, shape [height, width].
 
         Raises:
             WorkError: the virtual robot has ended.
@@ -59,8 +61,7 @@ class VirtualCamera:
 
 def views_around(middle: np.ndarray, distance: float, count: int,
                  camera: Camera = D455) -> list[Camera]:
-    """Return cameras all around a position [3], ``distance`` [m] from it, alternately a little
-    above and below.
+    """Return cameras around a position [3], ``distance`` [m] away, alternately high and low.
     """
     if count < 1 or not distance > 0:
         raise InputError(f"{count} views from a distance of {distance:g} m were "

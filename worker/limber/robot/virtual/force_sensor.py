@@ -7,18 +7,18 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SensorTraits:
-    """How a sensor errs.
+    """Errors of a sensor.
 
-    The defaults are those of an e-Series' built-in one as measured by users: its Fz drifted by
-    4 N in five minutes standing still, within its data sheet.
+    The defaults are those of an e-Series' built-in sensor as measured by users: its Fz drifted by 4
+    N in five minutes at rest, within its data sheet.
 
     Attributes:
         force_sigma, torque_sigma: White noise of a sample [N], [N m].
-        force_bias, torque_bias: Reading without load before it is zeroed, each axis at random
-            [N], [N m].
-        gain_sigma: By how much a sensor's gain is off, one for all it reads: relative.
-        drift_n_per_minute: Of the force along z after zeroing.
-        force_range, torque_range: Where a reading saturates [N], [N m].
+        force_bias, torque_bias: Reading without load before zeroing, each axis at random [N], [N
+            m].
+        gain_sigma: Relative standard deviation of the sensor's gain, one for all readings.
+        drift_n_per_minute: Drift of the force along z after zeroing.
+        force_range, torque_range: Saturation of a reading [N], [N m].
         estimated: Whether it is computed from motor currents (CB3): slow errors of newtons.
     """
 
@@ -44,7 +44,7 @@ class ForceSensor:
     """One sensor: true wrench in, reading out, both in the sensor's frame.
 
     Attributes:
-        gain: What it makes of one newton.
+        gain: Reading for one newton.
     """
 
     def __init__(self, traits: SensorTraits, rng: np.random.Generator):
@@ -68,12 +68,12 @@ class ForceSensor:
                        + self._sigma * self._rng.standard_normal(6), -self._range, self._range)
 
     def zero(self) -> None:
-        """Take the present load as nothing (zero_ftsensor)."""
+        """Tare the present load (zero_ftsensor)."""
         self._offset = self._true_reading(0.0)
 
     def _true_reading(self, seconds: float) -> np.ndarray:
         if self.traits.estimated and seconds > 0:
-            # Friction in the joints: an error that wanders with about a second's memory.
+            # Friction in the joints: an error that drifts with about a second's memory.
             kept = np.exp(-seconds)
             spread = np.r_[np.full(3, 2.0), np.full(3, 0.3)] * np.sqrt(1 - kept**2)
             self._slow = kept * self._slow + spread * self._rng.standard_normal(6)

@@ -1,12 +1,12 @@
-"""The branch in the virtual gripper: its reaction is what the virtual sensor feels.
+"""The branch in the virtual gripper: its reaction is the load of the virtual sensor.
 
-A process of its own solves the branch, over and over, where the gripper is about to be when the
-solution has come. Between two solutions the wrench is extrapolated by the tangent stiffness at the
-last one and by how that changed since one before, so the arm's loop never waits: the reaction
-is late by nothing and off by what is of third order in the way moved since. A branch held at an arm
-of 0.3 m and moved across by 6 mm comes 60 micrometres nearer to its root: along its stiff axis the
-tangent alone would be newtons off. How long a solution takes, and by how much the wrench was off
-when one came, is part of the robot's state.
+A separate process solves the branch repeatedly, at the gripper's predicted pose when the solution
+arrives. Between two solutions the wrench is extrapolated with the tangent stiffness at the last one
+and its change since an earlier one, so the arm's loop never waits. The reaction has no delay, and
+its error is of third order in the displacement since. A branch held at an arm of 0.3 m and moved
+across by 6 mm comes 60 micrometres nearer to its root: along its stiff axis the tangent alone would
+have an error of newtons. The time of a solution, and the error of the wrench when one arrived, are
+part of the robot's state.
 """
 
 from collections import deque
@@ -28,7 +28,7 @@ _PAST = 5  # solutions that are known still: the robot may go slowly
 
 
 class HeldBranch:
-    """What the gripper holds: a branch, once it is closed on it."""
+    """The gripper's load: a branch, once the gripper is closed on it."""
 
     def __init__(self, setting: BranchSetting):
         self.setting = setting
@@ -60,19 +60,19 @@ class HeldBranch:
 
     @property
     def points(self) -> np.ndarray:
-        """Where the seen points are [m], shape [n, 3]."""
+        """Positions of the seen points [m], shape [n, 3]."""
         solution = self._solution
         if solution is None:
             return self.rest_points
         patch = self._gripper @ self._offset
-        # The held piece stays behind the gripper by what gives way.
+        # The held piece stays behind the gripper by the compliance.
         felt = self._extrapolated(solution, patch)
         patch[:3, 3] -= self.setting.compliance * felt[:3]
         moved = solution.point_slopes @ solution.change_to(patch)
         return solution.points + moved.reshape(-1, 3)
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
-        """Return what the branch exerts on the flange, flange frame, shape [6]."""
+        """Return the wrench of the branch on the flange, flange frame, shape [6]."""
         self._gripper = self._base @ flange @ self._tool
         self._take_picture()
         if self.state == "closing" and not self._is_looking:
@@ -99,9 +99,9 @@ class HeldBranch:
         return self._at_flange(-on_branch, patch, flange)
 
     def grasp(self) -> None:
-        """Close the gripper where it is; the arm's loop goes on while the branch is looked for.
+        """Close the gripper at its present pose; the arm's loop does not wait for the solver.
 
-        The state is ``closing``, then ``held``, or ``empty`` where no branch is between the jaws.
+        The state is ``closing``, then ``held``, or ``empty`` if no branch is between the jaws.
         """
         self.state, self._solution = "closing", None
         self._closed_at = self._gripper
@@ -131,7 +131,7 @@ class HeldBranch:
             self._busy = self._asked = True
 
     def release(self) -> None:
-        """Open the gripper: the branch goes back to rest."""
+        """Open the gripper: the branch returns to rest."""
         self.lose("free")
 
     def lose(self, how: str) -> None:
@@ -139,7 +139,7 @@ class HeldBranch:
         self.state, self._solution = how, None
 
     def slide(self, part: float) -> None:
-        """Let the branch slide back in the grip by ``part`` of the way it was pulled."""
+        """Let the branch slide back in the grip by ``part`` of its displacement."""
         if self._solution is None:
             return
         step = np.linalg.solve(self._solution.stiffness[:3, :3], self._solution.wrench[:3])
@@ -154,11 +154,11 @@ class HeldBranch:
         self._pipe.close()
 
     def seen(self) -> list[list[float]]:
-        """Return where a tracker on the robot's base sees the points, base frame [m]."""
+        """Return the points as a tracker on the robot's base sees them, base frame [m]."""
         return ((self.points - self._base[:3, 3]) @ self._base[:3, :3]).tolist()
 
     def look(self, camera: dict[str, Any]) -> None:
-        """Ask for a depth image; it is in ``picture`` when the solver has found time for it.
+        """Ask for a depth image; it is in ``picture`` when the solver has computed it.
 
         Args:
             camera: Content of a :class:`~limber.geometry.cloud.camera.Camera`.
@@ -167,12 +167,12 @@ class HeldBranch:
 
     def _take_picture(self) -> None:
         if self._is_looking:
-            # Asked once: an answer may come between two questions.
+            # Asked once: an answer may arrive between two questions.
             if self._pipe.poll():
                 self.picture = self._pipe.recv()[1]
                 self._is_looking = self._busy = False
         elif self._busy and self.state not in ("held", "closing") and self._pipe.poll():
-            # A solution for a branch that has been let go.
+            # A solution for a branch that has been released.
             self._pipe.recv()
             self._busy = False
         if self._view is not None and not self._busy:
@@ -191,7 +191,7 @@ class HeldBranch:
         return told
 
     def _follow_twist(self, patch: np.ndarray, seconds: float) -> None:
-        """How fast the patch goes and turns, over the last hundredths of a second."""
+        """Velocity and angular velocity of the patch, over the last hundredths of a second."""
         change = np.concatenate((patch[:3, 3] - self._last_patch[:3, 3],
                                  rotation_vector(patch @ inverse_of(self._last_patch))))
         kept = np.exp(-seconds / 0.02)
@@ -212,12 +212,12 @@ class HeldBranch:
             found.led_by(self._past, self._tried)
             self._past.appendleft(found)
             if before is not None:
-                # The wrench goes over to the new solution, a branch's force does not jump.
+                # The wrench blends to the new solution: a branch's force does not jump.
                 jump = self._extrapolated(before, patch) - self._extrapolated(found, patch)
                 self._jump += jump
                 self._largest_jump = max(self._largest_jump, float(np.linalg.norm(jump[:3])))
             self._solution = found
-        # A picture that is asked for has the next turn.
+        # A requested picture has the next turn.
         if not self._busy and self._view is None:
             ahead = self._ahead(patch)
             if self._solution is not None:
@@ -225,14 +225,14 @@ class HeldBranch:
                 ahead[:3, 3] -= self.setting.compliance * force
                 if self._solution.converged and (
                         np.abs(self._solution.change_to(ahead)).max() < SAME_PLACE):
-                    # It stands still, and is solved there: the processor is others'.
+                    # It is at rest, and is solved there: the processor is free for others.
                     self._asked_age = 0.0
                     return
             self._pipe.send(("solve", ahead))
             self._busy, self._asked_age = True, 0.0
 
     def _ahead(self, patch: np.ndarray) -> np.ndarray:
-        """Where the patch will be in the middle of the time in which a solution is used."""
+        """Pose of the patch in the middle of the time in which a solution is used."""
         way = min(_LEAD * self._taken, _LONGEST_LEAD) * self._twist
         ahead = frame_of(np.concatenate((np.zeros(3), way[3:]))) @ patch
         ahead[:3, 3] = patch[:3, 3] + way[:3]
@@ -252,7 +252,7 @@ class HeldBranch:
         return solution.wrench_at(patch, self.setting.compliance)
 
     def _at_flange(self, wrench: np.ndarray, patch: np.ndarray, flange: np.ndarray) -> np.ndarray:
-        """A wrench at the patch, branch frame, as one at the flange in its frame."""
+        """Transform a wrench at the patch, branch frame, to the flange, in its frame."""
         rotation = (self._base[:3, :3] @ flange[:3, :3]).T
         force, torque = rotation @ wrench[:3], rotation @ wrench[3:]
         origin = self._base[:3, :3] @ flange[:3, 3] + self._base[:3, 3]

@@ -1,7 +1,7 @@
 """The virtual robot as a process: its main function, and a handle for programs and tests.
 
-The handle talks with the process in JSON lines over its standard input and output; the process
-ends when its input does, so it never outlives who started it.
+The handle communicates with the process in JSON lines over its standard input and output. The
+process ends when its input does, so it never outlives its parent.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ _START_SECONDS = 240.0  # its first start on a machine compiles what moves the b
 
 
 class VirtualRobot:
-    """A virtual robot in a process of its own; a context manager.
+    """A virtual robot in its own process; a context manager.
 
     Args:
         model: Name of the arm.
@@ -80,7 +80,7 @@ class VirtualRobot:
 
     @property
     def state(self) -> dict[str, Any]:
-        """What the controller reports about itself."""
+        """The controller's state as it reports it."""
         return self.ask("state")
 
     def kill(self) -> None:
@@ -114,10 +114,10 @@ class VirtualRobot:
 
 def serve(controller: Controller, address: str, *, control: bool = False,
           seconds: float | None = None, say: Callable[[str], None] = lambda line: None) -> Server:
-    """Serve ``controller`` until interrupted, its input ends (``control``) or ``seconds`` passed.
+    """Serve ``controller`` until interrupted, its input ends (``control``) or time is up.
 
     Raises:
-        WorkError: a port is taken.
+        WorkError: a port is in use.
     """
     _warm_up(controller)
     loop = new_loop()
@@ -137,7 +137,7 @@ def serve(controller: Controller, address: str, *, control: bool = False,
 
 
 def _warm_up(controller: Controller) -> None:
-    """Do before the clock runs what would stop it: compiling, for seconds, and whole searches."""
+    """Do beforehand what would stop the clock: compiling, for seconds, and full collections."""
     slow = Waypoint("line", controller.pose, True, 0.1, 0.1)
     line_move(controller.arm, controller.joints, controller.pose, [slow], controller.tool)
     Servo().step(controller.joints, controller.speeds, controller.seconds, 1.0)

@@ -1,4 +1,4 @@
-"""What the virtual gripper holds, as its controller knows it; and nothing at all."""
+"""The virtual gripper's load, as its controller knows it; and an empty gripper."""
 
 from typing import Any, Protocol
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Load(Protocol):
-    """What the gripper holds: gives the wrench on the tool at a pose of the flange."""
+    """The gripper's load: returns the wrench on the tool at a pose of the flange."""
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         """Return force and torque of the load on the flange, flange frame, shape [6]."""
@@ -21,20 +21,20 @@ class Load(Protocol):
         ...
 
     def lose(self, how: str) -> None:
-        """Lose what is held: ``slipped`` or ``broken``."""
+        """Lose the load: ``slipped`` or ``broken``."""
         ...
 
     def slide(self, part: float) -> None:
-        """Let what is held slide back by a part of its way."""
+        """Let the load slide back by a fraction of its displacement."""
         ...
 
     def seen(self) -> list[list[float]]:
-        """Return where the points are that a tracker sees, base frame [m]."""
+        """Return the positions of the points that a tracker sees, base frame [m]."""
         ...
 
     @property
     def picture(self) -> bytes | None:
-        """The depth image that was asked for, once it is there."""
+        """The requested depth image, once it is available."""
         ...
 
     def look(self, camera: dict[str, Any]) -> None:
@@ -42,22 +42,22 @@ class Load(Protocol):
         ...
 
     def report(self) -> dict[str, Any]:
-        """Return the state of what is held, as plain data."""
+        """Return the state of the load, as plain data."""
         ...
 
     def close(self) -> None:
-        """End what simulates it."""
+        """End the simulation."""
         ...
 
 
 class Nothing:
-    """There is nothing to hold."""
+    """An empty gripper."""
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         return np.zeros(6)
 
     def grasp(self) -> None:
-        """There is nothing between the jaws."""
+        """Nothing is between the jaws."""
 
     def release(self) -> None:
         """Nothing is held."""
@@ -80,4 +80,4 @@ class Nothing:
         return {"branch": "none"}
 
     def close(self) -> None:
-        """There is nothing to end."""
+        """There is nothing to close."""

@@ -1,8 +1,8 @@
-"""What ur-rtde's control script does on a controller, without an interpreter of its language.
+"""The function of ur-rtde's control script on a controller, without an interpreter.
 
 ur-rtde uploads a script that waits for commands in RTDE registers. This class answers the same
-registers in the same way: ``output_int_register_0`` is 1 when ready and 2 when a command is done;
-the client writes a command's number and arguments, waits for 2 and writes 0. A path is injected
+registers in the same way: ``output_int_register_0`` is 1 when ready and 2 when a command is done.
+The client writes a command's number and arguments, waits for 2 and writes 0. A path is injected
 into the uploaded text, so the text is read for it. Numbers and arguments are those of ur-rtde 1.6.
 """
 
@@ -51,7 +51,7 @@ class ControlProgram:
         self._upper = False
 
     def step(self, controller: "Controller") -> None:
-        """One turn of the script's loop."""
+        """One cycle of the script's loop."""
         if not self.is_control_script:
             controller.stop_program("end of script")
             return
@@ -73,7 +73,7 @@ class ControlProgram:
             self._execute(command, controller)
 
     def written(self, controller: "Controller") -> None:
-        """Take a real-time command as it comes: the client clears it before the next step."""
+        """Take a real-time command as it arrives: the client clears it before the next step."""
         command = self._command(controller)
         if command in _STOPS and self._phase == "ready":
             controller.say(f"stop command {command} was received")

@@ -26,14 +26,14 @@ RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, FT300_PORT = 30004, 30003, 29999, 63351
 MARKER_PORT = 63400
 """Simulated tracking of points on the branch: JSON lines, 30 a second."""
 CAMERA_PORT = 63401
-"""Simulated depth camera: an image for each camera that is sent."""
+"""Simulated depth camera: one image for each camera received."""
 
 _FT300_SECONDS = 1 / 100
 _MARKER_SECONDS = 1 / 30
 _MARKER_SIGMA_M = 0.5e-3
 
-# A process that was held up catches up at most this much; beyond it the controller's clock stood
-# still. A real controller is never held up: its watchdog must not count what only this one lost.
+# Longest delay that is caught up; beyond it the controller's clock stands still. A real controller
+# is never delayed: its watchdog must not count time that only this process lost.
 _MOST_CATCH_UP = 0.01
 _SENDS_BEHIND = 1 << 20  # bytes a client may leave unread before it is cut off
 
@@ -42,8 +42,8 @@ class Server:
     """Serves one controller on a loopback address.
 
     Attributes:
-        delay: Seconds by which every message is late, each way (a bad cable).
-        silent: Ports accept and read, but answer nothing.
+        delay: Delay of every message in each direction (a bad cable) [s].
+        silent: Ports accept and read, but do not answer.
     """
 
     def __init__(self, controller: Controller, address: str):
@@ -65,7 +65,7 @@ class Server:
         """Open the ports.
 
         Raises:
-            WorkError: one is taken.
+            WorkError: a port is in use.
         """
         ports: dict[int, Callable[[Any, Any], Awaitable[None]]] = {
             SCRIPT_PORT: self._serve_scripts}
@@ -98,7 +98,7 @@ class Server:
         self._servers = []
 
     def cut(self) -> None:
-        """Cut every connection, without a word."""
+        """Cut every connection without a message."""
         for transport in list(self.transports):
             transport.abort()
 
@@ -130,7 +130,7 @@ class Server:
             action()
 
     def send(self, to: asyncio.StreamWriter | asyncio.Transport, data: bytes) -> None:
-        """Send, late where there is a delay, never where silent."""
+        """Send, delayed if there is a delay, never if silent."""
         if self.silent:
             return
         self.later(lambda: None if to.is_closing() else to.write(data))
@@ -151,10 +151,10 @@ class Server:
             try:
                 await serve(reader, writer)
             except (ConnectionError, asyncio.IncompleteReadError):
-                # The client is gone; that is its right.
+                # The client has disconnected, which is allowed.
                 self.controller.say("a connection was closed")
             except asyncio.CancelledError:
-                # The robot ends. Passed on, asyncio's streams would print it as a fault of ours.
+                # The robot ends. Passed on, asyncio's streams would report it as an error.
                 return
             finally:
                 self.transports.discard(writer.transport)
@@ -166,7 +166,7 @@ class Server:
         text = ""
         while chunk := await reader.read(65536):
             text += chunk.decode("utf-8", "replace")
-            # A script is whole when a line holds nothing but `end`, from its first column.
+            # A script is complete at a line that is just `end`, from its first column.
             while (stop := _end_of_script(text)) is not None:
                 script, text = text[:stop], text[stop:]
                 self.later(lambda script=script: self.controller.load_script(script))
@@ -177,7 +177,7 @@ class Server:
         while not writer.is_closing():
             fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
             self.send(writer, f"( {fields} )".encode())
-            # Held up it leaves readings out and keeps its beat.
+            # After a delay it omits readings and keeps its cycle.
             behind = time.perf_counter() - due
             due += _FT300_SECONDS * (1 + behind // _FT300_SECONDS)
             await asyncio.sleep(due - time.perf_counter())
@@ -199,7 +199,7 @@ class Server:
 
     async def _serve_camera(self, reader: asyncio.StreamReader,
                             writer: asyncio.StreamWriter) -> None:
-        """Each line asks with a camera's content; the answer is a line and a packed image."""
+        """Each line has a camera's content; the answer is a line and a packed image."""
         while line := await reader.readline():
             try:
                 asked = Camera.model_validate_json(line)
@@ -216,9 +216,9 @@ class Server:
 
 
 class _Client(asyncio.Protocol):
-    """One client whose words are taken as they come.
+    """One client whose messages are taken as they arrive.
 
-    A stream's reader would leave them for the loop's next turn, which is part of a stop's time.
+    A stream's reader would leave them for the loop's next cycle, which is part of a stop's time.
     """
 
     def __init__(self, server: Server):
@@ -237,11 +237,11 @@ class _Client(asyncio.Protocol):
     def connection_lost(self, error: Exception | None) -> None:
         self._server.transports.discard(self.transport)
         if error is not None:
-            # The client is gone; that is its right.
+            # The client has disconnected, which is allowed.
             self._server.controller.say("a connection was closed")
 
     def read(self, data: bytearray) -> None:
-        """Take from ``data`` what is whole."""
+        """Remove the complete messages from ``data``."""
         raise NotImplementedError
 
 
@@ -293,7 +293,7 @@ class _RtdeClient(_Client):
                 and controller.step_count % self._every == 0)
 
     def _release(self) -> None:
-        """Give back the input registers that this client wrote."""
+        """Release the input registers that this client wrote."""
         owners = self._server.owners
         for name in [name for name, owner in owners.items() if owner is self]:
             del owners[name]
@@ -356,7 +356,7 @@ class _RtdeClient(_Client):
 
 
 def new_loop() -> asyncio.AbstractEventLoop:
-    """Return a loop whose sleeps have microseconds."""
+    """Return a loop whose sleeps have microsecond resolution."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 

@@ -1,5 +1,4 @@
-"""What the virtual robot computes at every step, compiled: tool pose and speed, servo, and the
-wrench of the branch in its gripper.
+"""Compiled computations of every step: tool state, servo and the held branch's wrench.
 """
 
 import numpy as np
@@ -16,9 +15,9 @@ def tool_state(flange: np.ndarray, slopes: np.ndarray, speeds: np.ndarray, tool:
     """Return the tool's pose [6] and its speed [6] in the base's frame.
 
     Args:
-        flange: Its frame, shape [4, 4].
+        flange: Frame of the flange, shape [4, 4].
         slopes: The arm's Jacobian, shape [6, n].
-        speeds: Of the joints [rad/s], shape [n].
+        speeds: Joint speeds [rad/s], shape [n].
         tool: Frame of the tool in the flange's, shape [4, 4].
     """
     tip = flange @ tool
@@ -38,8 +37,8 @@ def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain:
                lookahead: float, step: float, largest: float) -> tuple[np.ndarray, np.ndarray]:
     """One step of servoj: a spring of ``gain`` [1/s^2] to the target, damped by ``lookahead`` [s].
 
-    The controller's own law is not published. This one has its known traits: a target that moves
-    steadily is followed ``lookahead`` seconds behind, more gain follows more closely, and a short
+    The controller's own law is not published. This one has its known properties: a steadily moving
+    target is followed ``lookahead`` seconds behind, more gain follows more closely, and a short
     lookahead with a high gain overshoots.
 
     Returns:
@@ -63,18 +62,18 @@ def led_on(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, ways: n
     """Return the wrench [6] of a held branch near where it was solved.
 
     Args:
-        frame, wrench, stiffness: Where it was solved [4, 4], the wrench there [6] and its
+        frame, wrench, stiffness: Frame of the solution [4, 4], the wrench there [6] and its
             derivative to position and rotation [6, 6].
-        ways, bends: Ways [m], shape [n, 3], and by how much the stiffness changes over each,
-            shape [n, 6, 6]; the first that leads somewhere counts first.
-        patch: Frame of the held patch if nothing gave way, shape [4, 4].
-        compliance: What the patch stays behind by [m/N].
+        ways, bends: Displacements [m], shape [n, 3], and the change of stiffness over each, shape
+            [n, 6, 6]; earlier ones take precedence.
+        patch: Frame of the held patch with zero compliance, shape [4, 4].
+        compliance: Distance of the patch behind the gripper per force [m/N].
     """
     change = np.empty(6)
     change[:3] = patch[:3, 3] - frame[:3, 3]
     change[3:] = rotation_vector(patch @ inverse_of(frame))
     at, felt = change.copy(), np.zeros(6)
-    # The stiffness is that of the way that the patch goes, which the force tells.
+    # The stiffness is that of the patch's displacement, which depends on the force.
     for _ in range(2 if compliance > 0.0 and len(ways) > 0 else 1):
         secant, left = stiffness.copy(), at[:3].copy()
         for way, bend in zip(ways, bends):  # noqa: B905 (no strict in a kernel)

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
-"""Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
+"""File in the branch folder that grows while an estimate runs, and lets a stopped one resume."""
 _BASES = ".reduced-*.npz"
-"""Beside them too: bases of reduced models, from which the next estimate starts."""
+"""Bases of reduced models in the same folder, from which the next estimate starts."""
 
 
 class EstimateOptions(RunOptions):
-    """How an estimate is run."""
+    """Options of an estimate's run."""
 
     groups: ClassVar[Groups] = {"input": ("bag", "cell"), "running": ("resume", "follow", "pace")}
     common = ("bag",)
@@ -55,26 +55,27 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
              resume: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Estimate Young's modulus from the pulls of a branch folder.
 
-    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. Stopped by Ctrl-C it keeps the
-    best so far in ``estimate.json`` (``converged`` is then false).
+    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. If stopped by Ctrl-C it keeps the
+    best result so far in ``estimate.json`` (``converged`` is then false).
 
     Args:
-        branch_folder: Of the branch.
-        settings: What the result depends on.
+        branch_folder: Folder of the branch.
+        settings: Settings that determine the result.
         force: Estimate again even if nothing has changed.
-        resume: Start at the best that a stopped run of the same estimate found. It ends at the
-            same moduli to the fit's tolerance, not to the last digit; without it nothing that a
-            stopped or killed run left behind counts.
-        progress: Called as it goes.
+        resume: Start from the best result of a stopped run of the same estimate. It ends at the
+            same moduli to the fit's tolerance, not to the last digit. Without it nothing from a
+            stopped or killed run is used.
+        progress: Called during the work.
 
     Returns:
         DESIGN's keys and ``warnings``.
 
     Raises:
-        InputError: no pulls, or pulls that cannot tell Young's modulus.
-        WorkError: the simulation finds no equilibrium, or the fit ends at no result (it did not
-            converge, or at a bound, or the data leave the moduli open); nothing is written.
-        Cancelled: after the best so far was kept.
+        InputError: there are no pulls, or pulls that cannot determine Young's modulus.
+        WorkError: the simulation finds no equilibrium, or the fit has no result (it did not
+            converge, ended at a bound, or the data do not determine the moduli); nothing is
+            written.
+        Cancelled: the best result so far was kept.
     """
     branch = Branch.open(branch_folder)
     with branch.writing("limber estimate"):
@@ -147,7 +148,7 @@ def _bases(folder: Path) -> dict[str, str]:
 
 
 def _finished_bases(branch: Branch) -> dict[str, str]:
-    """Bases that finished estimates left; others are removed, since a killed run wrote them."""
+    """Bases of finished estimates; others are removed, as they come from a killed run."""
     entry = branch.manifest.stages.get("estimate")
     known = entry.result.get("bases", {}) if entry else {}
     kept = {}
@@ -161,12 +162,11 @@ def _finished_bases(branch: Branch) -> dict[str, str]:
 
 def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
            training_count: int = 60, progress: Progress = SILENT) -> dict[str, Any]:
-    """Estimate frame by frame from the first pull that is named (or the only one).
+    """Estimate frame by frame from the first named pull (or the only one).
 
-    A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
-    replayed at ``pace`` times its own speed (0: as fast as it goes). Writes
-    ``estimate-online.json`` with the estimate after every frame; `limber estimate` afterwards
-    gives the final word.
+    A pull that is still being recorded is read as it arrives. A finished one is replayed at
+    ``pace`` times its own speed (0: as fast as possible). Writes ``estimate-online.json`` with the
+    estimate after every frame; `limber estimate` afterwards gives the final result.
 
     Raises:
         InputError: no such pull, or one without markers.
@@ -189,8 +189,8 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
 
 
 def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Callable[[], Path]]:
-    """The pull to follow, and what tells its folder; one that is being recorded is not in the
-    manifest, and stands elsewhere than when it has ended.
+    """The pull to follow, and what identifies its folder. A pull that is being recorded is not in
+    the manifest, and its folder is a different one until it has ended.
     """
     from limber.store.loading import pull_names
 
@@ -209,13 +209,13 @@ def _cloud(branch: Branch) -> np.ndarray | None:
     if not branch.has("cloud.ply"):
         return None
     cloud = read_cloud(branch.path("cloud.ply"))
-    # Leaves say nothing of axes and radii.
+    # Leaves give no information on axes and radii.
     return cloud.points[cloud.attributes.get("leaf", np.zeros(len(cloud))) == 0]
 
 
 def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
                      settings: EstimateSettings, progress: Progress) -> None:
-    """Score the branch's pulls that this estimate was not asked to use."""
+    """Score the branch's pulls that this estimate did not use."""
     from limber.estimation.judgement import foretell
     from limber.store.loading import known_pulls, load_pulls
 
@@ -244,7 +244,7 @@ def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptio
 
 def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: EstimateSettings,
               progress: Progress) -> EstimateSettings:
-    """Bring a recording in; the estimate's pulls are those asked for and this one."""
+    """Import a recording; the estimate's pulls are the requested ones and this one."""
     import re
 
     from limber.recordings.settings import ImportSettings

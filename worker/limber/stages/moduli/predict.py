@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progress = SILENT,
             ) -> dict[str, Any]:
-    """Simulate the branch at rest under another load than the recorded one; writes nothing.
+    """Simulate the branch at rest under another load than the recorded one; writes no file.
 
     Returns:
         See :func:`limber.estimation.prediction.predict_rest`.
 
     Raises:
-        InputError: no load, nothing estimated yet, or no such pull.
-        WorkError: the branch finds no equilibrium under the load.
+        InputError: there is no load, no estimate yet, or no such pull.
+        WorkError: no equilibrium of the branch was found under the load.
     """
     from limber.estimation.estimate_file import read_estimate
     from limber.estimation.prediction import predict_rest, require_one_load

@@ -24,13 +24,14 @@ if TYPE_CHECKING:
 
 def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
           progress: Progress = SILENT) -> dict[str, Any]:
-    """Estimate one level of Young's modulus, and damping, from a branch that is let go.
+    """Estimate one level of Young's modulus, and damping, from a released branch.
 
     The modulus keeps its pattern along the branch. Writes ``swing.json``, and the modulus into
     ``mesh.vtu``.
 
     Raises:
-        InputError: no such swing, or nothing swings in it. WorkError: the fit does not converge.
+        InputError: there is no such swing, or nothing swings in it. WorkError: the fit does not
+        converge.
     """
     from limber.estimation.forward.forward_model import under_its_weight
     from limber.estimation.vibration.free_swing import SwingSeen, fit_swing

@@ -1,8 +1,9 @@
 """Estimate Young's modulus and damping from ringing (accelerometer, strain gauge, video).
 
-RECORD is a table of times and one column or more of accelerations, strains or displacements in any
-unit, or a C3D file of markers. The branch is plucked and left to itself. Its frequencies tell one
-level of Young's modulus, as sure as its density and radii are; the pattern along the branch stays.
+RECORD is a table of times and one or more columns of accelerations, strains or displacements in any
+unit, or a C3D file of markers. The branch is plucked and left to vibrate. Its frequencies determine
+one level of Young's modulus, as accurately as its density and radii are known; the pattern along
+the branch is kept.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel
 
 _MESH_DEVIATION = 0.02
-"""Of Young's modulus: what quadratic tetrahedra of the usual size are too stiff by, at most."""
+"""Largest error of Young's modulus due to the mesh: quadratic tetrahedra are too stiff."""
 _CLOSE = 1.15
-"""Modes within this ratio of the first may be the one that is seen: two planes of bending."""
+"""Frequency ratio within which the observed mode may be another: two bending planes."""
 _ROUNDS = 8
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 1000.0
-"""No plant's branch swings slower or faster: its record's times are in another unit."""
+"""Range of a plant branch's frequencies; outside it the record's times are in another unit."""
 
 
 class VibrationInputs(BranchInputs):
@@ -44,7 +45,7 @@ class VibrationInputs(BranchInputs):
 
 
 class VibrationSettings(Settings):
-    """What is known beside the record."""
+    """Settings of the record."""
 
     groups: ClassVar[Groups] = {"record": ("start", "sensor"),
                                 "known": ("density_sigma", "radius_sigma")}
@@ -63,7 +64,7 @@ class VibrationSettings(Settings):
 
 def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
               force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Estimate one level of Young's modulus, and damping, from a record of free ringing.
+    """Estimate one level of Young's modulus, and damping, from a record of free vibration.
 
     Writes ``vibration.json``, and the modulus into ``mesh.vtu``.
 
@@ -76,8 +77,8 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
         vibration its damping.
 
     Raises:
-        InputError: the record cannot be read, or does not ring. WorkError: no modulus has such a
-            frequency.
+        InputError: the record cannot be read, or shows no vibration. WorkError: no modulus has such
+            a frequency.
     """
     from limber.estimation.vibration.ringing import identify, read_record
     from limber.store.loading import load_branch, load_mesh
@@ -116,13 +117,13 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
 
 
 def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> dict[str, Any]:
-    """Return the factor on the modulus that gives a model the record's first frequency.
+    """Return the factor on the modulus for which a model has the record's first frequency.
 
     Returns:
         ``young_factor``, ``deviation`` (of its logarithm) and ``model_frequencies_hz``.
 
     Raises:
-        WorkError: none does.
+        WorkError: there is no such factor.
     """
     from limber.mechanics.dynamics.modes import lowest_modes
 
@@ -132,7 +133,7 @@ def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> 
         way = np.log(wanted / found[0])
         if abs(way) < 1e-5:
             break
-        # Weight stiffens a branch too, or softens it: the slope is not quite one half.
+        # Weight also stiffens or softens a branch: the slope is not exactly one half.
         slope = 0.5 if last is None else np.clip(
             (np.log(found[0]) - last[1]) / (np.log(factor) - last[0]), 0.1, 2.0)
         last = np.log(factor), np.log(found[0])
@@ -143,7 +144,7 @@ def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> 
                         "Check density, --sensor and the record's unit of time.")
     slope = 0.5 if last is None else slope
     near = found[found < _CLOSE * found[0]]
-    # Which of two planes of bending was seen is not known where the record does not part them.
+    # The observed plane of bending is unknown if the record does not separate the two.
     is_parted = len(seen.frequencies) > 1 and seen.frequencies[1] < _CLOSE * wanted
     planes = 0.0 if is_parted else float(np.log(near[-1] / near[0])) / np.sqrt(3.0)
     deviation = np.sqrt((seen.frequency_deviations[0] / wanted / slope) ** 2

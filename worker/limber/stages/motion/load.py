@@ -31,7 +31,7 @@ _Fruit = tuple[float, float, float, float]
 
 
 class LoadSettings(Settings):
-    """What acts beside the weight that the branch had when it was scanned."""
+    """Loads beside the weight that the branch had when it was scanned."""
 
     groups: ClassVar[Groups] = {
         "loads": ("wind", "drag", "snow", "fruit", "cut"),
@@ -95,19 +95,19 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     """Bring the branch to rest under loads.
 
     With a name it writes ``loads/NAME.json``, and ``frames/load-NAME.pc2``, ``.json`` and ``.npz``:
-    the branch as scanned, and at rest under the loads; what is stored of the same branch and loads
-    is not worked out again, unless ``force``. Without a name it writes nothing.
+    the branch as scanned, and at rest under the loads. Stored results of the same branch and loads
+    are not computed again, unless ``force``. Without a name it writes no file.
 
     Returns:
-        What :func:`~limber.mechanics.loads.load_effects.load_effects` tells (sag, greatest strain
+        The output of :func:`~limber.mechanics.loads.load_effects.load_effects` (sag, largest strain
         and strain along the main path, frequencies; with ``limit_load`` how many times the loads it
-        bears; each with its interval, None where nothing has told how sure the moduli are), and
-        ``frequencies_before_hz``. With gusts all of it is of their peak, and ``gusts`` has what
-        :func:`~limber.mechanics.loads.gust_loads.with_peak` tells.
+        bears; each with its interval, None if the uncertainty of the moduli is unknown), and
+        ``frequencies_before_hz``. With gusts all values are those of their peak, and ``gusts`` has
+        the output of :func:`~limber.mechanics.loads.gust_loads.with_peak`.
 
     Raises:
-        InputError: no load, one off the branch, or gusts without wind. WorkError: it finds no
-            rest under it.
+        InputError: there is no load, one off the branch, or gusts without wind. WorkError: there is
+            no equilibrium under it.
     """
     from limber.mechanics.added_masses import PointMass
     from limber.mechanics.dynamics.modes import lowest_modes
@@ -151,7 +151,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
 
 
 def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
-    """What the result depends on beside the settings, as the store takes it."""
+    """Further inputs of the result beside the settings, in the form for the store."""
     reads = [file for file in ("mesh.vtu", "skeleton.swc", "skeleton.csv", "point_masses.json",
                                "targets.json", "estimate.json") if branch.has(file)]
     # Damping and the interval may come from a swing's result alone.
@@ -188,7 +188,7 @@ def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], prestr
 
 
 def _gusts(settings: LoadSettings) -> Gusts | None:
-    """The gusts that were asked for."""
+    """The requested gusts."""
     from limber.mechanics.loads.gust_loads import Turbulence, WindRecord
 
     if settings.gust is not None and settings.gust_record is not None:

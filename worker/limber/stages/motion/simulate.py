@@ -30,7 +30,7 @@ _MOST_REPLAYED = 120
 
 
 class SimulateInputs(BranchInputs):
-    """A branch folder, and the grasp's way."""
+    """A branch folder, and the grasp's path."""
 
     groups: ClassVar[Groups] = {"motion": ("along", "pull")}
 
@@ -50,18 +50,18 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
 
     Args:
-        branch_folder: With a mesh.
-        settings: How to pull.
-        along: The grasp's way instead of a motion of the settings.
-        key: Of its entry in the manifest.
+        branch_folder: Folder with a mesh.
+        settings: Settings of the pull.
+        along: The grasp's path instead of a motion of the settings.
+        key: Key of its entry in the manifest.
 
     Returns:
         The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
         ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
 
     Raises:
-        InputError: options that do not fit. ConvergenceError: the branch could not follow; the
-            frames up to there are written.
+        InputError: the options do not fit together. ConvergenceError: the simulation of the branch
+            did not converge; the frames up to there are written.
     """
     from limber.mechanics.materials.law import law_digest
     from limber.mechanics.materials.material_registry import material_named
@@ -174,10 +174,10 @@ def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
 
 def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
             ) -> tuple[SimulateSettings, PoseTable]:
-    """Return the settings and the gripper's way of a recording.
+    """Return the settings and the gripper's path of a recording.
 
     Raises:
-        InputError: there is none of that name, or its gripper does not lead the branch.
+        InputError: there is no recording of that name, or its gripper does not drive the branch.
     """
     from limber.mechanics.dynamics.pose_table import PoseTable
     from limber.recordings.recording import read_pull
@@ -201,7 +201,7 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
             "grasp_point": grasp.point_m, "grasp_radius": grasp.radius_m,
             "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None}
     if is_static:
-        # Each frame is an equilibrium of its own, and a recording may last for minutes.
+        # Each frame is a separate equilibrium, and a recording may last for minutes.
         told["frame_rate"] = min(settings.frame_rate, _MOST_REPLAYED / way.duration)
     return settings.model_copy(update=told), way
 

@@ -1,4 +1,4 @@
-"""Motions of an arm by itself: to joint angles past cell and branch, and back from the branch."""
+"""Motions of an arm alone: to joint angles past cell and branch, and back from the branch."""
 
 from itertools import pairwise
 
@@ -24,10 +24,10 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
               ) -> Trajectory:
     """Return the motion from joint angles ``start`` [n] to ``goal`` [n], the gripper empty.
 
-    It keeps away from cell, branch and the arm itself, and is slow near the branch.
+    It keeps clear of cell, branch and the arm itself, and is slow near the branch.
 
     Raises:
-        NoPathError: there is no such way, or start or goal touch something.
+        NoPathError: there is no such path, or start or goal collide.
     """
     _require_limits(cell, goal)
     if np.abs(goal - start).max() < 1e-3:
@@ -45,14 +45,14 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
 
 
 def away_from_branch(cell: Cell, joints: np.ndarray, pose: np.ndarray) -> Trajectory:
-    """Return the straight motion of an open gripper back from the branch, as it came there.
+    """Return the straight retreat of an open gripper from the branch, opposite to its approach.
 
     Args:
-        joints: Where the arm is [rad], shape [n].
-        pose: Of the gripper's middle by the controller, base frame [m, rad], shape [6].
+        joints: Current joint angles [rad], shape [n].
+        pose: Pose of the gripper's middle from the controller, base frame [m, rad], shape [6].
 
     Raises:
-        NoPathError: the arm cannot go so far.
+        NoPathError: the arm cannot reach so far.
     """
     here = matrices(pose)
     back = here.copy()

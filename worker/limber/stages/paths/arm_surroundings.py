@@ -1,4 +1,4 @@
-"""What an arm must not meet on a way of its own: cell, branch and its own links."""
+"""Obstacles of an arm's own motion: cell, branch and its own links."""
 
 from itertools import combinations
 
@@ -14,12 +14,12 @@ _SPACING_M = 0.03  # of points along a rod
 
 
 class ArmSurroundings:
-    """Tells how far an arm with its gripper is from all that it could meet.
+    """Computes the distance of an arm with its gripper from all obstacles.
 
     Args:
         cell: Arm, gripper and base.
-        obstacles: Of the cell, branch frame.
-        branch: The branch, which is met as well; None: there is none.
+        obstacles: Obstacles of the cell, branch frame.
+        branch: The branch, also an obstacle; None: there is none.
     """
 
     def __init__(self, cell: Cell, obstacles: tuple[Obstacle, ...], branch: Skeleton | None):
@@ -27,20 +27,23 @@ class ArmSurroundings:
         self._base = matrices(np.array(cell.base.pose))
         self._branch = None if branch is None else Limbs.of(branch)
         rods = self._rods(np.array(cell.arm.home)[None])
-        # Neighbours overlap by their shape; so do links that touch when the arm stands at home.
+        # Neighbours overlap by their shape; so do links that touch in the home pose.
         self._pairs = [pair for pair in combinations(range(rods[0].shape[1]), 2)
                        if pair[1] - pair[0] > 1 and _apart(rods, *pair)[0] > 0.0]
 
     def free(self, joints: np.ndarray) -> np.ndarray:
-        """Return whether joint angles [n, joints] leave :data:`_CLEAR_M`, shape [n]."""
+        """Return whether joint angles [n, joints] keep the clearance :data:`_CLEAR_M`, shape [n].
+        """
         return self.clearance(joints) > _CLEAR_M
 
     def clearance(self, joints: np.ndarray) -> np.ndarray:
-        """Return the least distance from anything at joint angles [n, joints] [m], shape [n]."""
+        """Return the smallest distance to any obstacle at joint angles [n, joints] [m], shape [n].
+        """
         rods = self._rods(joints)
         found = np.full(len(joints), np.inf)
         for pair in self._pairs:
-            # Links of one arm may come closer to each other than to what is not known exactly.
+            # Links of one arm may come closer to each other than to objects with uncertain
+            # positions.
             found = np.minimum(found, _apart(rods, *pair) + _CLEAR_M)
         places, radii = self._places(rods)
         for obstacle in self._obstacles:
@@ -49,7 +52,7 @@ class ArmSurroundings:
         return np.minimum(found, self.from_branch(joints))
 
     def from_branch(self, joints: np.ndarray) -> np.ndarray:
-        """Return the least distance from the branch at joint angles [n, joints] [m], shape [n]."""
+        """Return the smallest distance to the branch at joint angles [n, joints] [m], shape [n]."""
         if self._branch is None:
             return np.full(len(joints), np.inf)
         places, radii = self._places(self._rods(joints))
@@ -91,14 +94,14 @@ class Limbs:
 
     @classmethod
     def of(cls, skeleton: Skeleton) -> "Limbs":
-        """Return those of a skeleton."""
+        """Return the rods of a skeleton."""
         child = np.flatnonzero(np.asarray(skeleton.parent) >= 0)
         parent = np.asarray(skeleton.parent)[child]
         return cls(skeleton.nodes[parent], skeleton.nodes[child],
                    np.maximum(skeleton.radius[child], skeleton.radius[parent]))
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Return how far ``points`` [n, 3] are outside [m], shape [n]."""
+        """Return the distance of ``points`` [n, 3] outside the surface [m], shape [n]."""
         found = np.full(len(points), np.inf)
         for start, way, square, radius in zip(self._starts, self._ways, self._squares,
                                               self._radii, strict=True):
@@ -109,7 +112,7 @@ class Limbs:
 
 
 def _apart(rods: tuple[np.ndarray, np.ndarray, np.ndarray], first: int, second: int) -> np.ndarray:
-    """Distance of two rods [m], shape [n], from points along the one to the other."""
+    """Distance of two rods [m], shape [n], from points along one to the other."""
     starts, ends, radii = rods
     way = ends[:, second] - starts[:, second]
     square = np.maximum((way**2).sum(axis=1), 1e-18)

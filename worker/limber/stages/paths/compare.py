@@ -37,7 +37,7 @@ class CompareInputs(BranchInputs):
 
 
 class CompareSettings(Settings):
-    """Trials, the goal that they share, and how is planned."""
+    """Trials, their common goal, and the planning."""
 
     groups: ClassVar[Groups] = {"trials": ("trials", "goal", "goal_tolerance", "seed"),
                                 "solver": ("max_detour", "iterations", "engine")}
@@ -61,11 +61,11 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
             progress: Progress = SILENT) -> dict[str, Any]:
     """Stage ``compare``: plan from random starts with each planner, on the branch's energy field.
 
-    Writes ``comparisons/NAME.csv``, a row a path, and ``comparisons/NAME.png``.
+    Writes ``comparisons/NAME.csv``, one row per path, and ``comparisons/NAME.png``.
 
     Raises:
-        BranchFolderError: no energy field. InputError: a name that is none.
-        NoPathError: no trial has a path; says why.
+        BranchFolderError: there is no energy field. InputError: the name is invalid.
+        NoPathError: no trial has a path; the message gives the reason.
     """
     from limber.planning.experiments.compared_planners import run_trials, summarised
     from limber.planning.field.energy_field import EnergyField

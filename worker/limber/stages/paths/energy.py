@@ -20,7 +20,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
     """Stage ``energy``: sample grasp poses and fit the field; writes ``energy.npz``.
 
     Raises:
-        BranchFolderError: no mesh yet.
+        BranchFolderError: there is no mesh yet.
         WorkError: too few poses could be solved.
     """
     from limber.planning.field.energy_field import fit_field

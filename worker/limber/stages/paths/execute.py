@@ -51,7 +51,7 @@ class ExecuteInputs(BranchInputs):
 
 
 class ExecuteSettings(Settings):
-    """How the path is followed."""
+    """Settings for following the path."""
 
     groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation", "gravity")}
 
@@ -84,20 +84,20 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
             options: ExecuteOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
     """Check a plan for a robot, and with ``arm`` follow it.
 
-    The branch's force along the path is solved anew on the full model; the guard stops where the
-    measured one differs from it. Armed, the robot approaches the branch, the gripper closes, the
-    path is followed, held and gone back, the gripper opens and the robot leaves.
+    The branch's force along the path is computed again with the full model; the guard stops if the
+    measured force differs from it. If armed, the robot approaches the branch and the gripper
+    closes; the path is followed, held and retraced; then the gripper opens and the robot leaves.
 
     Returns:
         ``armed``, ``reached``, ``stop_reason``, ``after_stop`` (as
         :func:`limber.robot.operator_decisions.retreat_if_chosen` returns it), ``peak_force_n``,
-        ``path_error_m`` (None in a dry run) and what was computed: duration, predicted peak force,
-        distances from singularities and joint limits, where the robot has to stand.
+        ``path_error_m`` (None in a dry run) and computed values: duration, predicted peak force,
+        distances from singularities and joint limits, required position of the robot.
 
     Raises:
-        InputError: plan, cell and branch do not belong together, or nobody confirmed.
-        NoPathError: the arm cannot follow the path; says where and why.
-        SafetyStop: it was stopped; the log is in the folder all the same.
+        InputError: plan, cell and branch do not belong together, or the user did not confirm.
+        NoPathError: the arm cannot follow the path; the message states where and why.
+        SafetyStop: the motion was stopped; the log is nevertheless in the folder.
     """
     branch, cell, settings, motion, result = planned_motion(
         folder, name, cell_file, settings, progress=progress, is_to_move=options.arm)
@@ -112,8 +112,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
 def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings, *,
                    progress: Progress, is_to_move: bool,
                    ) -> tuple[Branch, Cell, ExecuteSettings, RobotMotion, dict[str, Any]]:
-    """Return branch, cell, settings and the motion of a plan, checked for the robot, and what was
-    computed of it.
+    """Return branch, cell, settings and the checked motion of a plan, and the computed values.
 
     Raises:
         InputError, NoPathError: as :func:`execute`.
@@ -130,13 +129,13 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
 
     progress(0.02, "inverse kinematics")
     model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
-    # The plan's own turn of the gripper is the one that was checked against obstacles.
+    # The plan's own rotation of the gripper is the one checked against obstacles.
     rotation = settings.gripper_rotation or (told.get("robot") or {}).get("gripper_rotation")
     asked = {"speed": settings.speed, "rotation": rotation,
              "blocked": blocked_by(cell, cell_obstacles(cell, Path(cell_file).parent))}
     planned = _planned(branch, name, model.rest_position)
     if np.isfinite(planned).all():
-        # By the plan's own poses: whether the arm reaches them is known at once, forces are not.
+        # With the plan's own poses: whether the arm reaches them is known at once, forces are not.
         at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
         robot_motion(cell, at_once, model.reach.axis, **asked)
     progress(0.05, "forces along the path")
@@ -150,7 +149,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
 
 def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
                   progress: Progress) -> tuple[Branch, Cell, ExecuteSettings, dict[str, Any]]:
-    """Read branch and cell, and what a plan tells of its robot; refuse what is of another."""
+    """Read branch and cell, and the robot data of a plan; refuse those that do not match."""
     from limber.robot.cell.cell import read_cell
     from limber.robot.cell.compatibility import check_branch, check_plan
 
@@ -167,8 +166,7 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
 
 
 def _told(branch: Branch, name: str) -> dict[str, Any]:
-    """What a plan's file says of the robot that it was made for and of its check in motion, as far
-    as it says it in the way of this program."""
+    """The robot and the check in motion that a plan's file states, if in this program's format."""
     from limber.planning.plan_file import read_plan_summary
 
     file = f"plans/{name}.json"
@@ -187,7 +185,7 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
                       "is followed at that speed at most. Plan with a higher --speed to go "
                       "faster.")
     limits = cell.limits.model_copy(update={
-        # The plan's law spends that share of it along the way, the robot's all.
+        # The plan's motion law uses that fraction of it along the path, the robot's all of it.
         "acceleration_m_s2": min(cell.limits.acceleration_m_s2, np.sqrt(0.5) * acceleration)})
     return (settings.model_copy(update={"speed": min(settings.speed, speed)}),
             cell.model_copy(update={"limits": limits}))
@@ -195,10 +193,11 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
 
 def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progress: Progress,
                ) -> Predicted:
-    """What the model predicts from rest to the path's end, through ``positions`` [n, 3].
+    """Prediction of the model from rest to the path's end, through ``positions`` [n, 3].
 
-    The grasp goes through the plan's positions turned as the branch would turn by itself, close
-    enough that straight lines between stretch nothing; the wrench is that of the branch clamped so.
+    The grasp passes the plan's positions, rotated as the branch itself would rotate. Steps are
+    small enough that straight lines between positions stretch nothing. The wrench is that of the
+    branch clamped in this way.
     """
     from limber.mechanics import Grasp, follow_poses
     from limber.mechanics.sensitivities import grasp_slopes
@@ -242,7 +241,7 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
 
 def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, uncertainty: YoungUncertainty,
               ) -> np.ndarray:
-    """Covariance of the force for what is not known of Young's modulus [N^2], shape [3, 3]."""
+    """Covariance of the force due to the uncertainty of Young's modulus [N^2], shape [3, 3]."""
     from limber.mechanics.sensitivities import static_sensitivities
 
     slopes = static_sensitivities(model, result, grasp, None, shares=uncertainty.shares.T)
@@ -251,7 +250,8 @@ def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, uncertaint
 
 
 def _force_sigma(cell: Cell, samples: np.ndarray) -> float:
-    """Of the smoothed force by the sensor's noise and what it has drifted since its tare [N]."""
+    """Deviation of the smoothed force due to the sensor's noise and its drift since the tare [N].
+    """
     from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
 
     minutes = (samples[-1, 0] - samples[0, 0] + _BEFORE_PATH_SECONDS) / 60.0
@@ -260,7 +260,7 @@ def _force_sigma(cell: Cell, samples: np.ndarray) -> float:
 
 
 def _closely(positions: np.ndarray) -> np.ndarray:
-    """Return positions [n, 3] with more between them, on a smooth line that hardly overshoots."""
+    """Return positions [n, 3] with more in between, on a smooth curve with little overshoot."""
     from scipy.interpolate import Akima1DInterpolator
 
     kept = np.r_[True, np.linalg.norm(np.diff(positions, axis=0), axis=1) > 1e-9]
@@ -274,10 +274,10 @@ def _closely(positions: np.ndarray) -> np.ndarray:
 
 
 def _planned(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
-    """Return the way of the grasp from rest to the path's end [m, rad], shape [n, 6].
+    """Return the path of the grasp from rest to the path's end [m, rad], shape [n, 6].
 
-    Rotations are the branch's own; NaN where the table has none. Approach and path as planned; a
-    path without a planned approach is led up to straight.
+    Rotations are those of the branch; NaN if the table has none. Approach and path are as planned;
+    a path without a planned approach gets a straight one.
     """
     from limber.recordings.recording import POSE_COLUMNS
 
@@ -291,7 +291,7 @@ def _planned(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
         planned = planned[[row.get("phase") != "return" for row in rows]]
     if len(planned) < 2:
         raise InputError(f"{path} has {len(planned)} points.", "This is not a path.", "Plan again.")
-    # The grasped piece at rest is where it is and not turned.
+    # At rest the grasped piece is at its own position and not rotated.
     start = np.r_[rest, np.zeros(3)]
     way = float(np.linalg.norm(planned[0, :3] - rest))
     leading = start + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
@@ -336,7 +336,7 @@ def _summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
 
 def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: Cell,
                    motion: RobotMotion) -> None:
-    """What the robot would do, for the viewport: poses in the branch's frame, joints, forces."""
+    """The robot's motion for the viewport: poses in the branch's frame, joints, forces."""
     from limber.core.numerics.rigid import matrices, pose_vectors
 
     base = matrices(np.array(cell.base.pose))
@@ -421,7 +421,7 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
 def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSettings,
            options: ExecuteOptions, batches: list[np.ndarray], live: LiveForce,
            progress: Progress) -> tuple[dict[str, Any], tuple[int, int] | None]:
-    """Go through approach, grasp, path, return and leaving; stops at the first that stops."""
+    """Execute approach, grasp, path, return and leaving; end at the first one that is stopped."""
     _open_at_start(cell, link, motion)
     progress(0.5, "taring: keep the gripper free")
     live.at("taring")
@@ -451,8 +451,9 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
 
 
 def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:
-    """Open the gripper where Limber drives it: it closes on the branch later, and a tare needs it
-    empty. Only at the path's start, as elsewhere it may hold something."""
+    """Open the gripper if Limber drives it: it closes on the branch later, and a tare needs it
+    empty. Only at the path's start, as elsewhere it may hold something.
+    """
     from limber.core.numerics.rigid import inverted, matrices, pose_vectors
     from limber.robot.motion.start_check import require_start
 

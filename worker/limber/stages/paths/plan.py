@@ -1,7 +1,7 @@
 """Plan the shortest and the gentlest path to a goal, and compare them.
 
-The field serves to search. Every energy, force and strain that is reported comes from the finite
-elements along the found paths; how far the field was off is reported beside them.
+The field is used for the search only. All reported energies, forces and strains are computed by
+finite elements along the paths found; the error of the field is reported beside them.
 """
 
 from __future__ import annotations
@@ -70,14 +70,15 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
          progress: Progress = SILENT) -> dict[str, Any]:
     """Plan paths on the branch's energy field.
 
-    Writes ``plans/NAME.json``, csv files of both paths, the whole motion, its poses at the
+    Writes ``plans/NAME.json``, CSV files of both paths, the whole motion, its poses at the
     controller's rate and the search trees, and the frames.
 
     Raises:
-        BranchFolderError: no energy field, or one of another geometry or material.
-        InputError: a name that is none, a start that is not allowed, or two goals.
-        NoPathError: no path; the message says why.
-        Cancelled: the best so far was kept, where there was one and no finished plan of the name.
+        BranchFolderError: there is no energy field, or one of another geometry or material.
+        InputError: the name is invalid, the start is not allowed, or there are two goals.
+        NoPathError: there is no path; the message gives the reason.
+        Cancelled: the best result so far was kept, if there was one and no finished plan of that
+        name.
     """
     from limber.planning.constraints.limits import Limits
     from limber.planning.field.energy_field import EnergyField
@@ -154,7 +155,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         if found.summary["stopped"] and finished:
             raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
                             "Run it again when there is time for it.")
-        # Whoever limits the strain knows the wood: nothing is assumed of it.
+        # A user who limits the strain knows the wood: no strength is assumed.
         if strength is not None or settings.max_strain is None:
             found.summary["strength"] = strength_of_plan(
                 strength, found.plan, found.summary.get("in_motion"), progress)
@@ -187,7 +188,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
 
 @dataclass(frozen=True)
 class _InCell:
-    """A cell, and the limits that hold in it."""
+    """A cell, and its limits."""
 
     cell: Cell
     obstacles: tuple[Obstacle, ...]
@@ -221,7 +222,7 @@ class _InCell:
                        acceleration=min(pace.acceleration, most.acceleration_m_s2))
 
     def check_goal(self, settings: PlanSettings) -> None:
-        """Raise NoPathError where the goal that is given lies inside an obstacle."""
+        """Raise NoPathError if the given goal is inside an obstacle."""
         from limber.planning.constraints.obstacles import closest
         from limber.planning.goals.goal_kinds import asked_kinds
 
@@ -239,7 +240,7 @@ class _InCell:
 
 
 def _stiffer(branch: Branch) -> float:
-    """Return how many times Young's modulus may be the estimate, by its widest interval.
+    """Return the largest ratio of Young's modulus to its estimate, by the widest interval.
 
     Raises:
         InputError: an interval has no upper end.
@@ -283,7 +284,7 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
         "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
         "energies_j": plan.energies, "forces_n": plan.force_sizes, "path": name})) + "\n",
         encoding="utf-8")
-    # What the scene can colour the surface by, at the vertices and in the order of the frames.
+    # Values for colouring the surface in the scene, at the vertices and in the order of the frames.
     model, mesh = grasp_model.model, grasp_model.mesh
     states = [strain_state(model, u) for u in displacements]
     np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
@@ -308,7 +309,7 @@ def _motion_table(motion: Way) -> str:
 
 
 def _setpoints(motion: Way, pace: Pace, rate: float) -> str:
-    """Return the grasp's poses every 1 / ``rate`` [s], and last at the motion's end."""
+    """Return the grasp's poses every 1 / ``rate`` [s], and at the motion's end."""
     from limber.planning.timing import poses_at, time_law
 
     phases = present(motion.phases, "phase of the motion")
@@ -320,7 +321,8 @@ def _setpoints(motion: Way, pace: Pace, rate: float) -> str:
 
 
 def _trees_table(found: PlannedMotion) -> str:
-    """A row a node: its tree, its position, and the row of that tree that it hangs on, -1: none."""
+    """One row per node: its tree, its position, and the row of its parent in that tree (-1: none).
+    """
     lines = ["planner,x_m,y_m,z_m,parent"]
     for planner, tree in found.trees.items():
         small = tree.pruned(_MOST_NODES)

@@ -1,4 +1,4 @@
-"""What a robot's cell asks of a plan: its workspace, its obstacles, and that the arm reaches."""
+"""Requirements of a robot's cell on a plan: workspace, obstacles, and the arm's reach."""
 
 from functools import partial
 from pathlib import Path
@@ -38,10 +38,10 @@ _LARGE = 20.0  # [m] an obstacle that is larger is in another unit
 
 
 def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
-    """Return the cell of a file, checked to be this branch's.
+    """Return the cell of a file after checking that it is this branch's.
 
     Raises:
-        InputError: it cannot be read, or is another branch's.
+        InputError: it cannot be read, or belongs to another branch.
     """
     cell = read_cell(path)
     if warning := check_branch(cell, branch.uuid, branch.folder):
@@ -50,7 +50,7 @@ def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
 
 
 def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
-    """Return the cell's obstacles; files of meshes lie in ``folder``.
+    """Return the cell's obstacles; mesh files are in ``folder``.
 
     Raises:
         InputError: a mesh cannot be read, has holes, or is in another unit.
@@ -74,7 +74,7 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
 
 
 def places_in(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str, CellPlace]:
-    """Return what goals may ask of the cell: its camera's view and its second arm's reach."""
+    """Return the cell's constraints on goals: its camera's view and its second arm's reach."""
     found = {}
     if (view := _view_of(cell)) is not None:
         found["in_view"] = CellPlace(view, partial(require_seen, view, obstacles), True,
@@ -91,8 +91,9 @@ def places_in(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str, Cel
 
 
 def _outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
-    """Return how far what an arm grasps is from its shoulder at most [m]: all links in line, and
-    the tool's length."""
+    """Return the largest distance of an arm's grasp from its shoulder [m]: all links in line plus
+    the tool's length.
+    """
     joints = np.array(arm.home, float)
     places = np.vstack([arm.shoulder, arm.link_frames(joints)[:, :3, 3],
                         arm.forward(joints)[:3, 3]])
@@ -102,7 +103,7 @@ def _outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
 
 def require_seen(view: View, obstacles: tuple[Obstacle, ...], what: str, place: np.ndarray,
                  surface: np.ndarray | None) -> None:
-    """Raise NoPathError where the branch's surface or an obstacle hides ``what`` at ``place`` [3].
+    """Raise NoPathError if the branch's surface or an obstacle hides ``what`` at ``place`` [3].
     """
     if surface is not None:
         view.require_seen(what, place, surface)
@@ -116,7 +117,7 @@ def require_seen(view: View, obstacles: tuple[Obstacle, ...], what: str, place: 
 
 
 def require_taken(entry: SecondArmEntry, what: str, place: np.ndarray, _surface: object) -> None:
-    """Raise NoPathError where an arm cannot take ``what`` at ``place`` [3] from any side."""
+    """Raise NoPathError if an arm cannot grasp ``what`` at ``place`` [3] from any side."""
     arm = arm_named(entry.model)
     turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
     frames = np.tile(np.eye(4), (_TURNS, 1, 1))
@@ -132,7 +133,7 @@ def require_taken(entry: SecondArmEntry, what: str, place: np.ndarray, _surface:
 
 
 def _view_of(cell: Cell) -> View | None:
-    """Return what the cell's camera sees; None without one that stands still."""
+    """Return the view of the cell's camera; None without a static one."""
     camera = cell.camera
     if camera is None or camera.mount != "branch":
         return None
@@ -144,11 +145,12 @@ def _view_of(cell: Cell) -> View | None:
 
 def clearance_in(cell: Cell, asked: float | None, obstacles: tuple[Obstacle, ...],
                  grasp: np.ndarray, nodes: np.ndarray) -> float:
-    """Return the distance to keep from obstacles [m]: as ``asked``, else what covers how uncertain
-    it is where the robot holds the branch, but no more than nearly what it has at rest.
+    """Return the clearance from obstacles [m]: ``asked`` if given, else a value that covers the
+    uncertainty of the grasp position, limited to nearly the clearance at rest.
 
     Args:
-        grasp, nodes: Of the branch at rest, branch frame [m], shapes [3] and [n, 3].
+        grasp, nodes: Grasp and nodes of the branch at rest, branch frame [m], shapes [3] and [n,
+        3].
     """
     if asked is not None or not obstacles:
         return asked or 0.0
@@ -161,10 +163,10 @@ def clearance_in(cell: Cell, asked: float | None, obstacles: tuple[Obstacle, ...
 
 def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clearance: float = 0.0,
               ) -> Limits:
-    """Return limits with the cell's workspace, force and obstacles besides.
+    """Return limits that include the cell's workspace, force and obstacles.
 
     Raises:
-        InputError: the two workspaces have nothing in common.
+        InputError: the two workspaces do not intersect.
     """
     box = cell.workspace
     return limits.with_cell(None if box is None else np.array(box.low_m),
@@ -174,11 +176,11 @@ def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clear
 
 def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obstacle, ...],
                speed: float, clearance: float = 0.0) -> dict[str, Any]:
-    """Return how the cell's robot takes the gripper along approach and path, at a speed [m/s].
+    """Return the robot's motion of the gripper along approach and path, at a speed [m/s].
 
     Raises:
-        NoPathError: no continuous branch of the inverse kinematics carries it, or the gripper
-            meets an obstacle; says where.
+        NoPathError: there is no continuous branch of the inverse kinematics, or the gripper meets
+            an obstacle; the message states where.
     """
     there = np.array(motion.phases) != "return"
     forces = present(motion.forces, "force of the motion")
@@ -193,7 +195,7 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
 
 
 def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...], clearance: float = 0.0) -> Blocked:
-    """Return what tells where gripper or arm would be nearer to an obstacle than ``clearance`` [m].
+    """Return a test of whether gripper or arm is nearer to an obstacle than ``clearance`` [m].
     """
     def blocked(flange: np.ndarray, joints: np.ndarray) -> NoPathError | None:
         return None if not obstacles else _in_the_way(cell, obstacles, flange, joints, clearance)
@@ -202,12 +204,11 @@ def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...], clearance: float = 0
 
 def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
                 joints: np.ndarray, clearance: float) -> NoPathError | None:
-    """Return the error that names what is deepest in an obstacle, or in ``clearance`` [m] about it;
-    None where nothing is.
+    """Return the error for the deepest point in an obstacle or its ``clearance`` [m], or None.
 
     Args:
-        flange: Frames in the robot's base, shape [n, 4, 4].
-        joints: The same by angles [rad], shape [n, joints].
+        flange: Flange frames in the robot's base, shape [n, 4, 4].
+        joints: The same as angles [rad], shape [n, joints].
     """
     base = matrices(np.array(cell.base.pose))
     arm = cell.arm.rods(joints)
@@ -242,8 +243,7 @@ def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
 
 
 def _apart(places: np.ndarray) -> np.ndarray:
-    """Return the numbers of poses between which no place [n, k, 3] goes farther than what is
-    looked at."""
+    """Return indices of poses between which points [n, k, 3] move at most the spacing."""
     steps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)
     gone = np.r_[0.0, np.cumsum(steps)]
     chosen = np.searchsorted(gone, np.arange(0.0, gone[-1], _POSE_SPACING))

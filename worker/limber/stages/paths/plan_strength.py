@@ -1,4 +1,4 @@
-"""What a plan knows of the strain that breaks the branch."""
+"""Data of a plan on the strain that breaks the branch."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from limber.store import Branch
 
 def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | None,
                  ) -> Strength | None:
-    """Return the strength by the user's break tests, else by --wood; None where neither is given.
+    """Return the strength from the user's break tests, else from --wood; None if neither is given.
 
     Raises:
         InputError: the tests cannot be used, or --max-damage is given without a strength.
@@ -33,7 +33,7 @@ def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | Non
 
 
 def with_damage(limits: Limits, settings: PlanSettings, strength: Strength | None) -> Limits:
-    """Return the limits, the strain's no higher than the allowed probability of damage has it."""
+    """Return the limits, with the strain's reduced to the allowed probability of damage."""
     if strength is None or settings.max_damage is None:
         return limits
     return replace(limits, strain=min(limits.strain, strength.strain_limit(settings.max_damage)))
@@ -41,8 +41,7 @@ def with_damage(limits: Limits, settings: PlanSettings, strength: Strength | Non
 
 def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
                      in_motion: dict[str, Any] | None, progress: Progress) -> dict[str, Any]:
-    """Return what the strength says of a plan's largest strain; warn where it is over one that is
-    known."""
+    """Return the assessment of a plan's largest strain; warn if it exceeds a known strength."""
     states = plan.ahead
     at = int(states.strains.argmax())
     peak = float(states.strains[at])
@@ -60,8 +59,7 @@ def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
 
 
 def _radius_deviation(branch: Branch) -> float:
-    """Return the relative standard deviation of the branch's radius by its reconstruction; 0 where
-    there is none."""
+    """Return the relative deviation of the branch's radius by its reconstruction; 0 if unknown."""
     stage = branch.manifest.stages.get("reconstruct")
     result = {} if stage is None else stage.result
     sigma = result.get("radius_sigma_median_m")

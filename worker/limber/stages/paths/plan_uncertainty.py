@@ -1,4 +1,4 @@
-"""What a plan is told of how uncertain Young's modulus is."""
+"""Uncertainty of Young's modulus as used in a plan."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _INTERVAL = 2 * 1.96  # standard deviations in an interval of 95 %
 
 
 def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungUncertainty:
-    """Return the moduli's distribution by the branch's estimate, for a plan with limits.
+    """Return the moduli's distribution from the branch's estimate, for a plan with limits.
 
     Raises:
         InputError: there is no limit, no estimate, or one without intervals.
@@ -32,11 +32,11 @@ def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -
 
 
 def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncertainty | None:
-    """Return the moduli's distribution by the branch's estimate; None where there is none.
+    """Return the moduli's distribution from the branch's estimate; None if there is none.
 
     Deviations are those of the stated intervals of bending stiffness: a plan uses the mesh of the
     estimate, and an error of its radius cancels with that of the modulus. Correlations are those of
-    the fit. Control points of one group have one modulus.
+    the fit. Control points of one group share one modulus.
 
     Raises:
         InputError: the estimate has no interval.

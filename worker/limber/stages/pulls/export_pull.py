@@ -28,7 +28,7 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
     """Write a pull as an MCAP file; the folder stays as it is.
 
     Returns:
-        ``output`` and ``messages``, how many each topic has.
+        ``output`` and ``messages``, the number per topic.
 
     Raises:
         InputError: there is no such pull, or the file cannot be written.

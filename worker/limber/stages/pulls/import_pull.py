@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class ImportInputs(BranchInputs):
-    """A branch folder, a recording, and the name it gets."""
+    """A branch folder, a recording, and its new name."""
 
     groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",),
                                "simulation": ("swing",)}
@@ -42,13 +42,13 @@ class ImportInputs(BranchInputs):
 
 def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Bring a recording into ``pulls/NAME`` of a branch folder.
+    """Import a recording into ``pulls/NAME`` of a branch folder.
 
     Returns:
-        ``pull``, ``kind`` and what :func:`~.importing.pulls.import_recording` found.
+        ``pull``, ``kind`` and the result of :func:`~.importing.pulls.import_recording`.
 
     Raises:
-        InputError: SOURCE cannot be read as what it is said to be.
+        InputError: SOURCE cannot be read as the stated kind.
     """
     from limber.recordings.importing.import_request import BranchFrame, ImportRequest
     from limber.recordings.importing.pulls import import_recording
@@ -80,7 +80,7 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
 
 
 def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | None]:
-    """The settings with the cell's base, and what the cell says of its robot."""
+    """The settings with the cell's base, and the cell's data on its robot."""
     if settings.cell is None:
         return settings, None
     from limber.core.numerics.rigid import matrices, pose_vectors
@@ -130,7 +130,7 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     if inputs.swing and settings.weight is None and settings.load is None:
-        # Nothing is known of what bent it: its frequencies tell the modulus, no positions do.
+        # The load is unknown: the frequencies determine the modulus, positions do not.
         from limber.stages.moduli.vibration import VibrationSettings, vibration
 
         told = vibration(inputs.branch_folder, inputs.source, VibrationSettings(),
@@ -143,7 +143,7 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
 
 
 def _moved(values: Mapping[str, Any]) -> str | None:
-    """Say how far the points of a load's recording moved."""
+    """Report how far the points of a load's recording moved."""
     if "displacement_m" not in values:
         return None
     farthest = float(np.linalg.norm(values["displacement_m"], axis=-1).max())

@@ -44,8 +44,8 @@ class RecordInputs(BranchInputs):
 class RecordSettings(Settings):
     """A predefined pull, out and back.
 
-    A branch that is pulled far sideways without following its arc is stretched: its force then
-    rises steeply, and the guard pauses.
+    A branch pulled far sideways without following its arc is stretched. Its force then rises
+    steeply, and the guard pauses.
     """
 
     groups: ClassVar[Groups] = {
@@ -73,7 +73,7 @@ class RecordSettings(Settings):
 
 
 class RecordOptions(Settings):
-    """How a recording is run."""
+    """Options of a recording's run."""
 
     groups: ClassVar[Groups] = {"running": ("confirm", "markers", "after_stop", "recover")}
     common = ("confirm",)
@@ -96,9 +96,9 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
            options: RecordOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
     """Record a pull.
 
-    The sensor is tared with the gripper empty, the gripper closes, pulls and returns. Every
-    sample of the controller goes into ``robot.csv`` as it comes; a kill or a stop keeps all but
-    the last second.
+    The sensor is tared with the gripper empty; then the gripper closes, pulls and returns. Every
+    sample of the controller is written to ``robot.csv`` at once; after a kill or a stop at most the
+    last second is missing.
 
     Returns:
         ``ended`` (``reached`` or the reason of a stop), ``after_stop`` (after a stop, as
@@ -106,8 +106,8 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         ``seconds``, ``peak_force_n``, ``marker_frames``.
 
     Raises:
-        InputError: cell and branch do not belong together, or nobody confirmed.
-        SafetyStop: the guard stopped it; what was recorded is in the folder all the same.
+        InputError: cell and branch do not belong together, or the user did not confirm.
+        SafetyStop: the guard stopped the pull; the recording so far is nevertheless in the folder.
     """
     from limber.robot.cell.cell import read_cell
     from limber.robot.cell.compatibility import check_branch, require_payload
@@ -172,7 +172,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             point = _grasp_point(branch, sample[1:4])
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
-            # Before the tare: what takes long would be drift.
+            # Before the tare: during long work the sensor would drift.
             trajectory = _pull(branch, cell, point, sample, settings, blocked,
                                progress.part(0.02, 0.1))
             predicted = predicted_pull(branch, cell, point, trajectory, progress.part(0.08, 0.1))
@@ -190,7 +190,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
             ended = {"ended": _how_it_ended(event, doubts)}
             if event["event"] == "reached":
-                # What was seen last comes a little later.
+                # The last observations arrive a little later.
                 time.sleep(0.5)
                 _write_markers(tracker, marker_lines, recorder)
                 _warn_of_what_is_left(doubts, recorder, progress)
@@ -209,14 +209,14 @@ def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder],
         if lines is not None:
             lines.close()
             if not (recorders and recorders[0].count):
-                # No sample came: there is nothing to take over, and the name stays free.
+                # No sample came: there is nothing to import, and the name stays free.
                 lines.path.unlink(missing_ok=True)
     if tracker is not None:
         tracker.close()
 
 
 def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
-    """``reached``, or why the pull was stopped: by the guard, or because the sensor is wrong."""
+    """``reached``, or why the pull was stopped: by the guard, or because of a sensor fault."""
     if event["event"] == "reached":
         return "reached"
     reason = doubts[0].reason if doubts else None
@@ -225,7 +225,7 @@ def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
 
 def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder,
                           progress: Progress) -> None:
-    """Warn of a force that is left where the gripper is back at its start."""
+    """Warn of a remaining force once the gripper is back at its start."""
     if doubts and recorder.last is not None and (
             told := doubts[0].left_at_end(recorder.last[None])):
         progress.warn(f"{told}.")
@@ -234,7 +234,7 @@ def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder
 def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None,
              recorder: PullRecorder, trajectory: Trajectory, progress: Progress,
              ) -> dict[str, Any]:
-    """Wait for the end of the motion; markers are written as they come."""
+    """Wait for the end of the motion; markers are written as they arrive."""
     begin = time.monotonic()
     while True:
         try:
@@ -264,7 +264,7 @@ def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
 
 def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
           settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
-    """The motion of the gripper from where a sample of the robot has it."""
+    """The motion of the gripper from its position in a sample of the robot."""
     from limber.core.numerics.rigid import matrices
     from limber.stages.pulls.record_path import (
         suggested_pull,
@@ -320,7 +320,7 @@ def _grasp_point(branch: Branch, gripper: np.ndarray) -> np.ndarray:
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
                  seconds: float, tracker: MarkerStream | None, marker_lines: Stream | None,
                  ) -> None:
-    """Write ``pull.toml`` first of all: what a kill leaves can be read with it."""
+    """Write ``pull.toml`` first, so that the files left by a kill can be read."""
     from limber.recordings.recording import GraspEntry, PullEntry, entry_text
     from limber.robot.recorder import known_errors, known_noise
     from limber.stages.pulls.record_path import GRASP_RADIUS_M
@@ -345,7 +345,7 @@ def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, 
 
 def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str, Any],
             ) -> dict[str, Any]:
-    """Take the streams over into the branch folder."""
+    """Import the streams into the branch folder."""
     from limber.recordings.time_series import read_stream
 
     prefix = f"pulls/{name}/"

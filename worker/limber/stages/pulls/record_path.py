@@ -1,4 +1,5 @@
-"""The way of a recorded pull: straight, along the arc of the branch, or through given places."""
+"""The path of a recorded pull: straight, along the arc of the branch, or through given positions.
+"""
 
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.store import Branch
 
 GRASP_RADIUS_M = 0.012
-"""Half width of what a gripper takes hold of along the branch."""
+"""Half the length that a gripper holds along the branch."""
 
 _SAME_PLACE_M = 0.01  # from where a suggested pull holds the branch
 _STATES = 12  # of an arc: a chord of 4 mm on a bend of 0.3 m stretches a branch by 7 micrometres
@@ -41,19 +42,19 @@ class _Suggested(FileContent):
 
 def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
                progress: Progress) -> np.ndarray:
-    """Return frames [n, 4, 4] that take the held piece from where it is along its arc.
+    """Return frames [n, 4, 4] that move the held piece from its position along its arc.
 
-    The arc is where the branch's model goes when a growing force along ``direction`` pulls it, and
-    turns as it turns there. How stiff the branch is does not matter for it, only how its stiffness
-    runs along it, and that a little: with no estimate the arc is of one modulus throughout.
+    The arc is the path and rotation of the branch's model under a growing force along
+    ``direction``. The level of stiffness does not affect it, and the variation of stiffness along
+    the branch only a little. Without an estimate the arc is computed with one modulus throughout.
 
     Args:
-        point: Where the gripper holds, branch frame [m], shape [3].
+        point: Position of the grasp, branch frame [m], shape [3].
         direction: Shape [3].
-        distance: Of the grasp from rest [m].
+        distance: Distance of the grasp from rest [m].
 
     Returns:
-        Frames in the branch's that are to be applied to the gripper's, the first the identity.
+        Frames in the branch's frame to apply to the gripper's pose; the first is the identity.
 
     Raises:
         WorkError: no such force moves it so far.
@@ -73,19 +74,19 @@ def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distanc
                              start=state).require()
         poses.append(grasp.pose_of(model.mesh.nodes, state.displacement))
         progress((number + 1) / _STATES, "the arc of the branch")
-    # The force was found to some percent; a bend that is a little longer has the same shape.
+    # The force is accurate to some percent; a slightly longer bend has the same shape.
     frames = matrices(np.array(poses))
     return frames @ inverted(frames[0])
 
 
 def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return direction [3] across the branch and distance [m] of the pull that was found best.
+    """Return direction [3] across the branch and distance [m] of the suggested pull.
 
     Args:
-        point: Where the gripper is on the branch, branch frame [m], shape [3].
+        point: Position of the gripper on the branch, branch frame [m], shape [3].
 
     Raises:
-        BranchFolderError: none was suggested. InputError: it is to be held elsewhere.
+        BranchFolderError: none was suggested. InputError: the suggested grasp is elsewhere.
     """
     path = branch.require("suggested_pull.json", "suggest-pull")
     found = read_json_as(path, _Suggested, "a suggested pull").best
@@ -96,18 +97,19 @@ def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float
             f"The gripper is {1000 * away:.0f} mm from where the suggested pull holds the branch, "
             f"({', '.join(f'{x:.3f}' for x in place)}) m.", "The same motion at another grasp "
             "gives other information and other strains.", "Move the gripper there.")
-    # The end lies on the arc, nearer to the root, which is the origin: the pull is across.
+    # The end is on the arc, closer to the root, which is the origin: the pull is across.
     way, out = np.array(found.end_m) - place, place / max(float(np.linalg.norm(place)), 1e-9)
     return way - (way @ out) * out, found.travel_m
 
 
 def way_through(path: Path, gripper: np.ndarray) -> np.ndarray:
-    """Return frames [n, 4, 4] of the gripper through the places of a CSV file, branch frame.
+    """Return frames [n, 4, 4] of the gripper through the positions of a CSV file, branch frame.
 
-    Without columns of rotation the gripper is not turned.
+    Without columns of rotation the gripper is not rotated.
 
     Raises:
-        InputError: it cannot be read, has one place, or starts too far from ``gripper`` [6].
+        InputError: it cannot be read, has only one position, or starts too far from ``gripper``
+        [6].
     """
     table = read_columns(path, POSE_COLUMNS[:3], "a table of way-points (x_m, y_m, z_m, and "
                          "rx_rad, ry_rad, rz_rad if the gripper turns)")
@@ -132,12 +134,12 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
 
     Args:
         speed: [m/s].
-        pause: Standing still at each end [s].
-        start: Joint angles where the arm is [rad], shape [6].
+        pause: Standstill at each end [s].
+        start: Current joint angles of the arm [rad], shape [6].
 
     Raises:
-        NoPathError: the arm cannot follow it, or is blocked; says where and why.
-        SafetyStop: it could from another configuration than it stands in.
+        NoPathError: the arm cannot follow it, or is blocked; the message states where and why.
+        SafetyStop: the arm could follow it only from another configuration than its current one.
     """
     out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
     flange = matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
@@ -156,7 +158,8 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
         raise met
     passed = along(out, speed_within(cell, speed), cell.limits.acceleration_m_s2,
                    turn_speed=0.8 * cell.limits.turn_speed_rad_s)
-    # The way back is the way out in time as well, so that speeds fit where it turns.
+    # The return also reverses the outward motion in time, so that speeds match at the turning
+    # point.
     legs = ((passed, out, taken.joints),
             (passed[-1] - passed[::-1], out[::-1], taken.joints[::-1]))
     times, poses, joints, begin = [], [], [], 0.0

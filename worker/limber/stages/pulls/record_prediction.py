@@ -1,4 +1,4 @@
-"""What a recorded pull will feel at its beginning, by the branch's model."""
+"""Predicted force at the beginning of a recorded pull, by the branch's model."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _DEVIATIONS, _LEAST_FACTOR = 3.0, 2.0
 
 def predicted_pull(branch: Branch, cell: Cell, point: np.ndarray, trajectory: Trajectory,
                    progress: Progress) -> PredictedPull | None:
-    """Return the forces of the first :data:`.LOOKED_M` of a pull; None where no model tells them.
+    """Return the forces of the first :data:`.LOOKED_M` of a pull; None without a usable model.
 
     Args:
-        point: Where the gripper holds, branch frame [m], shape [3].
-        trajectory: Of the gripper, base frame.
+        point: Position of the grasp, branch frame [m], shape [3].
+        trajectory: Trajectory of the gripper, base frame.
     """
     from limber.mechanics import Grasp, follow_poses
     from limber.store.loading import load_branch, young_deviation

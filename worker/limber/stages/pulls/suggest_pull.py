@@ -1,9 +1,9 @@
 """Suggest where to hold and how far to pull next to learn most.
 
-Pulls of several places, directions and lengths are made on the branch as it is estimated. What each
-would tell of Young's modulus, with the errors of cell and sensors that the last pull stated, is
-compared with the strain it puts the branch to. With ``--plan`` it is also said whether another pull
-is worth it for that plan: whether it would change what the plan may do.
+Pulls with several positions, directions and lengths are simulated on the branch as estimated. Their
+information on Young's modulus, with the errors of cell and sensors that the last pull stated, is
+compared with the strain they cause in the branch. With ``--plan`` the result also states whether
+another pull is worthwhile for that plan: whether it would change what the plan may do.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class SuggestPullInputs(BranchInputs):
 
 
 class SuggestPullSettings(Settings):
-    """What a pull may do."""
+    """Limits of a pull."""
 
     groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force", "gravity")}
 
@@ -62,18 +62,17 @@ class SuggestPullSettings(Settings):
 def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: str | None = None,
                  workers: int | None = None, force: bool = False, progress: Progress = SILENT,
                  ) -> dict[str, Any]:
-    """Write ``suggested_pull.json``: the best pull and others, and what each would tell.
+    """Write ``suggested_pull.json``: the best pull and others, and the information of each.
 
     Returns:
         ``best`` and ``others``, each with ``grasp_fraction``, ``grasp_point_m``, ``end_m``,
         ``travel_m``, ``peak_strain``, ``peak_force_n``, ``bits``, ``bits_per_percent_strain`` and
-        ``young_deviation`` (of log E at the control points, to be expected after it);
-        ``most_telling``, that of them which tells most; ``young_deviation_now``;
-        ``too_much_count`` and ``failed_count``; ``plan`` with ``worth`` and ``why`` where one is
-        named.
+        ``young_deviation`` (of log E at the control points, expected after the pull);
+        ``most_telling``, the most informative of them; ``young_deviation_now``; ``too_much_count``
+        and ``failed_count``; ``plan`` with ``worth`` and ``why`` if one is named.
 
     Raises:
-        InputError: no such plan. WorkError: no pull keeps the limits.
+        InputError: there is no such plan. WorkError: no pull keeps the limits.
     """
     from limber.estimation.next_pull import suggest
 
@@ -108,7 +107,7 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
 
 
 def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Values, Known]:
-    """Return the branch, its moduli as far as known, and how well they are known."""
+    """Return the branch, its moduli if known, and their uncertainty."""
     from dataclasses import replace
 
     from limber.estimation.estimate_file import read_estimate
@@ -129,7 +128,7 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
 
 
 def _cell(branch: Branch) -> Cell:
-    """Return what the last recorded pull says of its cell, and how many frames it has."""
+    """Return the cell's data in the last recorded pull, and its number of frames."""
     from limber.estimation.next_pull import Cell
     from limber.recordings.recording import read_pull
     from limber.store.loading import known_pulls
@@ -189,7 +188,7 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
 
 
 def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
-    """Return whether a pull between two risks is worth it for a plan, and why.
+    """Return whether a pull between two risks is worthwhile for a plan, and why.
 
     Risks are :class:`limber.planning.constraints.chance.Risk`.
     """

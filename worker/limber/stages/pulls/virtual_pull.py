@@ -40,7 +40,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
 
     Raises:
         InputError: the branch has no skeleton, or the settings do not fit it.
-        WorkError: the branch cannot be pulled like that.
+        WorkError: the branch cannot be pulled in this way.
     """
     from limber.estimation.simulated_pull import simulate_pull, write_depth_frames
     from limber.recordings.recording import write_pull
@@ -75,8 +75,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
 
 
 def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
-    """The truth of a branch folder: its generator's, the body that was meshed, or a branch that its
-    scan allows.
+    """The truth of a branch folder: its generator's, the meshed body, or one that fits its scan.
     """
     from limber.estimation.simulated_pull import true_branch
     from limber.geometry.generated import read_truth
@@ -96,7 +95,7 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
 
 
 def _scan(branch: Branch, settings: VirtualPullSettings) -> np.ndarray | None:
-    """The points that a shape is drawn from; None where the truth is known, or no scan is."""
+    """The points that determine a drawn shape; None if the truth is known, or there is no scan."""
     from limber.geometry.io.clouds import read_cloud
 
     known = branch.has("truth/truth.json") or not branch.has("cloud.ply")
@@ -105,7 +104,7 @@ def _scan(branch: Branch, settings: VirtualPullSettings) -> np.ndarray | None:
 
 
 def _is_meshed_body(branch: Branch) -> bool:
-    """Whether `limber mesh` made the branch: its own tetrahedra are the truth."""
+    """Whether `limber mesh` made the branch: its own tetrahedra are then the truth."""
     return "mesh" in branch.manifest.stages and branch.has("mesh.vtu") and not branch.has(
         "truth/truth.json")
 

@@ -1,7 +1,7 @@
 """Export the branch for robot simulators, finite element programs and others.
 
-What is written goes by OUTPUT's suffix. Links and cylinders are in the branch's frame, in metres.
-Modulus and damping are those that the folder knows: of the last estimate or swing.
+The format is determined by OUTPUT's suffix. Links and cylinders are in the branch's frame, in
+metres. Modulus and damping are those in the folder, from the last estimate or swing.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class ExportSettings(Settings):
-    """How the branch is taken apart."""
+    """Discretisation of the branch."""
 
     groups: ClassVar[Groups] = {"output": ("links", "gravity", "load", "columns")}
 
@@ -46,14 +46,14 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
     """Write a branch in another program's format; the folder stays as it is.
 
     Returns:
-        ``output``, ``format``, and what it holds: ``link_count``, ``mass_kg`` and
-        ``stiffness_factor``, by which the links' springs were scaled to bend as the mesh does; or
+        ``output``, ``format``, and its content: ``link_count``, ``mass_kg`` and
+        ``stiffness_factor``, the scale of the links' springs with which they bend like the mesh; or
         ``tet_count``, ``node_count`` and ``tip_node``; or those and ``young_pa``, the one modulus
         that makes the tip as compliant as our mesh; or ``cylinder_count``.
 
     Raises:
-        InputError: no such format, or it cannot be written. BranchFolderError: the folder lacks
-            mesh or skeleton. MissingDependencyError: USD is not installed.
+        InputError: there is no such format, or the file cannot be written. BranchFolderError: the
+            folder lacks mesh or skeleton. MissingDependencyError: USD is not installed.
     """
     from limber.core.files.atomic import write_atomically
 
@@ -75,7 +75,7 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
 
 
 def _format_of(output: Path, columns: str) -> Format:
-    """The format of a suffix; of several that share it the one whose columns are asked for."""
+    """The format of a suffix; if several share it, the one with the requested columns."""
     known = [*EXPORTS.writers(), *SKELETONS.writers()]
     named = [one for one in known if output.suffix.lower() in one.suffixes]
     if not named:
@@ -169,8 +169,9 @@ EXPORTS = Registry("export", "limber.exports", [
     Format("Abaqus", (".inp",), write=_write_elements, about="Abaqus, CalculiX: the quadratic "
            "tetrahedra, held base, a static and a frequency step")])
 """``write`` is called with the open branch folder, the path, the settings and progress; it returns
-what the file holds. All formats of :data:`~limber.geometry.io.skeletons.SKELETONS` are written
-too."""
+the content of the file. All formats of :data:`~limber.geometry.io.skeletons.SKELETONS` are
+available too.
+"""
 
 
 class ExportInputs(BranchInputs):

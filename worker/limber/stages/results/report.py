@@ -29,7 +29,7 @@ class ReportInputs(BranchInputs):
 
 def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Path | None = None,
                  force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Write ``report.html`` into a branch folder from whatever stages have been run.
+    """Write ``report.html`` into a branch folder for the stages that have been run.
 
     Args:
         folder: The branch folder.
@@ -38,8 +38,8 @@ def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Pat
             :func:`limber.geometry.skeleton.qsm_tables.read_calipers`.
 
     Returns:
-        ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``; ``calipers``,
-        the scan's diameters against the measured ones.
+        ``report`` (its path), ``figure_count``, ``sections`` and the ``missing`` ones;
+        ``calipers``, the scan's diameters against the measured ones.
 
     Raises:
         InputError: the picture or the measured diameters cannot be used.
@@ -67,7 +67,7 @@ def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Pat
 
 
 def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> dict[str, str]:
-    """Digests of all that the page is drawn from."""
+    """Digests of all inputs of the page."""
     outside = {"picture": picture, "caliper": caliper_path}
     return {"folder": branch.manifest.content_digest(), "limber": VERSION} | {
         name: file_digest(require_file(path, f"A {name} file"))

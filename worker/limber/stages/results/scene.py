@@ -24,7 +24,7 @@ _TURN_SECONDS = 6.0
 
 
 class SceneInputs(BranchInputs):
-    """A branch folder, and the files to make of it."""
+    """A branch folder, and the output files."""
 
     groups: ClassVar[Groups] = {"output": ("output", "render", "turntable", "data")}
     common = ("output", "render")
@@ -41,7 +41,7 @@ class SceneInputs(BranchInputs):
 
 
 class SceneSettings(Settings):
-    """What a scene shows."""
+    """Content of a scene."""
 
     groups: ClassVar[Groups] = {
         "picture": ("width", "sides", "color", "plan", "motion", "strength")}
@@ -64,10 +64,10 @@ class SceneSettings(Settings):
 
 def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = SILENT,
           ) -> dict[str, Any]:
-    """Make a Blender scene of a branch, or only what it shows, as arrays.
+    """Make a Blender scene of a branch, or only its content as arrays.
 
     Raises:
-        InputError: not one of output and data, or nothing to show.
+        InputError: not exactly one of output and data is given, or there is nothing to show.
         WorkError: Blender failed.
     """
     from limber.results.scene.contents import scene_data
@@ -100,7 +100,7 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
 
 def _made(data: SceneData, output: Path, inputs: SceneInputs, settings: SceneSettings,
           progress: Progress) -> dict[str, Any]:
-    """Have Blender make the scene, and what is rendered of it; returns what it told."""
+    """Have Blender make the scene and its renders; return its report."""
     from limber.results.scene.blender_process import make_scene
 
     with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
@@ -121,7 +121,7 @@ def _made(data: SceneData, output: Path, inputs: SceneInputs, settings: SceneSet
 
 
 def _write_moving(path: Path, pictures: list[Path]) -> None:
-    """Write pictures one after the other as one that moves, and begins again."""
+    """Write pictures as one animation that loops."""
     from PIL import Image
 
     if not pictures:

@@ -1,7 +1,7 @@
 """List doubtful parts of the skeleton, and edit it; the mesh follows.
 
-EDITS is a JSON list, one object an edit, its places in the coordinates and the unit of the scan's
-file, as the list of doubtful parts gives them:
+EDITS is a JSON list with one object per edit. Positions are in the coordinates and unit of the
+scan's file, as in the list of doubtful parts:
 
 \b
   {"do": "move", "at": [x, y, z], "to": [x, y, z]}     put a node elsewhere
@@ -13,8 +13,9 @@ file, as the list of doubtful parts gives them:
   {"do": "radius", "at": [...], "radius": r}           with "to": all along the axes to there
   {"do": "confirm", "at": [x, y, z]}                   the branch is there, no more doubt
 
-They stay in the branch folder and are applied again by each reconstruct. With --frame branch places
-and radii are in the branch's frame [m]; with --append they come after those that it has.
+They are kept in the branch folder and applied again by each reconstruct. With --frame branch,
+positions and radii are in the branch's frame [m]; with --append they are added to the existing
+edits.
 """
 
 from __future__ import annotations
@@ -67,15 +68,16 @@ class SkeletonInputs(BranchInputs):
 def review_skeleton(folder: Path, *, edits_path: Path | None = None,
                     frame: Literal["scan", "branch"] = "scan", append: bool = False,
                     output: Path | None = None, progress: Progress = SILENT) -> dict[str, Any]:
-    """List what is doubtful in a branch's skeleton, after edits of it if there are any to make.
+    """List the doubtful parts of a branch's skeleton, after applying edits if there are any.
 
     Args:
         folder: The branch folder.
-        edits_path: Edits to apply to the skeleton as it was found; surface and mesh are made anew.
-        frame: Of the edits' places: the scan file's coordinates, or the branch's frame [m].
-        append: The edits come after those that the branch has, not in their place.
+        edits_path: Edits to apply to the skeleton as found; surface and mesh are made again.
+        frame: Frame of the edits' positions: the scan file's coordinates, or the branch's frame
+        [m].
+        append: Add the edits to those of the branch instead of replacing them.
         output: ``.swc`` or ``.csv`` to write, in the scan file's coordinates and unit.
-        progress: Called as it goes; gets what the user should know.
+        progress: Called during the work; receives warnings for the user.
 
     Returns:
         ``doubtful``: a list of ``kind``, ``branch``, ``at`` (in the scan's coordinates), ``at_m``
@@ -83,8 +85,8 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
         are applied; ``mesh``: ``current``, ``out of date`` or ``missing``; ``unit`` of ``at``.
 
     Raises:
-        InputError: an edit does not fit. MeshingError: what it leaves cannot be meshed. The
-            folder is then as it was.
+        InputError: an edit does not fit. MeshingError: the edited skeleton cannot be meshed. The
+            folder is then unchanged.
     """
     from limber.geometry.skeleton.doubtful_parts import doubtful_parts
 
@@ -114,7 +116,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
 
 
 def _wanted(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
-    """The edits that the branch shall have, in the coordinates of the scan's file."""
+    """The resulting edits of the branch, in the coordinates of the scan's file."""
     from limber.geometry.skeleton.edits import read_edits
 
     edits = read_edits(path)
@@ -140,7 +142,7 @@ def _unit(branch: Branch) -> str:
 
 
 def _latest(branch: Branch) -> tuple[Skeleton, Alignment, str]:
-    """The newest skeleton in the branch's frame, its alignment, and how the mesh stands to it."""
+    """The newest skeleton in the branch's frame, its alignment, and the state of the mesh."""
     from limber.geometry.io.skeletons import read_skeleton
     from limber.store.loading import load_found_skeleton
 
@@ -158,10 +160,10 @@ def _latest(branch: Branch) -> tuple[Skeleton, Alignment, str]:
 
 
 def _belong(early: Any, made: Any) -> bool:
-    """Whether a kept skeleton and a mesh are of the same scan and settings, edits aside."""
+    """Whether a stored skeleton and a mesh are of the same scan and settings, apart from edits."""
     def source(entry: Any) -> dict[str, str]:
         return {name: value for name, value in entry.reads.items() if name != "edits"}
-    # As this version has them: one of both may have been written before a setting was added.
+    # In this version's form: one of them may have been written before a setting was added.
     return (_settings(early) == _settings(made)) and source(early) == source(made)
 
 
@@ -172,7 +174,7 @@ def _settings(entry: Any) -> Any:
 
 
 def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
-    """Apply edits to the skeleton as it was found; make surface and mesh of what comes out."""
+    """Apply edits to the skeleton as found; make surface and mesh of the result."""
     from limber.geometry.io.clouds import read_points
     from limber.geometry.reconstruction import labelled, mesh_skeleton
     from limber.geometry.skeleton.confidence import shares

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class GenerateInputs(Settings):
-    """Where the scan and its truth go."""
+    """Output folder of the scan and its truth."""
 
     groups: ClassVar[Groups] = {"output": ("folder",)}
 
@@ -53,7 +53,7 @@ def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
 
 def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
     """Write the scan and the truth: ``cloud.ply``, ``truth_skeleton.swc``, ``truth_surface.ply``
-    and ``truth.json``; returns what was written.
+    and ``truth.json``; return what was written.
 
     Raises:
         InputError: the folder cannot be written to.

@@ -37,16 +37,16 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
 
     Args:
         path: A surface, a CSV of sections, or a cylinder model.
-        folder: The branch folder to make or renew.
-        settings: How.
+        folder: The branch folder to make or replace.
+        settings: Settings to use.
         force: Run even if nothing has changed.
-        progress: Called as it goes; gets what the user should know.
+        progress: Called during the work; receives warnings for the user.
 
     Raises:
         InputError: the surface cannot be read or is not that of one solid
-            (:func:`limber.geometry.io.surfaces.usable_surface`), or the table is none of
-            sections (:func:`limber.geometry.sections.read_sections`), or the cylinder model
-            cannot be used (:func:`limber.geometry.mesh_skeleton.mesh_model`).
+            (:func:`limber.geometry.io.surfaces.usable_surface`), or the table is not one of
+            sections (:func:`limber.geometry.sections.read_sections`), or the cylinder model cannot
+            be used (:func:`limber.geometry.mesh_skeleton.mesh_model`).
         MeshingError: fTetWild failed.
     """
     from limber.core.constants import UNIT_METRES

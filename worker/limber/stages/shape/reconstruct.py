@@ -34,14 +34,15 @@ if TYPE_CHECKING:
     from limber.geometry.skeleton.skeleton import Skeleton
 
 SEARCH = f"{FOUND_SKELETON}.npz"
-"""All that the search for the skeleton came to, until there is a mesh: a reconstruct that is
-stopped between goes on from there."""
+"""Result of the skeleton search, kept until there is a mesh: a reconstruct that is stopped in
+between continues from it.
+"""
 EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
 
 
 class ReconstructInputs(Settings):
-    """A scan, what is known of it, and the branch folder to make."""
+    """A scan, its known properties, and the branch folder to make."""
 
     groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "edits", "camera", "mask"),
                                "output": ("output",)}
@@ -71,30 +72,30 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
                 skeleton_path: Path | None = None, edits_path: Path | None = None,
                 camera_path: Path | None = None, mask_path: Path | None = None,
                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+    """Make a branch folder from a scan: skeleton, surface and tetrahedra.
 
-    The skeleton is kept in the scan's own coordinates as soon as it is found
-    (``scan_skeleton.swc`` and ``.csv``), also where a later step fails or the program is killed:
-    the next run with the same scan and settings goes on from there.
+    The skeleton is stored in the scan's own coordinates as soon as it is found
+    (``scan_skeleton.swc`` and ``.csv``), even if a later step fails or the program is killed. The
+    next run with the same scan and settings continues from it.
 
     Args:
-        cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
-        folder: The branch folder to make or renew.
-        settings: How.
+        cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is copied too.
+        folder: The branch folder to make or replace.
+        settings: Settings to use.
         skeleton_path: The user's own skeleton in the scan's coordinates and unit, instead of ours.
-        edits_path: Edits of the skeleton; without them those that the folder has, if the
-            skeleton is not the user's own.
+        edits_path: Edits of the skeleton; without them those in the folder, if the skeleton is not
+            the user's own.
         camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
         mask_path: The depth image's mask of the branch.
         force: Run even if nothing has changed.
-        progress: Called as it goes; gets what the user should know.
+        progress: Called during the work; receives warnings for the user.
 
     Returns:
         The stage's result (DESIGN's keys and more).
 
     Raises:
         InputError: the scan, the skeleton or the folder cannot be used.
-        WorkError: the work failed; the folder is as it was but for the kept skeleton.
+        WorkError: the work failed; the folder is unchanged except for the stored skeleton.
     """
     from limber.core.constants import UNIT_METRES
     from limber.geometry.io.depth_images import read_depth
@@ -170,11 +171,11 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
     """Reconstruct every cloud in a folder into ``folder/NAME.branch``.
 
     Args:
-        clouds: The folder of scans; files of other kinds in it are passed over.
-        folder: Where the branch folders go.
-        settings: For all of them.
-        force: Run even where nothing has changed.
-        progress: Called as it goes; gets each scan's warnings, with its name, and each failure.
+        clouds: The folder of scans; files of other kinds in it are skipped.
+        folder: Parent folder of the branch folders.
+        settings: Settings of all of them.
+        force: Run even if nothing has changed.
+        progress: Called as it goes; receives each scan's warnings, with its name, and each failure.
 
     Returns:
         ``done`` and ``failed``: name to result, name to message.
@@ -217,10 +218,10 @@ def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit:
 
 def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str, str],
                 ) -> FoundSkeleton | None:
-    """Return what an earlier run of these programs found of a scan, if it came to no mesh.
+    """Return the skeleton that an earlier run of this version found in a scan, if no mesh followed.
 
     Raises:
-        InputError: the file has been changed, its checksum as well.
+        InputError: the file was changed together with its checksum.
     """
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
     from limber.store import program_versions
@@ -251,7 +252,7 @@ def load_edits(branch: Branch) -> list[Edit]:
     """Return the edits of its skeleton that a branch keeps.
 
     Raises:
-        InputError: the file has been changed by hand, and is none now.
+        InputError: the file was changed by hand and is no longer valid.
     """
     from limber.geometry.skeleton.edits import read_edits
 
@@ -259,14 +260,14 @@ def load_edits(branch: Branch) -> list[Edit]:
 
 
 def edits_digest(edits: Sequence[Edit]) -> dict[str, str]:
-    """Return what a manifest remembers of edits: nothing of none."""
+    """Return the manifest's record of edits; empty if there are none."""
     from limber.geometry.skeleton.edits import edits_text
 
     return {"edits": hashlib.sha256(edits_text(edits).encode()).hexdigest()} if edits else {}
 
 
 def _eye(camera_path: Path | None) -> np.ndarray | None:
-    """Where the depth image's camera stood [m], shape [3]."""
+    """Position of the depth image's camera [m], shape [3]."""
     if camera_path is None:
         return None
     from limber.geometry.cloud.camera import read_camera
@@ -275,7 +276,7 @@ def _eye(camera_path: Path | None) -> np.ndarray | None:
 
 
 def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
-    """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
+    """Copy the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
     from limber.geometry.generated import read_truth
     from limber.geometry.surface.surface import Surface
 

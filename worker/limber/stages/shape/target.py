@@ -30,7 +30,7 @@ class TargetInputs(BranchInputs):
 
 
 class TargetSettings(Settings):
-    """Where a target is and what it weighs."""
+    """Position and mass of a target."""
 
     groups: ClassVar[Groups] = {"input": ("at", "mass", "farthest", "remove")}
     common = ("at",)
@@ -48,19 +48,19 @@ class TargetSettings(Settings):
 
 def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, force: bool = False,
                ) -> dict[str, Any]:
-    """Write a target into ``targets.json``, in place of one of that name, or take it out.
+    """Write a target into ``targets.json``, replacing one of that name, or remove it.
 
-    One that is there already as wished is left as it is, unless ``force``.
+    An existing identical target is left unchanged, unless ``force``.
 
-    It keeps the place that was given, and moves and turns with the nearest place of the branch.
+    It keeps the given position, and moves and rotates with the nearest point of the branch.
 
     Returns:
-        ``target``, ``position_m``, ``mass_kg``; ``branch_point_m``, the nearest place of the
-        branch, that it hangs on, ``distance_m`` from there; ``targets``, the names of all.
+        ``target``, ``position_m``, ``mass_kg``; ``branch_point_m``, the nearest point of the
+        branch, to which it is attached, ``distance_m`` from there; ``targets``, the names of all.
 
     Raises:
-        InputError: a name that is none, no place or two wishes, a place off the branch, or nothing
-            to remove.
+        InputError: the name is invalid, the position is missing, contradictory or off the branch,
+            or there is nothing to remove.
     """
     from limber.store.loading import load_mesh, load_targets
 
@@ -109,7 +109,7 @@ def _check_request(name: str, settings: TargetSettings) -> None:
 
 def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: TargetSettings,
             ) -> dict[str, Any]:
-    """Return the target and how it hangs on the branch."""
+    """Return the target and its attachment to the branch."""
     from limber.mechanics.loads.loaded_branch import NamedTarget
     from limber.mechanics.points import nearest_inside
 

@@ -1,4 +1,4 @@
-"""Clouds as COLMAP's ``points3D.bin``; its text is read as other text is."""
+"""Clouds as COLMAP's ``points3D.bin``; its text format is read like other text."""
 
 import struct
 from pathlib import Path
@@ -11,14 +11,14 @@ from limber.geometry.cloud.cloud import Cloud
 
 _POINT = struct.Struct("<Q3d3BdQ")
 _SEEN_BYTES = 8
-"""Of each image that saw a point: its number, and that of the point in it."""
+"""For each image that saw a point: its number, and that of the point in it."""
 
 
 def read_points3d(path: Path) -> Cloud:
     """Return the points of a reconstruction, in its own unit, with colour and error.
 
     Raises:
-        InputError: it is cut short.
+        InputError: the file is cut short.
     """
     raw = path.read_bytes()
     count, = struct.unpack_from("<Q", raw)

@@ -1,7 +1,7 @@
 """Clouds as E57 files (ASTM E2807), read without a package: none has wheels for all systems.
 
-A file is pages of 1,024 bytes whose last four check the others. Without them it is a header, an XML
-text that says which scans there are, and for each scan packets of numbers of a few bits each.
+A file consists of pages of 1,024 bytes, of which the last four are a checksum. Without them it is a
+header, an XML text that lists the scans, and for each scan packets of numbers of a few bits each.
 """
 
 import struct
@@ -25,7 +25,7 @@ _DATA_PACKET = 1
 
 @dataclass(frozen=True)
 class _Field:
-    """A column: its name, how many bits a value has, and what its value is."""
+    """A column: its name, bits per value, and meaning of its values."""
 
     name: str
     bits: int
@@ -39,8 +39,8 @@ def read_e57(path: Path) -> Cloud:
     """Return the points of all scans [m] in their common frame, with colour and scalars.
 
     Raises:
-        InputError: it is damaged, is compressed in a way that the standard leaves open, or has no
-            scan with points.
+        InputError: the file is damaged, is compressed in a way that the standard leaves open, or
+            has no scan with points.
     """
     content, page = _content(path)
     start, length = struct.unpack_from("<QQ", content, 24)
@@ -67,7 +67,7 @@ def read_e57(path: Path) -> Cloud:
 
 
 def _content(path: Path) -> tuple[bytes, int]:
-    """The file without the checks of its pages, and how long a page is."""
+    """The file without the checksums of its pages, and the length of a page."""
     raw = np.frombuffer(path.read_bytes(), np.uint8)
     if len(raw) < 48 or raw[:8].tobytes() != b"ASTM-E57":
         raise _damaged(path, "it does not begin as E57 files do")

@@ -16,7 +16,7 @@ def read_ptx(path: Path) -> Cloud:
     """Return the points of all scans [m] in their common frame, with intensity and colour.
 
     Raises:
-        InputError: a scan is cut short, or a header or a line of it is none.
+        InputError: a scan is cut short, or a header or a line of it is invalid.
     """
     lines = [line for line in decoded(path.read_bytes()).splitlines() if line.strip()]
     scans, start = [], 0
@@ -43,7 +43,7 @@ def read_ptx(path: Path) -> Cloud:
 
 
 def _header(path: Path, head: list[str], start: int) -> tuple[int, np.ndarray]:
-    """Points of a scan and its matrix [4, 4], which takes points as rows to the common frame."""
+    """Points of a scan and its matrix [4, 4] from points as rows to the common frame."""
     try:
         columns, rows = int(head[0]), int(head[1])
         matrix = np.array([[float(word) for word in line.split()] for line in head[6:_HEAD]])
@@ -57,7 +57,7 @@ def _header(path: Path, head: list[str], start: int) -> tuple[int, np.ndarray]:
 
 
 def _scan(path: Path, rows: list[str], matrix: np.ndarray) -> np.ndarray:
-    """Points in the common frame and what else a line has; NaN where there was no echo."""
+    """Points in the common frame and the other values of a line; NaN where there was no echo."""
     try:
         table = np.loadtxt(rows, ndmin=2)
     except ValueError as error:

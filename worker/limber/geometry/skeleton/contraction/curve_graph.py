@@ -24,10 +24,10 @@ class CurveGraph:
     Attributes:
         nodes: Positions [m], shape [n, 3].
         edges: Node pairs of the forest, shape [e, 2].
-        thickness: Distance that a node's points were drawn [m]: a first radius, shape [n].
+        thickness: Distance [m] by which a node's points were contracted: a first radius, shape [n].
         support: Number of points of each node, shape [n].
-        bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m], ``price``
-            (1: an end goes straight on; more: the odder).
+        bridges: Each closed gap: ``from``, ``to`` [m, 3], ``length`` [m], ``price`` (1: a straight
+            continuation of an end; higher: less plausible).
         split_off: Each discarded piece: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
         plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
@@ -55,7 +55,8 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
         points: Scanned points [m], shape [n, 3].
         contracted: The same points after contraction [m], shape [n, 3].
         gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
-        bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
+        bridge_limit: Gaps up to this length [m] are bridged; beyond it, the smaller piece is
+        discarded.
         up: The up direction, shape [3].
         join_plants: Join even pieces that look like two plants.
     """
@@ -84,7 +85,7 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
 
 
 def spreads(points: np.ndarray, owner: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """How far each node's points reach from it [m], shape [n]."""
+    """Largest distance of each node's points from it [m], shape [n]."""
     spread = np.zeros(len(nodes))
     np.maximum.at(spread, owner, np.linalg.norm(points - nodes[owner], axis=1))
     return spread
@@ -93,8 +94,8 @@ def spreads(points: np.ndarray, owner: np.ndarray, nodes: np.ndarray) -> np.ndar
 def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Pairs of near points, shape [m, 2], and the median distance to the nearest neighbour [m].
 
-    A link is at most four times as long as its ends' own neighbourhoods are wide, so that sparse
-    twigs hold together and neighbouring ones stay apart.
+    A link is at most four times as long as the neighbourhoods of its ends are wide. So sparse twigs
+    stay connected and neighbouring twigs stay apart.
     """
     count = min(11, len(points))
     distance, near = cKDTree(points).query(points, k=count)
@@ -109,7 +110,7 @@ def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def rooted(nodes: np.ndarray, edges: np.ndarray, root: int) -> np.ndarray:
-    """Parents of the tree of ``edges`` hung up at ``root``; -1 for the root, -2 if not reached."""
+    """Parents in the tree of ``edges`` rooted at ``root``; -1 for the root, -2 if not reached."""
     _, before = breadth_first_order(edge_matrix(len(nodes), edges), root, directed=False)
     parent = np.where(before < 0, -2, before).astype(np.int64)
     parent[root] = -1
@@ -149,7 +150,7 @@ def _node_links(owner: np.ndarray, links: np.ndarray) -> np.ndarray:
 
 def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
                      radius: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """Shortest edges first; an edge that closes a long way round is a loop of the plant."""
+    """Shortest edges first; an edge that closes a long cycle is a loop of the plant."""
     if len(edges) == 0:
         return edges, []
     tree = minimum_spanning_tree(edge_matrix(len(nodes), edges, np.maximum(length, 1e-300))).tocoo()

@@ -1,13 +1,13 @@
 """Laplacian-based contraction: the cloud is drawn together onto the axes of its branches.
 
 Cao, Tagliasacchi, Olson, Zhang, Su: Point Cloud Skeletons via Laplacian-Based Contraction (2010),
-as the paper has it: each iteration solves, in the least-squares sense,
+following the paper: each iteration solves, in the least-squares sense,
 
     [W_L L]        [   0   ]
     [ W_H ]  P'  = [ W_H P ].
 
-The Laplacian is taken once, on the scan. Taken anew on the contracted points, as is usual, it
-follows every hole of the scan and costs several times the time (`scripts/bench geometry`).
+The Laplacian is computed once, on the scan. Recomputed on the contracted points, as is usual, it
+follows every hole of the scan and takes several times as long (`scripts/bench geometry`).
 """
 
 import time
@@ -41,12 +41,12 @@ _STILL_THICK = 0.6  # fraction of points not yet on a line, down to which the we
 
 
 class ContractionStatus(StrEnum):
-    """How a contraction ended; each is its own text.
+    """How a contraction ended; each value is its own text.
 
     contracted: nearly all points lie on lines.
     stalled: points no longer moved.
-    iteration_limit: no more solves were allowed.
-    given: the skeleton was given, nothing was contracted.
+    iteration_limit: the maximum number of solves was reached.
+    given: the skeleton was given, so there was no contraction.
     """
 
     contracted = "contracted"
@@ -57,19 +57,19 @@ class ContractionStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Contraction:
-    """What the contraction ended with.
+    """Result of the contraction.
 
     Attributes:
         points: Contracted points [m], recentred against the scan, shape [n, 3], in the order of
             the input.
         linearity: Fraction of the variance around each point that lies along one line, 1/3 to 1,
-            shape [n]: 1 where the cloud has become a curve.
+            shape [n]; 1 where the cloud has become a curve.
         iterations: Number of linear solves.
-        status: How it ended.
+        status: Status at the end.
         history: One dict an iteration: ``moved`` [m], ``active`` (fraction of points not yet on a
             curve), ``seconds``.
-        drawn: Contracted points [m] before they were recentred: less right, but they tell
-            branches apart up to the fork, where circles mix them, shape [n, 3].
+        drawn: Contracted points [m] before recentring, shape [n, 3]. They are less accurate, but
+            separate branches up to the fork, where circles mix them.
     """
 
     points: np.ndarray
@@ -90,7 +90,7 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
     Args:
         points: Positions [m], shape [n, 3].
         attraction: constant, or growing as neighbourhoods shrink (Cao et al., section 4). On 4
-            generated branches growing was as good where all sides were seen; from one side radii
+            generated branches growing was as good where all sides were seen. From one side radii
             were 2.6 instead of 2.0 % off, and one fork of 12 was lost.
         progress: Called each iteration.
 
@@ -114,8 +114,8 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
         positions = drawn
         linearity = local_linearity(positions)
         active = linearity < _LINEAR
-        # Past that share it is forks and noise that never become lines; more weight only pulls
-        # the rest off its axis.
+        # Beyond that fraction, only forks and noise remain, which never become lines. More weight
+        # only pulls the rest off its axis.
         growth = _GROWTH if active.mean() > _STILL_THICK else 1.0
         weight *= np.where(active, growth, 0.1)
         if growing is not None:
@@ -138,8 +138,8 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
 def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
     """Return the cotangent Laplacian of a cloud (rows sum to 0), shape [n, n].
 
-    By ``robust_laplacian`` (Sharp and Crane 2020) where it is installed, else by the triangles
-    of each point's neighbours in its tangent plane.
+    Uses ``robust_laplacian`` (Sharp and Crane 2020) if installed, else triangles of each point's
+    neighbours in its tangent plane.
     """
     try:
         import robust_laplacian
@@ -173,7 +173,7 @@ class _Attraction:
         return np.clip(self._extent / extents, 1.0, _MOST_ATTRACTION)
 
     def _extents(self, points: np.ndarray) -> np.ndarray:
-        """Mean distance of each point's first neighbours from it, shape [n]."""
+        """Mean distance of each point from its first neighbours, shape [n]."""
         return np.linalg.norm(points[self._near] - points[:, None], axis=2).mean(axis=1)
 
 

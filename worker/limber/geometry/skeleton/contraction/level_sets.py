@@ -1,11 +1,11 @@
-"""The scan's own connectivity, cut into levels from the root: for sparse scans and for leaves.
+"""Level sets of the scan's connectivity, measured from the root: for sparse scans and for leaves.
 
-Where twigs are a few points thick, contraction draws neighbouring ones together, and they become
-one branch; and a leaf is no cylinder that an axis could be fitted to. Shortest paths along the scan
-keep twigs apart as long as the scan does: points about as far from the root along the plant, and
-connected, are one place of one branch. Verroust and Lazarus: Extracting skeletal curves from 3D
-scattered data (2000); for scanned trees Xu, Gossett and Chen: Knowledge and heuristic-based
-modeling of laser-scanned trees (2007).
+Where twigs are a few points thick, contraction merges neighbouring ones into one branch. A leaf is
+not a cylinder to which an axis could be fitted. Shortest paths along the scan keep twigs apart as
+long as the scan does: connected points at about the same distance from the root along the plant
+form one section of one branch. Verroust and Lazarus: Extracting skeletal curves from 3D scattered
+data (2000); for scanned trees Xu, Gossett and Chen: Knowledge and heuristic-based modeling of
+laser-scanned trees (2007).
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from limber.geometry.skeleton.joining.join_pieces import join_pieces
 from limber.geometry.skeleton.joining.pieces import edge_matrix, labels
 
 POINT_LIMIT = 30_000
-"""Points that levels are made of at most: more tell no finer twigs apart, they only take longer."""
+"""Most points from which levels are made. More take longer and separate no finer twigs."""
 
 _WIDTH = 3.0  # of a level, in median distances to the nearest point
 _SPARSE = 0.65  # how far points are drawn, in their own spacing
@@ -30,15 +30,14 @@ _SPARSE_QUANTILE = 0.1
 
 
 def is_sparse(points: np.ndarray, contracted: np.ndarray) -> bool:
-    """Whether part of the scan shows branches too thinly to be told apart by contraction.
+    """Whether part of the scan shows branches too sparsely for contraction to separate them.
 
-    There points were drawn less far, towards an axis, than they are apart. For that tenth of the
-    points the ratio is over 0.75 in scans of single branches, under 0.57 in trees and in sparse
-    scans.
+    There, points moved towards an axis by less than their spacing. For that tenth of the points the
+    ratio is over 0.75 in scans of single branches, under 0.57 in trees and in sparse scans.
 
     Args:
         points: Scanned points [m], shape [n, 3].
-        contracted: The same points as contraction drew them [m], shape [n, 3].
+        contracted: The same points after contraction [m], shape [n, 3].
     """
     drawn = np.linalg.norm(points - contracted, axis=1)
     _, near = cKDTree(contracted).query(contracted, k=min(16, len(points)))
@@ -55,12 +54,13 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
 
     Args:
         points: Scanned points [m], shape [n, 3].
-        source: Where the root is [m], shape [3].
+        source: Position of the root [m], shape [3].
         gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
-        bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
+        bridge_limit: Gaps up to this length [m] are bridged; beyond it, the smaller piece is
+        discarded.
         up: The up direction, shape [3].
         join_plants: Join even pieces that look like two plants.
-        width: Of a level [m]; None: as narrow as the points' spacing allows.
+        width: Width of a level [m]; None: as narrow as the points' spacing allows.
     """
     links, spacing = neighbour_links(points)
     distance, before = _along_plant(points, links, source)
@@ -86,16 +86,17 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
 
 def _along_plant(points: np.ndarray, links: np.ndarray, source: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each point along the scan, and the point before it on the way, -1 at starts.
+    """Distance of each point along the scan, and the previous point on its path, -1 at starts.
 
-    A piece that hangs together with nothing starts anew where it is nearest to those done.
+    An unconnected piece starts again where it is nearest to those already processed.
     """
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
     graph = edge_matrix(len(points), links, np.maximum(length, 1e-12))
     graph = graph.maximum(graph.T)
     _, piece = connected_components(graph, directed=False)
     distance, before = np.full(len(points), np.inf), np.full(len(points), -1)
-    # One start, though levels near it run askew: from all points around a cut, more spurs came.
+    # A single start, although levels near it are oblique. Starting from all points around a cut
+    # gave more spurs.
     starts = np.array([np.argmin(np.linalg.norm(points - source, axis=1))])
     while True:
         way, previous, _ = dijkstra(graph, directed=False, indices=starts, min_only=True,
@@ -113,7 +114,7 @@ def _along_plant(points: np.ndarray, links: np.ndarray, source: np.ndarray,
 
 
 def _parents(owner: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """The node that most of each node's points were reached from, -1 at starts."""
+    """The node from which most of each node's points were reached, -1 at starts."""
     across = np.flatnonzero(before >= 0)
     across = across[owner[before[across]] != owner[across]]
     pairs, count = np.unique(np.stack([owner[across], owner[before[across]]], axis=1), axis=0,

@@ -1,8 +1,8 @@
-"""Recentring: contracted points are put where the scan around them says that the axis is.
+"""Recentring: contracted points move to the axis that the scan around them indicates.
 
-Contraction draws points inward of bends, and where one side alone was seen it ends on that side:
-about 0.7 radii off the axis. The scanned points of a short piece of branch lie on a circle around
-its axis, whichever part of it was seen; that circle's centre is where they belong.
+Contraction draws points inward of bends. Where only one side was seen, it ends on that side, about
+0.7 radii off the axis. The scanned points of a short piece of branch lie on a circle around its
+axis, whichever part of it was seen. The centre of that circle is the right position.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ _FARTHEST = 1.5  # how far a point may be put off its line, in how far it was dr
 def recentred(points: np.ndarray, contracted: np.ndarray) -> np.ndarray:
     """Move contracted points across their own line to the centre of the scanned points' circle.
 
-    Where the points around lie on no circle (forks, leaves, strays) a point is only put on the
-    line of its neighbours.
+    Where the points around lie on no circle (forks, leaves, strays), a point only moves to the line
+    of its neighbours.
 
     Args:
         points: Scanned points [m], shape [n, 3].
@@ -44,7 +44,7 @@ def recentred(points: np.ndarray, contracted: np.ndarray) -> np.ndarray:
     some = slice(0, 400)
     inside = float(np.median(tree.query_ball_point(
         contracted[site[some]], drawn[some], return_length=True)))
-    # Every so many points only, so that those around reach about as far as a branch is thick.
+    # Only every n-th point, so that the neighbours reach about as far as a branch is thick.
     chosen = order[:max(int(count * min(1.0, _WANTED / max(inside, 1.0))),
                         min(count, 3 * _WANTED))]
     distance, near = cKDTree(contracted[chosen]).query(
@@ -102,8 +102,8 @@ def _circles(u: np.ndarray, v: np.ndarray, weight: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centre and radius of the circle through each row of weighted points, shape [n, k].
 
-    Taubin's fit (1991), solved by Newton's iteration as in Chernov: Circular and Linear
-    Regression (2010), 5.10: nearly unbiased on arcs, where the plain algebraic fit shrinks.
+    Taubin's fit (1991), solved by Newton's iteration following Chernov: Circular and Linear
+    Regression (2010), 5.10. It is nearly unbiased on arcs, where the plain algebraic fit shrinks.
     """
     weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
     mean_u, mean_v = (weight * u).sum(axis=1), (weight * v).sum(axis=1)
@@ -123,7 +123,7 @@ def _circles(u: np.ndarray, v: np.ndarray, weight: np.ndarray,
         following = root - value / np.where(slope == 0, 1e-300, slope)
         root = np.where(np.isfinite(following) & (following >= 0), following, root)
     scale = root**2 - root * mean_z + covariance
-    # Points on a line: a circle without end, that the caller's limits refuse.
+    # Points on a line give an infinite circle, which the caller's limits reject.
     scale = np.where(np.abs(scale) > 1e-12 * mean_z**2, scale, 1e-12 * mean_z**2 + 1e-300)
     a = (xz * (yy - root) - yz * xy) / scale / 2
     b = (yz * (xx - root) - xz * xy) / scale / 2

@@ -1,4 +1,4 @@
-"""Which end of a curve graph is the root: the lowest of the thick ones, or where the user says."""
+"""Choice of a curve graph's root: the lowest of the thick ends, or the user's."""
 
 import numpy as np
 
@@ -15,14 +15,15 @@ _ROOT_EVEN = 1.0  # by which two ends may differ, in these, and be as likely
 
 def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
               prune: float) -> tuple[int, np.ndarray | None]:
-    """The end nearest to ``root``, or the lowest of the thick ends; and one that is as likely.
+    """The end nearest to ``root``, or the lowest of the thick ends; and another about as likely.
 
-    How thick an end is, its smallest extent tells together with how far its points were drawn: a
-    leaf is wide, but flat. An end that is shorter than it is thick is a spur, not an end.
+    The thickness of an end follows from its smallest extent and the distance that its points moved:
+    a leaf is wide, but flat. An end that is shorter than it is thick is a spur, not an end.
     """
     degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
     tips = np.flatnonzero(degree == 1)
-    # Spurs would end the walk from a tip early: pruned as from the lowest tip, for now.
+    # Spurs would end the walk from a tip early, so they are pruned here as seen from the lowest
+    # tip.
     first = int(tips[np.argmin(graph.nodes[tips] @ up)])
     parent = rooted(graph.nodes, graph.edges, first)
     neighbours = _pruned_neighbours(graph, parent, prune)
@@ -30,15 +31,15 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
     if root is not None:
         return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))]), None
     thick = _end_thickness(graph, points, neighbours, tips)
-    # Of a thick foot that few points show, contraction leaves strands around its rim: each tells
-    # as little of it as a twig.
+    # Where few points show a thick foot, contraction leaves strands around its rim. Each strand
+    # gives as little evidence of the foot as a twig.
     neighbours = _pruned_neighbours(graph, parent, max(prune, _STRAND))
     whole = np.array([len(neighbours[tip]) == 1 for tip in tips])
     thick[whole] = np.maximum(thick[whole], _end_thickness(graph, points, neighbours, tips[whole]))
     able = thick >= _ROOT_SHARE * thick.max()
     height = graph.nodes[tips] @ up / np.linalg.norm(up)
     chosen = int(np.argmin(np.where(able, height, np.inf)))
-    # As likely: about as low and as thick, or thicker by more than it is higher.
+    # About as likely: about as low and as thick, or thicker by more than it is higher.
     odds = np.log(np.maximum(thick, 1e-12) / max(thick[chosen], 1e-12)) / _ROOT_THICK - (
         height - height[chosen]) / (_ROOT_HEIGHT * max(float(np.ptp(height)), 1e-12))
     odds[chosen] = -np.inf
@@ -48,7 +49,7 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
 
 
 def _pruned_neighbours(graph: CurveGraph, parent: np.ndarray, prune: float) -> list[list[int]]:
-    """Neighbours of each node along what is left without spurs."""
+    """Neighbours of each node in the graph without spurs."""
     keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
     neighbours: list[list[int]] = [[] for _ in graph.nodes]
     for node in np.flatnonzero(keep & (parent >= 0)):
@@ -59,18 +60,18 @@ def _pruned_neighbours(graph: CurveGraph, parent: np.ndarray, prune: float) -> l
 
 def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[int]],
                    tips: np.ndarray) -> np.ndarray:
-    """How thick each end is [m], shape [tips]; 0 for spurs."""
+    """Thickness of each end [m], shape [tips]; 0 for spurs."""
     reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
     thick = np.zeros(len(tips))
     for place, tip in enumerate(tips):
-        # Contraction may draw a few points of an end far beyond it.
-        # What few points show of a ragged foot says little: it goes on until there are enough.
+        # Contraction may draw a few points of an end far beyond it. A few points of a ragged foot
+        # give little evidence, so the walk continues until there are enough.
         for way in reach * np.arange(1, _END_REACHES + 1) + graph.thickness[tip]:
             chain = _end_chain(neighbours, graph.nodes, int(tip), way)
             mine = points[np.isin(graph.owner, chain)]
             if len(mine) >= _END_POINTS:
                 break
-        # Along the chain: contraction leads what is left of a ragged foot around its rim.
+        # Measured along the chain: contraction runs what is left of a ragged foot around its rim.
         length = np.linalg.norm(np.diff(graph.nodes[chain], axis=0), axis=1).sum()
         if len(mine) < 4:
             continue

@@ -8,8 +8,8 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 def tangent_laplacian(points: np.ndarray, neighbours: int) -> sparse.csc_matrix:
     """Return a cotangent Laplacian: Delaunay triangles around each point in its tangent plane.
 
-    Belkin, Sun, Wang: Constructing Laplace operator from point clouds in R^d (2009); as Cao et
-    al. use it for contraction. Each triangle is seen from up to three points, hence the third.
+    Belkin, Sun, Wang: Constructing Laplace operator from point clouds in R^d (2009); Cao et al. use
+    it for contraction. Each triangle is seen from up to three points, hence the third.
 
     Args:
         points: Positions, shape [n, 3].

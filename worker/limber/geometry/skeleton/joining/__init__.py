@@ -1,1 +1,1 @@
-"""Pieces of a scan joined to one tree over its gaps."""
+"""Joining of a scan's pieces to one tree over its gaps."""

@@ -1,4 +1,4 @@
-"""Which of the possible bridges are made in a round."""
+"""Selection of the bridges that are made in a round."""
 
 from collections.abc import Iterator
 
@@ -11,10 +11,11 @@ from limber.geometry.skeleton.joining.pieces import Joined, Rules
 from limber.geometry.skeleton.joining.plants import PLANT_SHARE, are_plants
 
 _SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any size
-# The longest bridge beyond, in what the smaller piece reaches; and where it goes straight on.
+# Longest bridge beyond, in reaches of the smaller piece; the same if straight; price per length of
+# a straight one.
 _REACH, _REACH_STRAIGHT, _STRAIGHT_ON = 5.0, 10.0, 1.5
-# A turn up to which an end points at what it reaches, and within which its piece is straight behind
-# it: an end that is so long reaches as far.
+# Largest turn at which an end points at its target, and the angle within which its piece is
+# straight behind it: an end that is straight for such a length reaches as far.
 _AHEAD, _BEHIND = np.deg2rad(10.0), np.deg2rad(15.0)
 _AT_ONCE = 1024  # hypotheses that are looked through together
 
@@ -23,15 +24,16 @@ def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rul
            alone: bool) -> tuple[list[int], set[tuple[int, int]]]:
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
 
-    A piece that has a bridge takes another in the same round, if what is joined to it by that lies
-    so far from all bridges of the round that none of them can offer it a cheaper one: otherwise a
-    stem with many twigs would take as many rounds.
+    A piece with a bridge takes another one in the same round if the newly joined part is so far
+    from all bridges of the round that none of them can offer it a cheaper one. Otherwise a stem
+    with many twigs would take as many rounds.
 
-    Stems are joined before twigs; where two pieces belong together, a price counts more than how
-    thick the end is that names it: a knob of the stem that points past a twig is no foot of it.
+    Stems are joined before twigs. Where two pieces belong together, the price counts more than the
+    thickness of the end that proposes the bridge: a knob of the stem that points past a twig is not
+    its foot.
 
     Returns:
-        Their places, and the pairs of given pieces whose hypotheses decided on them.
+        Their indices, and the pairs of given pieces whose hypotheses were decisive.
     """
     pairs = np.sort(state.label[np.stack([found.one, found.other])], axis=0)
     own_price = found.price / np.sqrt(found.thick)
@@ -84,9 +86,9 @@ class _Made:
         return a in self._joined or b in self._joined
 
     def is_clear(self, found: Hypotheses, place: int, piece: int) -> bool:
-        """Whether all bridges lie farther from a piece than its hypothesis costs.
+        """Whether all bridges are farther from a piece than its hypothesis costs.
 
-        No way to what they fill in is cheaper then. A blind way is compared with blind ones.
+        No path to their added nodes is cheaper then. Blind paths are compared with blind ones.
         """
         own = self._state.nodes[self._state.label == piece]
         apart = np.linalg.norm(own[:, None] - np.array(self._middles), axis=2).min(axis=0)
@@ -101,8 +103,8 @@ def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], coun
 
     Args:
         pairs: The pieces of each, shape [2, h].
-        likely: Which of them are looked at, shape [h].
-        best: Grows in between.
+        likely: Which of them are considered, shape [h].
+        best: Updated by the caller during the iteration.
         count: Number of pieces.
     """
     has = np.zeros(count, bool)
@@ -118,10 +120,10 @@ def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], coun
 
 
 class _Allowed:
-    """Whether the smaller piece of a bridge is large enough for it, and no plant of its own.
+    """Whether the smaller piece of a bridge is large enough for it, and not a plant of its own.
 
     Attributes:
-        likely: What may hold, as far as lengths and prices of all hypotheses tell, shape [h].
+        likely: Hypotheses that may hold, judged by the lengths and prices of all, shape [h].
     """
 
     def __init__(self, found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray,
@@ -132,7 +134,8 @@ class _Allowed:
         of_one = weight[a] <= weight[b]
         reach = far_sides(state.nodes, np.maximum(state.spread, state.thickness), state.label,
                           np.where(of_one, found.one, found.other))
-        # An end may go far straight on to what is left of its tip; that itself points anywhere.
+        # An end may reach far straight ahead to the rest of its tip; the rest itself has no
+        # reliable direction.
         odd = found.price > _STRAIGHT_ON * found.length
         straight = (found.price < _STRAIGHT_ON * found.length) & ~of_one
         self._near = found.length <= np.maximum(
@@ -144,7 +147,7 @@ class _Allowed:
             found.length > rules.gap) & (not rules.join_plants)
 
     def holds(self, place: int) -> bool:
-        """Whether a hypothesis that is likely is allowed."""
+        """Whether a likely hypothesis is allowed."""
         pair = int(self._found.one[place]), int(self._found.other[place])
         state = self._state
         if not self._near[place] and self._found.length[place] > _straight_behind(
@@ -155,7 +158,7 @@ class _Allowed:
 
 
 def _straight_behind(state: Joined, ends: Ends, end: int) -> float:
-    """How far an end's piece lies straight behind it [m]."""
+    """Length over which an end's piece is straight behind it [m]."""
     direction = ends.direction[int(np.flatnonzero(ends.node == end)[0])]
     offset = state.nodes[state.label == state.label[end]] - state.nodes[end]
     behind = -(offset @ direction)

@@ -1,4 +1,4 @@
-"""Loops of the search for bridges: what each end costs to join to each node of other pieces."""
+"""Loops of the search for bridges: cost of joining each end to each node of other pieces."""
 
 import math
 
@@ -7,7 +7,7 @@ from numba import njit
 
 _TURN = math.radians(35.0)  # a turn that doubles the price
 _SIDE = 0.25  # what a fork costs against going on
-# Angle that twigs stand at, and what doubles the price.
+# Usual angle of twigs to their carrier, and the deviation from it that doubles the price.
 _STAND, _STAND_DOUBLES = math.radians(45.0), math.radians(60.0)
 _RATIO = 0.7  # price of a radius e times another
 _FARTHER = 2.0  # an end may reach that times the limit, if it points at what it reaches
@@ -17,7 +17,7 @@ _LEAST = 1e-12
 
 @njit(cache=True)
 def _turned(direction: np.ndarray, way: np.ndarray, radius: float) -> float:
-    """Angle [rad] from a direction to a way; aside by up to a radius is no turn."""
+    """Angle [rad] from a direction to a path; an offset of up to a radius is no turn."""
     along = way[0] * direction[0] + way[1] * direction[1] + way[2] * direction[2]
     x, y, z = (way[0] - along * direction[0], way[1] - along * direction[1],
                way[2] - along * direction[2])
@@ -29,19 +29,19 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
            label: np.ndarray, end_node: np.ndarray, end_direction: np.ndarray,
            end_radius: np.ndarray, end_of: np.ndarray, limit: float,
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Price the ways from all ends that have a direction to the nodes of other pieces.
+    """Price the paths from all ends with a direction to the nodes of other pieces.
 
     Args:
         nodes: Positions [m], shape [n, 3].
         thickness: First radii [m], shape [n].
         axis: Direction of the axis at each node, zero where there is none, shape [n, 3].
-        single: Whether a node's piece tells neither direction nor thickness, shape [n].
+        single: Whether a node's piece has neither direction nor thickness, shape [n].
         label: Which piece each node belongs to, shape [n].
         end_node: Nodes of the ends, shape [k].
         end_direction: Outwards, zero where there is none, shape [k, 3].
         end_radius: Typical thickness [m], shape [k].
         end_of: Which end a node is, -1 if none, shape [n].
-        limit: Longest way [m], unless an end points straight at what it reaches.
+        limit: Longest path [m], unless an end points straight at its target.
 
     Returns:
         Columns of :class:`.bridges.Hypotheses`, without the last.
@@ -73,7 +73,7 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
                 along = abs(way[0] * axis[node, 0] + way[1] * axis[node, 1]
                             + way[2] * axis[node, 2])
                 stand = math.acos(min(along / far, 1.0))
-            # Of a single patch of skin the contraction tells no thickness.
+            # For a single patch of skin, the contraction gives no thickness.
             thicker = 0.0 if single[node] else math.log(radius / max(thickness[node], _LEAST))
             side = (_SIDE + ((stand - _STAND) / _STAND_DOUBLES)**2
                     + _RATIO * max(thicker, 0.0))
@@ -101,9 +101,9 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
     Args:
         nodes: Positions [m], shape [n, 3].
         label: Which piece each node belongs to, shape [n].
-        own: The nodes that ask, shape [m].
+        own: The querying nodes, shape [m].
         limit: Only nodes nearer than that [m].
-        count: How many at most.
+        count: Most nodes to find.
 
     Returns:
         Nodes, -1 where there are fewer, and distances [m], both of shape [m, count].
@@ -141,13 +141,13 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
 @njit(cache=True)
 def far_sides(nodes: np.ndarray, spread: np.ndarray, label: np.ndarray, own: np.ndarray,
               ) -> np.ndarray:
-    """How far the points of a node's piece reach from it [m], for each of ``own``, shape [m].
+    """Largest distance of the points of a node's piece from it [m], for each of ``own``, shape [m].
 
     Args:
         nodes: Positions [m], shape [n, 3].
-        spread: How far its points reach from each node [m], shape [n].
+        spread: Largest distance of each node's points from it [m], shape [n].
         label: Which piece each node belongs to, shape [n].
-        own: The nodes that ask, in any order, also repeatedly, shape [m].
+        own: The querying nodes, in any order, repeats allowed, shape [m].
     """
     order = np.argsort(label, kind="mergesort")
     start = np.searchsorted(label[order], np.arange(label.max() + 2))

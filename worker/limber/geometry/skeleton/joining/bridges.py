@@ -1,10 +1,10 @@
 """Bridges over gaps of a scan, as hypotheses: which ends of its pieces belong together.
 
-The shortest way over a gap is often wrong: where a fork is missing, it leads from the stem along a
-twig and back. An end of a piece goes on in its own direction, meets another end that comes towards
-it and is about as thick, or the side of a thicker piece at the angle that twigs stand at. How far
-that is from what was found prices a hypothesis; the cheapest ones for their thickness are taken
-first, so that stems come before twigs, and what they fill in can carry the next.
+The shortest path over a gap is often wrong: where a fork is missing, it runs from the stem along a
+twig and back. An end of a piece continues in its own direction. It meets another end that points
+towards it and is about as thick, or the side of a thicker piece at the usual angle of twigs. The
+deviation from that sets the price of a hypothesis. The cheapest ones for their thickness are taken
+first, so stems come before twigs, and the nodes added along them can carry later ones.
 """
 
 from dataclasses import dataclass
@@ -27,11 +27,12 @@ class Hypotheses:
         one: Node at the end that reaches out, shape [h].
         other: Node that it reaches, shape [h].
         length: [m], shape [h].
-        price: Length times how odd the bridge is [m], shape [h].
+        price: Length times the implausibility of the bridge [m], shape [h].
         turn: Angle between the end's direction and the bridge [rad], pi where it has none,
             shape [h].
         meets: 1 where the other node is an end that comes towards this one, else 0, shape [h].
-        thick: How thick the end that reaches out is [m]; of a blind one the thinner, shape [h].
+        thick: Thickness of the end that reaches out [m]; for a blind one, of the thinner, shape
+        [h].
     """
 
     one: np.ndarray
@@ -46,7 +47,7 @@ class Hypotheses:
 def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, label: np.ndarray,
                weight: np.ndarray, limit: float, ends: Ends, known: Known | None = None,
                ) -> Hypotheses:
-    """Price the ways in which pieces can be joined.
+    """Price the paths by which pieces can be joined.
 
     Args:
         nodes: Positions [m], shape [n, 3].
@@ -54,9 +55,9 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
         thickness: First radii [m], shape [n].
         label: Which piece each node belongs to, shape [n].
         weight: Points of each piece, shape [pieces].
-        limit: No bridge is longer [m], unless an end points straight at what it reaches.
+        limit: Longest bridge [m], unless an end points straight at its target.
         ends: The pieces' free ends.
-        known: What earlier calls found; what this one finds is added.
+        known: Results of earlier calls; those of this call are added.
     """
     axes = _axes(nodes, edges, known or Known())
     end_of = np.full(len(nodes), -1)
@@ -80,8 +81,8 @@ def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other
            step: float) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [m], shape [k, 3], and radii [m] along a bridge, about ``step`` [m] apart.
 
-    A cubic from end to end in their directions; where only one end has a direction, it leaves in
-    that and arrives as it comes.
+    A cubic from end to end in their directions. If only one end has a direction, the curve leaves
+    in that direction, and its arrival is free.
     """
     start, stop = nodes[one], nodes[other]
     way = stop - start
@@ -124,7 +125,7 @@ def _axes(nodes: np.ndarray, edges: np.ndarray, known: Known) -> np.ndarray:
 
 def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,
            ) -> tuple[np.ndarray, ...]:
-    """The shortest ways from each piece to others, whatever the directions."""
+    """The shortest paths from each piece to others, regardless of direction."""
     own = np.argsort(label, kind="stable")
     own = own[label[own] != largest]
     near, distance = nearest_others(nodes, label, own, float(limit), _BLIND_NEAR)
@@ -135,7 +136,7 @@ def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,
 
 
 def _lead(ends: Ends, node: int, way: np.ndarray) -> np.ndarray | None:
-    """Direction that an end gives to a bridge along ``way``; None if it is none or turns much."""
+    """Direction of an end for a bridge along ``way``; None if there is none or it turns much."""
     place = np.flatnonzero(ends.node == node)
     if len(place) == 0 or not ends.direction[place[0]].any():
         return None

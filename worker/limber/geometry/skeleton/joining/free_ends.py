@@ -7,7 +7,7 @@ import numpy as np
 _CHAIN = 6.0  # radii of an end that tell its direction
 _CHAIN_NODES = 4  # and so many nodes at least
 UNSURE = 2
-"""Nodes of a piece that tell no direction."""
+"""Number of nodes up to which a piece has no reliable direction."""
 _BEYOND, _LONG = 3, 0.9  # nodes past a fork that tell how its axis comes; of a length as long
 
 
@@ -35,10 +35,10 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
         nodes: Positions [m], shape [n, 3].
         edges: Node pairs of a forest, shape [e, 2].
         thickness: First radii [m], shape [n].
-        joints: Those of the edges by which a bridge joined a side, the bridge's node first, shape
-            [j, 2]: a twig that came to a stem's end does not close that.
-        known: What earlier calls found, with fewer edges between the same nodes; what this one
-            finds is added.
+        joints: Edges by which a bridge joined the side of a piece, the bridge's node first, shape
+            [j, 2]: a twig that joined a stem's end does not close that end.
+        known: Results of earlier calls, with fewer edges between the same nodes; those of this call
+            are added.
     """
     found = {} if known is None else known.ends
     near: list[list[int]] = [[] for _ in range(len(nodes))]
@@ -61,12 +61,12 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
 
 @dataclass
 class Known:
-    """What earlier calls found, which holds where nothing has changed since.
+    """Results of earlier calls, valid where nothing has changed since.
 
     Attributes:
-        ends: Of each end.
+        ends: Results for each end.
         sums: Squares of the edges at each node [m^2], shape [n, 3, 3].
-        axes: Direction of the axis that these tell, shape [n, 3].
+        axes: Direction of the axis from these sums, shape [n, 3].
     """
 
     ends: dict[int, "KnownEnd"] = field(default_factory=dict)
@@ -74,20 +74,20 @@ class Known:
     axes: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
     def copy(self) -> "Known":
-        """The same, to which other findings are added."""
+        """The same, to which further results are added."""
         return Known(dict(self.ends), self.sums, self.axes)
 
 
 @dataclass(frozen=True)
 class KnownEnd:
-    """What was found of an end, and all the neighbours that this depended on."""
+    """Result for an end, and all the neighbours that it depended on."""
 
     direction: np.ndarray
     radius: float
     asked: dict[int, list[int]]
 
     def holds(self, near: list[list[int]]) -> bool:
-        """Whether those neighbours are the same still."""
+        """Whether those neighbours are still the same."""
         return all(near[node] == others for node, others in self.asked.items())
 
 
@@ -104,10 +104,10 @@ class _Neighbours:
 
 
 def _end(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, end: int) -> KnownEnd:
-    # Points are missing beside an end too, where it looks thinner than it is.
+    # Points are also missing beside an end, where it looks thinner than it is.
     chain = _straight_chain(nodes, near, end, _CHAIN * thickness[end])
     chain = _straight_chain(nodes, near, end, _CHAIN * float(thickness[chain].max()))
-    # What hangs beside a longer axis has neither its thickness nor its direction.
+    # A stub beside a longer axis has neither its thickness nor its direction.
     chain = chain[:_beside(nodes, near, thickness, chain)]
     direction = _direction(nodes[chain]) if len(chain) > UNSURE else np.zeros(3)
     return KnownEnd(direction, float(np.median(thickness[chain])), near.asked)
@@ -117,7 +117,7 @@ def _straight_chain(nodes: np.ndarray, near: _Neighbours, end: int, reach: float
                     before: int = -1) -> list[int]:
     """Nodes inwards from an end, straight on at forks, as far as ``reach`` [m].
 
-    With ``before`` the chain starts at a node within a piece and goes away from that neighbour.
+    With ``before``, the chain starts at a node within a piece and runs away from that neighbour.
     """
     chain, length = [end], 0.0
     while length < reach or len(chain) < _CHAIN_NODES:
@@ -137,10 +137,10 @@ def _straight_chain(nodes: np.ndarray, near: _Neighbours, end: int, reach: float
 
 def _beside(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, chain: list[int],
             ) -> int:
-    """How many of an end's nodes belong to a stub beside a longer axis; all if it is none.
+    """Number of an end's nodes that belong to a stub beside a longer axis; all if it is not a stub.
 
-    At a fork that the chain passes, that axis goes on along another arm, which is longer than the
-    stub and turns less.
+    At a fork on the chain, that axis continues along another arm, which is longer than the stub and
+    turns less.
     """
     length = 0.0
     for place in range(1, len(chain) - 1):

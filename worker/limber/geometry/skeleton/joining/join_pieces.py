@@ -1,4 +1,4 @@
-"""Pieces of a scan: which belong to one plant and are bridged, and which are discarded."""
+"""Pieces of a scan: those of one plant are bridged, the others discarded."""
 
 from dataclasses import fields
 
@@ -18,21 +18,21 @@ _MOST_WAYS = 150_000_000  # between ends and nodes, that all trials go through: 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
                 spread: np.ndarray, *, gap: float, bridge_limit: float, up: np.ndarray,
                 join_plants: bool) -> Joined:
-    """Join pieces over gaps by the bridges that their directions and radii speak for.
+    """Join pieces over gaps by the bridges that their directions and radii support.
 
-    The smaller piece of a long bridge must have some length itself: so a severed twig comes back to
-    its branch, and a stray clump of pixels is joined to nothing far away.
+    The smaller piece of a long bridge must itself have some length: so a severed twig is joined to
+    its branch again, and a stray clump of pixels is not joined to anything far away.
 
-    Two large pieces that each stand on the ground are two plants, and are not joined.
+    Two large pieces that are each on the ground are two plants and are not joined.
 
     Args:
         nodes: Positions [m], shape [n, 3].
         edges: Node pairs of a forest, shape [e, 2].
         thickness: First radii [m], shape [n].
         support: Number of points of each node, shape [n].
-        spread: How far its points reach from each node [m], shape [n].
+        spread: Largest distance of each node's points from it [m], shape [n].
         gap: Steps up to this length [m] are no gap (the paper's gamma rule).
-        bridge_limit: No bridge is longer [m], unless its end points straight at what it reaches.
+        bridge_limit: Longest bridge [m], unless its end points straight at its target.
         up: The up direction, shape [3].
         join_plants: Join even what looks like two plants.
     """
@@ -49,10 +49,10 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
 
 def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = frozenset(),
             dearest: float = np.inf, alone: bool = True) -> Joined:
-    """Bridge after bridge from what was given; those between ``refused`` pieces are not made.
+    """Make bridge after bridge from the given state, but none between ``refused`` pieces.
 
-    It ends early once they cost ``dearest`` [m]. One node or two tell no direction: as long as
-    ``alone`` holds, they are joined only to ends that go straight on to them.
+    It ends early once they cost ``dearest`` [m]. One or two nodes have no direction: while
+    ``alone`` holds, they are joined only to ends that continue straight to them.
     """
     state = first.copy(first.rounds)
     while True:
@@ -79,9 +79,9 @@ def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = f
 
 def _without(state: Joined, pair: tuple[int, int], rules: Rules,
              refused: frozenset[tuple[int, int]], dearest: float) -> Joined:
-    """As ``state`` was joined, but for bridges between a ``pair`` of pieces, ``refused`` as well.
+    """The state joined like ``state``, but without bridges between this ``pair`` of pieces.
 
-    All is the same up to the first round that such a bridge mattered in.
+    The rounds before the first one in which such a bridge mattered stay the same.
     """
     at = _start(state, pair)
     past = state.rounds[at]
@@ -90,16 +90,16 @@ def _without(state: Joined, pair: tuple[int, int], rules: Rules,
 
 
 def _start(state: Joined, pair: tuple[int, int]) -> int:
-    """The first round that bridges between a ``pair`` of pieces mattered in."""
+    """The first round in which bridges between a ``pair`` of pieces mattered."""
     return next(k for k, past in enumerate(state.rounds) if pair in past.decisive)
 
 
 def _reconsidered(state: Joined, rules: Rules) -> Joined:
-    """The bridges without one that left an odd one to others, if all together then cost less.
+    """Return the bridges without one that forced others to be odd, if the total cost falls.
 
-    A stem's end takes the foot of a twig that happens to be nearer than the stem's next patch;
-    that patch is then left to come to the twig from aside. What was tried in vain is tried again
-    only once bridges of its pieces have changed.
+    A stem's end may take the foot of a twig that is nearer than the stem's next patch. That patch
+    can then only join the twig from the side. A failed attempt is repeated only after bridges of
+    its pieces have changed.
     """
     refused: frozenset[tuple[int, int]] = frozenset()
     vain: set[tuple[int, int]] = set()
@@ -132,7 +132,7 @@ def _bridged(state: Joined) -> set[tuple[int, int]]:
 
 
 def _doubted(state: Joined, gap: float) -> list[tuple[int, int]]:
-    """Pairs of pieces whose bridge ends near an odd one, those near the dearest first."""
+    """Pairs of pieces whose bridge ends near an odd one, those near the most expensive first."""
     ends, length = state.nodes[state.bridges], state.lengths()
     doubted: dict[tuple[int, int], None] = {}
     odd = np.flatnonzero((state.prices > _ODD) & (length > gap))

@@ -1,4 +1,4 @@
-"""Pieces of a scan: what they are while they are being joined."""
+"""Pieces of a scan and their state during joining."""
 
 from dataclasses import dataclass, field, replace
 
@@ -9,30 +9,31 @@ from scipy.sparse.csgraph import connected_components
 from limber.geometry.skeleton.joining.bridges import Hypotheses, filled
 from limber.geometry.skeleton.joining.free_ends import Ends, Known, free_ends
 
-# Length in thicknesses, under which a piece tells no direction; and if it has few points.
+# Length in thicknesses below which a piece has no direction; that for few points; fewer points are
+# few.
 _SPECK, _SPECK_FEW, _FEW = 5.0, 10.0, 30
 
 
 @dataclass
 class Joined:
-    """What joining the pieces gave.
+    """Result of joining the pieces.
 
     Attributes:
         nodes: All nodes [m], those along bridges after the given ones, shape [n, 3].
         thickness: First radii [m], shape [n].
         support: Number of points of each node, none along bridges, shape [n].
-        spread: How far its points reach from each node [m], 0 along bridges, shape [n].
+        spread: Largest distance of each node's points from it [m], 0 along bridges, shape [n].
         edges: All edges, the bridges included, shape [e, 2].
         bridges: Node pairs that were joined, shape [b, 2].
-        prices: What each bridge cost over its length: 1 where an end goes straight on into
-            another as thick, more the odder the bridge is, shape [b].
+        prices: Cost of each bridge over its length, shape [b]: 1 where an end continues straight
+            into another of equal thickness, higher for less plausible bridges.
         plants: Node pairs between pieces that are plants of their own, shape [p, 2].
         label: Which piece each node belongs to now, shape [n].
         joints: Edges by which bridges joined the side of a piece, the bridge's node first, shape
             [j, 2].
-        piece: Which of the given pieces each node is of, -1 along bridges, shape [n].
-        known: What was found of ends and axes on the way here.
-        rounds: How it came to this, see :class:`Round`.
+        piece: The given piece of each node, -1 along bridges, shape [n].
+        known: Results for ends and axes found during joining.
+        rounds: The rounds that led to this state, see :class:`Round`.
     """
 
     nodes: np.ndarray
@@ -50,7 +51,7 @@ class Joined:
     rounds: list["Round"] = field(default_factory=list)
 
     def copy(self, rounds: list["Round"]) -> "Joined":
-        """A state that goes on by itself, after these ``rounds``."""
+        """A copy of the state that changes independently, after these ``rounds``."""
         return replace(self, known=self.known.copy(), rounds=list(rounds))
 
     def ends(self) -> Ends:
@@ -66,7 +67,7 @@ class Joined:
         if not found.meets[place]:
             own, met = (_pointing(ends, node) for node in (one, other))
             if met > 0:
-                # Of two ends side by side the thicker one goes on.
+                # Of two ends side by side, the thicker one continues.
                 joint = chain[[1, 0]] if own > met else chain[[-2, -1]]
                 self.joints = np.vstack([self.joints, joint])
         self.nodes = np.vstack([self.nodes, curve])
@@ -78,12 +79,12 @@ class Joined:
         self.prices = np.append(self.prices, found.price[place] / found.length[place])
 
     def lengths(self) -> np.ndarray:
-        """Of each bridge [m], shape [b]."""
+        """Length of each bridge [m], shape [b]."""
         return np.linalg.norm(self.nodes[self.bridges[:, 0]] - self.nodes[self.bridges[:, 1]],
                               axis=1)
 
     def cost(self) -> float:
-        """What all bridges cost [m]."""
+        """Cost of all bridges [m]."""
         return float(self.prices @ self.lengths())
 
 
@@ -92,11 +93,11 @@ class Round:
     """A round of bridges.
 
     Attributes:
-        before: What there was before it.
-        alone: Whether pieces that tell no direction had to wait.
-        decisive: The pairs of given pieces between which a hypothesis mattered. Without those of
-            any other pair the round is the same.
-        ways: Between ends and nodes, all that could have been hypotheses.
+        before: The state before it.
+        alone: Whether pieces without a direction had to wait.
+        decisive: The pairs of given pieces between which a hypothesis mattered. Without the
+            hypotheses of any other pair, the round is the same.
+        ways: Paths between ends and nodes that could have been hypotheses.
     """
 
     before: Joined
@@ -107,7 +108,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Rules:
-    """What bridges may be, as :func:`join_pieces` has it."""
+    """Limits on bridges, as in :func:`join_pieces`."""
 
     gap: float
     bridge_limit: float
@@ -135,10 +136,10 @@ def edge_matrix(count: int, edges: np.ndarray, weight: np.ndarray | None = None,
 
 def specks(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
            ) -> np.ndarray:
-    """A number for each node, shape [n]: its own, but one for all of a piece too short to point.
+    """A number for each node, shape [n]: its own, but one per piece too short for a direction.
 
-    Of a few points of a branch contraction makes a short line in any direction; whoever is joined
-    to it in its middle finds no end to go on from.
+    From a few points of a branch, contraction makes a short line in a random direction. A piece
+    joined to its middle finds no end to continue from.
     """
     label = labels(len(nodes), edges)
     low, high = np.full((label.max() + 1, 3), np.inf), np.full((label.max() + 1, 3), -np.inf)

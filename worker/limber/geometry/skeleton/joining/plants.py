@@ -1,4 +1,4 @@
-"""Pieces, or tips of one, that stand on the ground as plants of their own."""
+"""Pieces, or tips of one, that are on the ground as separate plants."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from limber.geometry.skeleton.skeleton import Skeleton
 
 PLANT_SHARE = 0.2
-"""Of all points, from which a piece may be a plant of its own."""
+"""Fraction of all points from which a piece may be a separate plant."""
 _BASE_SHARE = 0.12  # of a piece's reach, up to which a bridge starts at its base
 _FAR_SHARE = 0.3  # from which it starts far from its base
 _THICK = 0.45  # of a piece's thickest part, from which the base may be there
@@ -15,7 +15,7 @@ _GROUND = 0.2  # of the scan's height, up to which a base stands on the ground
 
 def are_plants(nodes: np.ndarray, thickness: np.ndarray, label: np.ndarray,
                 bridge: tuple[int, int], up: np.ndarray) -> bool:
-    """Whether two pieces each stand on the ground, not one of them on the other's end."""
+    """Whether two pieces are each on the ground, and neither base is on the other's end."""
     height = nodes @ up
     ground = height.min() + _GROUND * np.ptp(height)
     share = []
@@ -48,7 +48,7 @@ def plants_apart(nodes: np.ndarray, thickness: np.ndarray, support: np.ndarray,
 
 
 def _base(nodes: np.ndarray, thickness: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The lowest place where a piece is thick [m], shape [3]."""
+    """The lowest position where a piece is thick [m], shape [3]."""
     _, near = cKDTree(nodes).query(nodes, k=min(6, len(nodes)))
     thick = np.median(thickness[near.reshape(len(nodes), -1)], axis=1)
     able = np.flatnonzero(thick >= _THICK * np.quantile(thick, 0.9))
@@ -56,10 +56,10 @@ def _base(nodes: np.ndarray, thickness: np.ndarray, up: np.ndarray) -> np.ndarra
 
 
 def second_base(skeleton: Skeleton, up: np.ndarray) -> np.ndarray | None:
-    """Where a tree stands on the ground a second time [m], shape [3]; None if it does not.
+    """Position where a tree reaches the ground a second time [m], shape [3]; None if it does not.
 
-    A tip about as thick and as low as the root, that its branch comes down to, is the base of
-    another plant, or of another stem.
+    A tip that is about as thick and as low as the root, and that its branch runs down to, is the
+    base of another plant or stem.
     """
     nodes, parent, radius = skeleton.nodes, skeleton.parent, skeleton.radius
     height = nodes @ up / np.linalg.norm(up)

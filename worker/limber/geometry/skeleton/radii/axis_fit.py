@@ -1,10 +1,9 @@
 """Axes and radii fitted to the scan together: one robust least-squares problem for the tree.
 
-The contraction finds which branches there are; where their axes run, and how thick they are, is
-fitted to the scanned points. Each point should lie at the radius from the axis of the cylinder
-that it is nearest to; axes and radii vary smoothly along a run. The fit is right where only one
-side was seen: a circle is known from its arc, and what the arc leaves open, the neighbours along
-the branch settle.
+The contraction finds the branches. Their axes and radii are fitted to the scanned points. Each
+point should lie at the radius from the axis of its nearest cylinder; axes and radii vary smoothly
+along a run. The fit is right where only one side was seen: a circle follows from its arc, and the
+neighbours along the branch determine what the arc leaves open.
 """
 
 from dataclasses import dataclass, replace
@@ -40,8 +39,8 @@ from limber.geometry.skeleton.radii.sides_seen import (
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 
-# Of the median radius: the grid that each round starts from. A fifth of the step that ends a fit,
-# and far coarser than what libraries round differently.
+# Grid from which each round starts, as a fraction of the median radius. It is a fifth of the step
+# that ends a fit, and far coarser than rounding differences between libraries.
 _GRID = 1e-5
 _MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
@@ -74,16 +73,16 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     """Fit axes and radii of a skeleton's runs to points.
 
     Args:
-        skeleton: Where the axes about are, with first radii; its topology is kept.
+        skeleton: Approximate axes, with first radii; its topology is kept.
         points: Scanned points [m], shape [m, 3].
         rounds: Gauss-Newton rounds; points choose their cylinder again in each.
-        settled: The axes are where they belong: what is left to find is fine.
-        along_sight: The points are a depth camera's: they scatter along its sight alone.
-        uncertainty: Find each radius's standard deviation too; without, it and the states stay
-            as they were.
-        seen: What an earlier fit found was seen; None: told anew in each round. Where noise hides
-            the rings, a side that is told anew follows what the axes made of the last one, and
-            radii shrink from round to round.
+        settled: The axes are already near their final positions; only fine changes remain.
+        along_sight: The points are a depth camera's: they scatter only along its sight.
+        uncertainty: Compute each radius's standard deviation too; otherwise it and the states are
+            unchanged.
+        seen: The sides that an earlier fit found; None: estimated again in each round. Where noise
+            hides the rings, an estimate repeated in each round follows the axes of the last one,
+            and radii shrink from round to round.
         progress: Called each round.
     """
     fit = _Rounds(skeleton, points, rounds, settled, along_sight, seen)
@@ -96,12 +95,13 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
 
 
 class _Rounds:
-    """Axes and radii from round to round of a fit, and what the points said so far."""
+    """Axes and radii from round to round of a fit, and the evidence of the points so far."""
 
     def __init__(self, skeleton: Skeleton, points: np.ndarray, rounds: int, settled: bool,
                  along_sight: bool, seen: SeenSides | None) -> None:
-        # Leaves, which lie on no axis, lead a fit astray; then a last digit that differs grows from
-        # round to round until other cylinders are chosen. On a grid it does not outlive its round.
+        # Leaves, which lie on no axis, mislead a fit. A difference in the last digit then grows
+        # from round to round until other cylinders are chosen. On a grid it does not outlast its
+        # round.
         self._grid = 2.0**np.floor(np.log2(_GRID * float(np.median(skeleton.radius))))
         nodes, radius = self._on_grid(skeleton.nodes, skeleton.radius)
         self._start = replace(skeleton, nodes=nodes, radius=radius)
@@ -109,8 +109,8 @@ class _Rounds:
         self._rounds, self._settled, self._along_sight = rounds, settled, along_sight
         self._spread = 0.35 * float(np.median(radius))
         self._floor = 0.05 * float(np.median(radius))
-        # Once a fit is too thin, scatter along the sight no longer shows as such: what is known
-        # counts.
+        # Once a fit is too thin, scatter along the sight is no longer recognisable: prior knowledge
+        # is used.
         self._known = SCATTERED_ALONG_SIGHT if along_sight else seen
         self._near: np.ndarray | None = None
         self._found_at = nodes
@@ -122,11 +122,12 @@ class _Rounds:
     def step(self, number: int) -> float:
         """Move axes and radii by one round; returns the longest step of a node [m]."""
         match = self._match()
-        # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
+        # Wide at first, since a one-sided scan starts with its axis far off; later as wide as the
+        # noise.
         noise = max(robust_sigma(match.residual, match.thick), 1e-4 * self._floor)
         self.noise = noise
         self._spread = noise if self._settled else max(noise, 0.6 * self._spread)
-        # While axes are still far off, the misfit is no noise that smoothing could help against.
+        # While axes are still far off, the misfit is not noise that smoothing could reduce.
         trusted = noise if self._settled or number > self._rounds // 2 else 0.0
         limit = partial(residual_limit, self._spread, noise, 0.0 if self._along_sight else trusted)
         weight = tukey(match.residual, limit(match.thick))
@@ -139,11 +140,11 @@ class _Rounds:
         return float(size.max())
 
     def has_settled(self, size: float) -> bool:
-        """Whether a round's longest step [m] is as small as none, and all noise is trusted."""
+        """Whether a round's longest step [m] is negligible, and all noise is trusted."""
         return size < 1e-3 * self._floor and self._spread <= 1.01 * self.noise
 
     def result(self, uncertainty: bool) -> AxisFit:
-        """What the fit came to; with ``uncertainty`` each radius's standard deviation too."""
+        """Result of the fit; with ``uncertainty`` each radius's standard deviation too."""
         nodes, radius, start = self._nodes, self._radius, self._start
         match = match_cylinders(start.parent, start.order, nodes, radius, self._points)
         noise = robust_sigma(match.residual, match.thick)
@@ -163,12 +164,12 @@ class _Rounds:
         return AxisFit(fitted, match.segment, match.residual, noise, seen)
 
     def _on_grid(self, nodes: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and radii [m] rounded to the grid, no radius to nothing."""
+        """Positions and radii [m] rounded to the grid, no radius to zero."""
         nodes, radius = (np.round(values / self._grid) * self._grid for values in (nodes, radius))
         return nodes, np.maximum(radius, self._grid)
 
     def _match(self) -> Match:
-        """The cylinder of each point; those around it are looked up anew once axes have moved."""
+        """The cylinder of each point; candidates are searched again once axes have moved."""
         start, nodes = self._start, self._nodes
         moved = np.linalg.norm(nodes - self._found_at, axis=1)
         if self._near is None or (moved > _MOVED * self._radius).any():
@@ -179,7 +180,7 @@ class _Rounds:
 
     def _sides(self, match: Match, weight: np.ndarray, noise: float,
                ) -> tuple[SeenSides, np.ndarray, np.ndarray, np.ndarray]:
-        """What was seen, and of each point the axis [m, 3], how sharp its place is and how stout.
+        """The sides seen; for each point the axis [m, 3], ``sharpness`` and ``stout``.
         """
         axis = self._nodes[match.segment] - self._nodes[self._start.parent[match.segment]]
         axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
@@ -191,8 +192,9 @@ class _Rounds:
 
     def _asked(self, match: Match, weight: np.ndarray, limit: partial,
                ) -> tuple[np.ndarray, Aims, np.ndarray | None]:
-        """Where noise hides places: each point's mean place, how far out it should lie, and how
-        firmly it holds the axis across."""
+        """Where noise hides positions: each point's mean position, how far out it should lie, and
+        how firmly it holds the axis across.
+        """
         now, axis, sharpness, stout = self._sides(match, weight, self.noise)
         if now.one_sided and self._known is None:
             shown = weight if self._even is None else weight * self._even[match.segment]
@@ -206,8 +208,8 @@ class _Rounds:
             aims, nearest = weighted_aims(match.thick, self.noise, limit)
         if now.one_sided:
             if self._even is None:
-                # Told once, of axes that the nearest places have led to: a strip makes a thin
-                # cylinder of its own, all of whose side it seems to show.
+                # Estimated once, from axes fitted to the nearest positions: a strip makes a thin
+                # cylinder of its own and seems to show all of its side.
                 self._even = evenly_seen(self._start, self._nodes, self._radius, match, weight,
                                          across_sight(match.normal, axis, now), self.noise)
             whole = self._even[match.segment]
@@ -218,7 +220,7 @@ class _Rounds:
             match.normal, axis, place, stout)
 
     def _move(self, step: np.ndarray, size: np.ndarray) -> None:
-        """Take a round's step [n, 4] of lengths ``size`` [n], none too far."""
+        """Take a round's step [n, 4], limited for lengths ``size`` [n]."""
         shrink = np.minimum(1.0, 0.5 * self._radius / np.maximum(size, 1e-300))
         nodes = self._nodes + step[:, :3] * shrink[:, None]
         radius = self._radius + np.clip(step[:, 3], -0.4 * self._radius, 0.8 * self._radius)
@@ -227,9 +229,9 @@ class _Rounds:
 
 def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep axes within reach of the contracted ones, which lie inside the branch or on its skin.
+    """Keep axes within reach of the contracted ones, which are inside the branch or on its skin.
 
-    Without that, a run with few points may drift off and take those of others with it.
+    Without that limit, a run with few points may drift off and take other runs' points with it.
     """
     moved = nodes - skeleton.nodes
     size = np.linalg.norm(moved, axis=1)

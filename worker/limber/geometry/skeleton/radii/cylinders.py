@@ -29,12 +29,12 @@ def point_counts(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
 
 def on_cylinders(skeleton: Skeleton, points: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where points lie along the cylinders that they are nearest to, or inside of.
+    """Positions of points along the cylinders that they are nearest to, or inside.
 
     Returns:
-        Lower and upper node of each, shape [m] each, the fraction of the way between them, shape
-        [m] (1 throughout in the first cylinder of a twig, whose radius is the twig's), and the
-        way from the axis to the point [m], shape [m, 3].
+        Lower and upper node of each, shape [m] each; the fraction of the path between them, shape
+        [m] (1 throughout in the first cylinder of a twig, which has the twig's radius); and the
+        vector from the axis to the point [m], shape [m, 3].
     """
     match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
                             points)
@@ -46,9 +46,10 @@ def on_cylinders(skeleton: Skeleton, points: np.ndarray,
 
 @dataclass(frozen=True)
 class Match:
-    """For each of m points: the upper node of its cylinder, the fraction of the way to it, the unit
-    normal away from the axis [m, 3], the distance from the surface [m], the radius there [m], and
-    whether that is the twig's all along."""
+    """For each of m points: the upper node of its cylinder, the fraction of the path to it, the
+    unit normal away from the axis [m, 3], the distance from the surface [m], the radius there [m],
+    and whether the cylinder has the twig's radius throughout.
+    """
 
     segment: np.ndarray
     share: np.ndarray
@@ -60,13 +61,13 @@ class Match:
 
 def match_cylinders(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.ndarray,
                     points: np.ndarray, near: np.ndarray | None = None) -> Match:
-    """Find for each point the cylinder to whose surface it is nearest.
+    """Find the cylinder whose surface is nearest to each point.
 
     Args:
-        near: Upper nodes of the cylinders that may be, shape [m, k]; None: those around.
+        near: Upper nodes of the candidate cylinders, shape [m, k]; None: those nearby.
     """
     near = cylinders_around(parent, nodes, points) if near is None else near
-    # The first cylinder of a side run has the twig's radius all along, not its carrier's.
+    # The first cylinder of a side run has the twig's radius throughout, not its carrier's.
     own = order > order[parent]
     segment, share, normal, residual, thick = nearest_of(
         np.ascontiguousarray(points, np.float64), np.ascontiguousarray(near), parent, own,

@@ -1,4 +1,4 @@
-"""Loops of the axis fit over points: which cylinder each is nearest to, and what it asks of it."""
+"""Loops of the axis fit over points: nearest cylinder of each, and its normal equations."""
 
 import math
 
@@ -15,19 +15,19 @@ _TOLD = 14.0  # logarithm of a place's weight, under the best one's, from which 
 def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_radius: np.ndarray,
                nodes: np.ndarray, radius: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Find for each point the cylinder to whose surface it is nearest, of some candidates.
+    """Find the cylinder, among some candidates, whose surface is nearest to each point.
 
     Args:
         points: Positions [m], shape [m, 3].
         near: Upper nodes of the candidates, shape [m, k].
         parent: Lower node of each node's cylinder, shape [n].
-        own_radius: Whether a cylinder has its upper node's radius all along, shape [n].
+        own_radius: Whether a cylinder has its upper node's radius throughout, shape [n].
         nodes: Positions [m], shape [n, 3].
         radius: Radii [m], shape [n].
 
     Returns:
-        Upper node, fraction of the way up to it, unit vector from the axis to the point,
-        shape [m, 3], the distance from the surface [m], positive outside, and the radius [m].
+        Upper node, fraction of the path up to it, unit vector from the axis to the point, shape [m,
+        3], the distance from the surface [m], positive outside, and the radius [m].
     """
     count = len(points)
     segment, share = np.empty(count, np.int64), np.empty(count)
@@ -47,7 +47,8 @@ def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_rad
             dx, dy, dz = px - t * ax, py - t * ay, pz - t * az
             distance = np.sqrt(dx * dx + dy * dy + dz * dz)
             here = radius[end] if own_radius[end] else (1 - t) * radius[start] + t * radius[end]
-            # Two that meet are as near to a point beyond both: rounding must not tell them apart.
+            # Two cylinders that meet are equally near to a point beyond both: rounding must not
+            # decide.
             if distance - here < best - _EVEN * here:
                 best, chosen = distance - here, max(distance, 1e-300)
                 segment[i], share[i], thick[i], residual[i] = end, t, here, best
@@ -63,17 +64,18 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
 
     Args:
         segment: Cylinder of each point, shape [m].
-        share: Fraction of the way up it, shape [m].
-        low: Derivative of the radius there in the lower node's, shape [m].
-        high: In the upper node's, shape [m].
+        share: Fraction of the path up the cylinder, shape [m].
+        low: Derivative of the radius there with respect to the lower node's, shape [m].
+        high: With respect to the upper node's, shape [m].
         normal: Unit vector from the axis to the point, shape [m, 3].
-        across: How firmly each holds the axis across that, as a vector, shape [m, 3].
-        gradient: What each asks of both ends, shape [m, 8].
-        weight: How far it counts, shape [m].
+        across: How firmly each point holds the axis across that direction, as a vector, shape [m,
+        3].
+        gradient: Derivatives of each point's residual at both ends, shape [m, 8].
+        weight: Weight of each point, shape [m].
         count: Number of cylinders.
 
     Returns:
-        Matrices, shape [count, 8, 8], and right sides, shape [count, 8].
+        Matrices, shape [count, 8, 8], and right-hand sides, shape [count, 8].
     """
     block, right = np.zeros((count, 8, 8)), np.zeros((count, 8))
     row, side = np.empty(8), np.zeros(8)
@@ -101,16 +103,16 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
 @njit(cache=True)
 def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
                    density: np.ndarray) -> np.ndarray:
-    """Mean of (cos, sin) over places on a circle, each weighted by how likely it is a point's.
+    """Mean of (cos, sin) over positions on a circle, each weighted by its likelihood for a point.
 
-    The weight is density times exp(sharpness (cos(place - angle) - 1)), as von Mises has it.
+    The weight is density times exp(sharpness (cos(place - angle) - 1)), a von Mises distribution.
 
     Args:
-        cosine: Of each point's own angle, shape [m].
-        sine: Of it, shape [m].
+        cosine: Cosine of each point's own angle, shape [m].
+        sine: Sine of that angle, shape [m].
         sharpness: Shape [m].
-        density: Of evenly spaced places around the circle, each in the middle of its part, shape
-            [places].
+        density: Density at evenly spaced positions around the circle, each in the middle of its
+            interval, shape [places].
 
     Returns:
         Shape [m, 2].
@@ -121,13 +123,13 @@ def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
     power = np.empty(places)
     mean = np.empty((len(cosine), 2))
     for i in range(len(cosine)):
-        # Places farther than that weigh nothing.
+        # Positions farther away have no weight.
         reach = places
         if sharpness[i] > _TOLD / 2:
             reach = int(np.ceil(np.arccos(1 - _TOLD / sharpness[i]) * places / (2 * np.pi))) + 1
         own = int(np.arctan2(sine[i], cosine[i]) % (2 * np.pi) * places / (2 * np.pi))
         first, count = (own - reach, 2 * reach + 1) if 2 * reach < places else (0, places)
-        # Wide enough, it is summed as well by thrice as wide parts, each by its middle.
+        # If it is wide enough, intervals three times as wide, each by its middle, sum it as well.
         step = 3 if sharpness[i] < _WIDE and places % 3 == 0 and places >= _FINE else 1
         if step == 3:
             first -= (first - 1) % 3
@@ -150,20 +152,20 @@ def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
 @njit(cache=True)
 def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray, limit: float,
                     least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Logarithm of how likely points are of a side seen up to a limit, and its derivatives.
+    """Log-likelihood of points on a side seen up to a limit, and its derivatives.
 
-    Places up to the limit count 1, those beyond ``least``; each point's are blurred as von Mises
-    has it. Not divided by the sum over all places.
+    Positions up to the limit count 1, those beyond it ``least``; each point's are blurred by a von
+    Mises distribution. Not divided by the sum over all positions.
 
     Args:
-        angle: Of each point, from the middle of the side that was seen [rad], shape [m].
+        angle: Angle of each point from the middle of the side that was seen [rad], shape [m].
         sharpness: Shape [m].
         bessel: I0(sharpness) exp(-sharpness), shape [m].
         limit: Up to pi [rad].
-        least: Density of the places beyond.
+        least: Density of the positions beyond the limit.
 
     Returns:
-        The logarithm, its derivative in the angle and that in the limit, shape [m] each.
+        The logarithm, its derivative with respect to the angle and to the limit, shape [m] each.
     """
     log, by_angle, by_limit = np.empty(len(angle)), np.empty(len(angle)), np.empty(len(angle))
     for i in range(len(angle)):
@@ -179,9 +181,9 @@ def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray
 
 @njit(cache=True)
 def _below(angle: float, sharpness: float, bessel: float) -> float:
-    """Fraction of von Mises' distribution around 0 below an angle, which counts whole turns.
+    """Fraction of a von Mises distribution around 0 below an angle, counting whole turns.
 
-    Its series (Hill, ACM Algorithm 518, 1977), or the normal one that it comes near to.
+    Its series (Hill, ACM Algorithm 518, 1977), or the normal distribution that it approaches.
     """
     turns = np.floor((angle + np.pi) / (2 * np.pi))
     angle -= 2 * np.pi * turns

@@ -1,12 +1,12 @@
-"""Points scattered around a circle: where on it each one belongs, given how far they scatter.
+"""Points scattered around a circle: the true position of each, given their scatter.
 
-A point's distance from the axis says too much of the radius where noise is no longer small against
-it: points of a full circle lie too far out on average, and a fit to the half that one camera saw
-comes out a fifth too thin at a noise of half the radius. Both follow from taking the nearest place
-on the circle for the true one. The likelihood of the structural model instead averages over all
-places that a point may come from, weighted by how much of each side was seen (Chernov: Circular and
-Linear Regression, 2010, chapter 6, has the models); its gradient needs the mean direction of these
-places alone."""
+A point's distance from the axis overestimates the radius where noise is not small against it.
+Points of a full circle lie too far out on average, and a fit to the half that one camera saw comes
+out a fifth too thin at a noise of half the radius. Both follow from taking the nearest position on
+the circle for the true one. The likelihood of the structural model instead averages over all
+positions that a point may come from, weighted by how much of each side was seen (Chernov: Circular
+and Linear Regression, 2010, chapter 6, has the models). Its gradient needs only the mean direction
+of these positions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ from scipy.special import i0e, i1e
 from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle
 from limber.geometry.skeleton.radii.sides_seen import SeenSides, sides_of
 
-# Square of radius over noise from which places are known to within 5 degrees; and where one side
-# alone was seen, and its edges tell the radius, to within one.
+# Square of radius over noise from which positions are known to within 5 degrees; and to within one
+# degree, where only one side was seen and its edges determine the radius.
 _SHARP, _SHARP_SIDE = 150.0, 2500.0
 _SIGHT_LEAST = 0.75
-# Of a circle's fitted radius, the variance over that which sharp points leave is 1 + so many times
-# (noise / radius)^2: Fisher's information of points with open places, at 0.3 to 3 noises a radius,
-# all around a circle and on half of one.
+# Factor c in 1 + c (noise / radius)^2: the variance of a circle's fitted radius over that from
+# sharp points. From Fisher's information of points with open positions, at 0.3 to 3 noises a
+# radius, all around a circle and on half of one.
 _OPEN_PLACES, _OPEN_SIDE = 1.0, 2.2
 _RADII = np.geomspace(0.05, 12.0, 48)  # in standard deviations of the noise, up to where it tells
 _DISTANCES = 300
 
 
 def position_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
-    """Times as large as of points with known places a radius's standard deviation is, shape [n]."""
+    """Factor on a radius's standard deviation against points with known positions, shape [n]."""
     if seen.along_sight:
         return np.ones_like(radius)
     open_places = _OPEN_SIDE if seen.one_sided else _OPEN_PLACES
@@ -39,11 +39,11 @@ def position_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> n
 
 @dataclass(frozen=True)
 class Aims:
-    """How far from the axis points should lie on average [m], shape [m] each.
+    """Distance from the axis at which points should lie on average [m], shape [m] each.
 
     Attributes:
-        axis: As what moves the axis has them.
-        radius: As what moves the radius has them.
+        axis: For the equations that move the axis.
+        radius: For the equations that move the radius.
     """
 
     axis: np.ndarray
@@ -52,21 +52,22 @@ class Aims:
 
 def weighted_aims(radius: np.ndarray, noise: float,
                   limit: Callable[[np.ndarray], np.ndarray]) -> tuple[Aims, Aims]:
-    """How far out points should lie of whom the farther ones count less.
+    """Distances at which points should lie, if farther points count less.
 
-    Noise puts more points outside of a thin branch than inside, and farther: weights that fall with
-    the distance from the surface take so much from its radius that at one noise it came out at half
-    of it, and at two noises at nine tenths. What is asked of points is therefore what they come to
-    with those weights where the radius is right (the consistency of M-estimates, after Fisher).
-    Whichever sides were seen, that is the same: it holds for each place on the circle by itself.
+    Noise puts more points outside a thin branch than inside, and farther. Weights that fall with
+    the distance from the surface therefore reduce its radius: at one noise it came out at half, at
+    two noises at nine tenths. So the target of the points is their weighted mean where the radius
+    is right (the consistency of M-estimates, after Fisher).
+    It does not depend on the sides seen: it holds for each position on the circle separately.
 
     Args:
-        radius: True one of each point [m], shape [m].
+        radius: True radius of each point [m], shape [m].
         noise: Standard deviation of the points [m].
-        limit: Residual [m] from which a point has no weight (Tukey's biweight), of radii [m].
+        limit: Residual [m] from which a point has no weight (Tukey's biweight), as a function of
+        radii [m].
 
     Returns:
-        Where mean places are taken for the true ones, and where the nearest are.
+        Aims where mean positions are taken for the true ones, and where the nearest are.
     """
     thick = _RADII[:, None]
     reach = limit(_RADII * noise)[:, None] / noise
@@ -91,40 +92,41 @@ def held_across(out: np.ndarray, axis: np.ndarray, place: np.ndarray, stout: np.
                 ) -> np.ndarray:
     """How firmly points hold the axis across their own direction, as vectors, shape [m, 3].
 
-    A point whose place is known along the circle says nothing of that; where noise hides it, or
-    the seen side ends, it does. Left out of the equations, their steps went twice as far as they
-    should and back again: one-sided radii came out right or a sixth too thin by turns.
+    A point whose position along the circle is known gives no information across; where noise hides
+    it, or the seen side ends, it does. Without these terms in the equations, steps went twice as
+    far as they should and back again: one-sided radii came out right or a sixth too thin by turns.
 
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
-        place: Mean direction of each point's true place, shape [m, 3].
+        place: Mean direction of each point's true position, shape [m, 3].
         stout: Square of radius over noise, shape [m].
     """
     known = np.clip(1 - stout * (1 - np.einsum("mj,mj->m", place, place)), 0.0, 1.0)
-    # A place that is taken for certain is one that is not looked for.
+    # A position that is taken as certain is not searched for.
     known[np.einsum("mj,mj->m", place, out) >= 1 - 1e-12] = 0.0
     return np.sqrt(known)[:, None] * np.cross(axis, out)
 
 
 def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
                 seen: SeenSides) -> np.ndarray:
-    """Return the mean direction from the axis to each point's true place, shape [m, 3].
+    """Return the mean direction from the axis to each point's true position, shape [m, 3].
 
-    Shorter than 1 by how much the place is open.
+    It is the shorter, below 1, the less certain the position is.
 
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
         sharpness: Radius times distance over the noise's square, shape [m].
         stout: Square of radius over noise, shape [m].
-        seen: What was seen.
+        seen: The sides that were seen.
     """
     mean = out * np.where(sharpness > 1, 1 - 0.5 / np.maximum(sharpness, 1.0), 0.5)[:, None]
     if seen.along_sight:
-        # Scatter along the sight widens no silhouette: what it adds to the radius is bounded.
+        # Scatter along the sight does not widen a silhouette: its effect on the radius is bounded.
         return out * np.clip(1 - 0.5 / np.maximum(sharpness, 1e-9), _SIGHT_LEAST, 1.0)[:, None]
-    # By the radius alone: chosen by their distance too, near points would count otherwise than far.
+    # By the radius alone: if also chosen by distance, near points would count differently from far
+    # ones.
     blurred = np.flatnonzero(stout < (_SHARP_SIDE if seen.one_sided else _SHARP))
     side, cross = sides_of(axis[blurred], seen.view)
     cosine, sine = (np.einsum("mj,mj->m", out[blurred], way) for way in (side, cross))

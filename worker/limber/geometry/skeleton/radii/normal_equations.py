@@ -1,4 +1,4 @@
-"""The least-squares problem of a fit: what points ask of axes and radii, and of smoothness."""
+"""The least-squares problem of a fit: terms of points, axes, radii and smoothness."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ class NormalEquations:
     per_node: np.ndarray
 
     def factor(self) -> SuperLU:
-        """Return the matrix's factor."""
+        """Return the factorisation of the matrix."""
         return splu(self.matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
     def solve(self) -> np.ndarray:
@@ -44,19 +44,20 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
                      weight: np.ndarray, noise: float, place: np.ndarray | None = None,
                      aims: Aims | None = None, across: np.ndarray | None = None,
                      ) -> NormalEquations:
-    """Set up a round: what points ask, how smooth runs are, and what holds bare nodes.
+    """Set up a round: terms of the points, smoothness of runs, and constraints on bare nodes.
 
     Args:
-        skeleton: As the fit began.
-        nodes: Positions now [m], shape [n, 3].
-        radius: Radii now [m], shape [n].
+        skeleton: At the start of the fit.
+        nodes: Current positions [m], shape [n, 3].
+        radius: Current radii [m], shape [n].
         match: The cylinder of each point.
-        weight: How far each point counts, shape [m].
+        weight: Weight of each point, shape [m].
         noise: Standard deviation of the points [m].
-        place: Mean direction of each point's true place (:mod:`noisy_rings`), shape [m, 3]; None:
-            the nearest place on the circle is the true one.
-        aims: How far out the points should lie; None: at the radius.
-        across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not.
+        place: Mean direction of each point's true position (:mod:`noisy_rings`), shape [m, 3];
+            None: the nearest position on the circle is the true one.
+        aims: Distances at which the points should lie; None: at the radius.
+        across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not
+        at all.
     """
     data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place, aims, across)
     smooth = smoothness(skeleton, nodes, radius, per_node, noise)
@@ -69,11 +70,11 @@ def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_ma
     """How firmly points hold a fitted skeleton, and their noise [m].
 
     The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
-    shape [4 n, 4 n]: of a smoothing spline as Wahba (1983) has it. Its noise is that of single
-    points, independent of each other. True errors of generated scans, averaged over ninths of the
-    main axis, came to 1.0 of the deviations so foretold (medians over 0.6745) on 8 scans of both
-    kinds, to 1.2 to 1.4 on 6 more of one side only. Where the axis ran into a twig and back, at a
-    fork that one side hides, they were far larger.
+    shape [4 n, 4 n], as for a smoothing spline (Wahba 1983). Its noise is that of single,
+    independent points. True errors of generated scans, averaged over ninths of the main axis, came
+    to 1.0 of the predicted deviations (medians over 0.6745) on 8 scans of both kinds, and to 1.2 to
+    1.4 on 6 more of one side only. Where the axis ran into a twig and back, at a fork that one side
+    hides, they were far larger.
     """
     match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
                             points)
@@ -87,7 +88,7 @@ def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
                       weight: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviation of each radius [m], and whether the node has points of its own."""
     system = normal_equations(skeleton, nodes, radius, match, weight, noise)
-    # Nodes so far apart say nothing about each other: the inverse's diagonal is read off one
+    # Nodes that far apart do not affect each other: the diagonal of the inverse comes from one
     # solve for all of them. Nodes of a run have consecutive numbers.
     period = min(_PROBE, len(nodes))
     unit = np.zeros((4 * len(nodes), period))
@@ -100,7 +101,7 @@ def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
                 place: np.ndarray | None, aims: Aims | None, across: np.ndarray | None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
-    """Normal equations of the residuals in (x, y, z, r) of both ends, and weight a node."""
+    """Normal equations of the residuals in (x, y, z, r) of both ends, and weight per node."""
     count = len(nodes)
     aims = Aims(match.thick, match.thick) if aims is None else aims
     across = np.zeros_like(match.normal) if across is None else across
@@ -126,7 +127,7 @@ def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.
 
 
 def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> sparse.csc_matrix:
-    """Hold nodes along their axis, where points say nothing, and weakly elsewhere."""
+    """Hold nodes along their axis, where points give no information, and weakly elsewhere."""
     typical = float(np.median(per_node[per_node > 0])) if (per_node > 0).any() else 1.0
     direction = np.zeros_like(nodes)
     for members in skeleton.runs():

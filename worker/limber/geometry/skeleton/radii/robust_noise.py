@@ -1,20 +1,20 @@
-"""How much points scatter around fitted cylinders, and which of them belong to something else."""
+"""Scatter of points around fitted cylinders, and the points that belong to something else."""
 
 import numpy as np
 
 _TUKEY = 4.685  # 95 % efficiency for normal noise
 _ENOUGH = 200  # points that tell the noise
-# Points scattered around a circle by noise s lie at distances after Rice's law. What robust_sigma
-# measures of those within a radius of it, over that radius, and s over what was measured.
+# Distances of points scattered around a circle by noise s follow Rice's law. _MEASURED: estimate
+# from points within a radius of the circle, over that radius. _TRUE: s over that estimate.
 _MEASURED = (0.1655, 0.2461, 0.3234, 0.3802, 0.4506, 0.4810, 0.5102, 0.5360)
 _TRUE = (1.007, 1.016, 1.031, 1.052, 1.110, 1.155, 1.225, 1.333)
 
 
 def robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
-    """Noise [m] of points on the thicker half: around thin twigs, part of it passes for radius.
+    """Noise [m] of points on the thicker half: thin twigs' radii absorb part of it.
 
-    Points that are farther than a radius from the surface may be something else's. Where noise
-    reaches so far, those left out are made up for.
+    Points farther than a radius from the surface may belong to something else. Where noise reaches
+    that far, the result is corrected for those left out.
     """
     near = np.abs(residual) < radius
     if near.sum() < 10:
@@ -41,7 +41,7 @@ def settled_weights(residual: np.ndarray, noise: float) -> np.ndarray:
 def residual_limit(spread: float, noise: float, trusted: float, radius: np.ndarray) -> np.ndarray:
     """Residual [m] from which a point belongs to something else, shape [m].
 
-    Noise that is not trusted yet widens none by more than its radius.
+    Noise that is not trusted yet widens no limit by more than its radius.
     """
     return np.minimum(_TUKEY * spread,
                       0.9 * radius + 3 * np.maximum(trusted, np.minimum(noise, radius)))

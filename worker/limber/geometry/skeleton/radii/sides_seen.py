@@ -1,4 +1,4 @@
-"""Which sides of its branches a scan shows: all around, or one side up to a grazing limit."""
+"""Sides of the branches that a scan shows: all around, or one side up to a grazing limit."""
 
 from dataclasses import dataclass
 
@@ -16,17 +16,17 @@ _BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not see
 _FEW = 0.12  # fraction of points there that noise can put
 _FRONT, _EDGE = np.deg2rad(40.0), np.deg2rad(65.0)
 _ALONG = 0.65  # scatter at the edges over that in front, under which it is along the sight alone
-# Beyond about that no sensor sees a surface. Which it is moves a radius where noise hides the arc's
-# ends: fitted circles whose limit was another by 4 to 19 degrees came out 0.8 to 1.1 % off a degree
-# for noise over 0.12 of the radius, and in proportion less below.
+# Beyond about this angle, no sensor sees a surface. Its exact value affects a radius where noise
+# hides the arc's ends. Fitted circles with a limit 4 to 19 degrees off came out 0.8 to 1.1 % off
+# per degree for noise over 0.12 of the radius, and proportionally less below.
 _GRAZING, _GRAZING_SIGMA = np.deg2rad(81.0), np.deg2rad(4.0)
 _GRAZING_MOVES, _ARC_HIDDEN = 0.55, 0.12  # fraction of the radius a radian; noise over radius
 _LEAST_SEEN = 0.01
 _RING_LOST = 12.0  # square of radius over noise, under which a ring's middle is not seen empty
 _FLAT = 0.10  # relative difference of scatter across and along the sight that is one side's
 _FLAT_SURE = 4.0  # standard deviations
-# Third moment of an arc, of cos over its half-angle with sin squared, in cubes of the radius; half
-# of it tells an arc from what is flat but not bent, as an elliptic stem is.
+# Third moment of an arc, of cos over its half-angle with sin squared, in cubes of the radius. Half
+# of it distinguishes an arc from a shape that is flat but not bent, such as an elliptic stem.
 _BENT, _BENT_LEAST, _BENT_SURE = 0.0913, 0.5, 2.0
 _DIRECTIONS, _SAMPLE = 120, 2000
 _ANGLE = 2 * np.pi * (np.arange(PLACES) + 0.5) / PLACES
@@ -36,10 +36,11 @@ _VIEW_SIGMA = np.deg2rad(12.0)  # of the mean normal from the sight
 _TURNS, _TURN = 4, 0.15  # steps of the direction a round; each at most so many radians
 _EASE = 0.6  # of a step of the limit: the next round's axes and radii follow it
 _FURTHER = np.deg2rad(3.0)  # and no more: past the last point, few scores say how far it may be
-# The points' angles fit the model worse than chance has it, and are wrong together: so many of them
-# tell as much as one that is independent.
+# The points' angles fit the model worse than by chance, and their errors are correlated: this many
+# of them carry as much information as one independent point.
 _MISFIT = 3.0
-# Radii to either side whose points tell how evenly a side is seen, each at least so many noises.
+# Radii to either side whose points show how evenly a side is seen; a radius counts as at least this
+# many noises.
 _WINDOW, _NOISY_WINDOW = 4.0, 2.0
 _TELLING = 80  # points there that tell
 _ASKEW, _NARROW = 0.25, 0.33  # mean of the sine from the sight, and of its square: half a circle's
@@ -51,10 +52,10 @@ class SeenSides:
 
     Attributes:
         view: Mean outward normal of the points: towards the camera where there was one, shape [3].
-        share: Density of points over the places of a cross-section, from the side that faces
-            ``view`` around, shape [places].
-        along_sight: Points scatter along ``view`` alone, as a depth camera's do.
-        limit: Angle around the axis from ``view`` to where the side that was seen ends [rad].
+        share: Density of points over the positions of a cross-section, counted from the side that
+            faces ``view``, shape [places].
+        along_sight: Points scatter only along ``view``, as a depth camera's do.
+        limit: Angle around the axis from ``view`` to the end of the side that was seen [rad].
         limit_sigma: Its standard deviation [rad].
     """
 
@@ -66,25 +67,25 @@ class SeenSides:
 
     @property
     def one_sided(self) -> bool:
-        """Whether some places of a cross-section were not seen."""
+        """Whether some positions of a cross-section were not seen."""
         return bool(self.share.min() < 1.0)
 
 
 SCATTERED_ALONG_SIGHT = SeenSides(np.array([0.0, 0.0, 1.0]), np.ones(PLACES), along_sight=True)
-"""What a depth camera is known to have seen; from where does not matter to places then."""
+"""The sides seen by a depth camera; its direction does not affect positions then."""
 
 
 def seen_sides(out: np.ndarray, axis: np.ndarray, residual: np.ndarray, sharpness: np.ndarray,
                stout: np.ndarray, weight: np.ndarray) -> SeenSides:
-    """Tell whether points show branches from all around or from one side.
+    """Determine whether points show branches from all around or from one side.
 
-    A depth camera's readings scatter along its sight, and say where a silhouette ends: none of
-    their places is open.
+    A depth camera's readings scatter along its sight and show where a silhouette ends: all of their
+    positions are known.
 
-    Estimated as a density, the sides that were seen would grow with the noise that blurs them: a
-    thin ring with points all around it looks like half of a thicker one. So it is one of the two.
-    Where noise fills the ring, an axis in the middle of half a circle has points all around it too;
-    there the cross-section's scatter decides, which is as wide in all directions of a full one.
+    Estimated as a density, the seen sides would grow with the noise that blurs them: a thin ring
+    with points all around it looks like half of a thicker one. So the result is one of the two.
+    Where noise fills the ring, an axis in the middle of half a circle also has points all around
+    it. There the cross-section's scatter decides: for a full circle it is equal in all directions.
 
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
@@ -92,7 +93,7 @@ def seen_sides(out: np.ndarray, axis: np.ndarray, residual: np.ndarray, sharpnes
         residual: Distance of each point from its cylinder [m], shape [m].
         sharpness: Radius times distance over the noise's square, shape [m].
         stout: Square of radius over noise, shape [m].
-        weight: How far each counts, shape [m].
+        weight: Weight of each point, shape [m].
     """
     around = SeenSides(np.array([0.0, 0.0, 1.0]), np.ones(PLACES))
     clear = np.flatnonzero((sharpness > min(_CLEAR, float(np.quantile(sharpness, 0.7))))
@@ -124,9 +125,9 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
                weight: np.ndarray) -> SeenSides | None:
     """One side, if noise fills the rings and points scatter less along one sight than across it.
 
-    Of an arc of half-angle g, the variance along the sight is that of cos over (-g, g), 0.08 of
-    the radius's square at 84 degrees, and across it that of sin, 0.46. Noise adds to both alike,
-    and nothing to the third moment, which a flat stem seen from all around does not have.
+    For an arc of half-angle g, the variance along the sight is that of cos over (-g, g), 0.08 of
+    the squared radius at 84 degrees; across it that of sin, 0.46. Noise adds equally to both, and
+    nothing to the third moment, which a flat stem seen from all around does not have.
     """
     near = np.flatnonzero(weight > 0)
     if len(near) == 0:
@@ -168,25 +169,25 @@ def _half_sphere() -> np.ndarray:
 
 def side_told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: np.ndarray,
               mean: np.ndarray, first: SeenSides, limit_free: bool = True) -> SeenSides:
-    """Tell from where one side was seen, and how far around: most likely of the points' angles.
+    """Estimate the direction of view and the limit of one seen side from the points' angles.
 
     The mean normal of the points is off where a scan has holes or branches lean (by 23 degrees at
-    most in generated ones), and which grazing angle was seen at last is the sensor's. Of a point
-    at a given distance, the angle around the axis is that of its place, blurred as von Mises has
-    it: the density of angles over the side that was seen tells both.
+    most in generated ones), and the last grazing angle seen depends on the sensor. For a point at a
+    given distance, the angle around the axis is that of its true position, blurred by a von Mises
+    distribution. The density of angles over the seen side determines both.
 
-    Steps are Fisher's scoring with the scores' own outer products. The limit takes one step a call,
-    as far as the sight's direction leaves it open. The mean normal is the sight's prior: of
-    parallel axes no angle says how far it turns along them.
+    Steps are Fisher's scoring with the scores' own outer products. The limit takes one step per
+    call, as far as the sight's direction leaves it open. The mean normal is the prior of the sight:
+    with parallel axes, no angle shows a turn along them.
 
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
         sharpness: Radius times distance over the noise's square, shape [m].
-        weight: How far each counts, shape [m].
+        weight: Weight of each point, shape [m].
         mean: Mean normal of the points, shape [3].
-        first: The side as told so far.
-        limit_free: Whether axes and radii are near enough to tell the limit.
+        first: The side as estimated so far.
+        limit_free: Whether axes and radii are accurate enough to estimate the limit.
     """
     use = np.flatnonzero(weight > 0)
     use = use[::max(len(use) // _TELL, 1)]
@@ -216,7 +217,7 @@ def side_told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: 
 
 def _told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray,
           weight: np.ndarray, view: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Score and information of the points in the view's two turns and the limit."""
+    """Score and information of the points in the two turns of the view and the limit."""
     side, cross = sides_of(axis, view)
     aside = np.einsum("mj,mj->m", side, np.broadcast_to(view, side.shape))
     angle = np.arctan2(np.einsum("mj,mj->m", out, cross), np.einsum("mj,mj->m", out, side))
@@ -229,14 +230,14 @@ def _told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, bessel: np.n
 
 
 def _across(view: np.ndarray) -> np.ndarray:
-    """Two unit vectors across the view, and each other, shape [3, 2]."""
+    """Two unit vectors orthogonal to the view and to each other, shape [3, 2]."""
     other = np.cross(view, np.eye(3)[np.argmin(np.abs(view))])
     other /= np.linalg.norm(other)
     return np.stack([other, np.cross(view, other)], axis=1)
 
 
 def side_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
-    """Standard deviation of radii [m] from not knowing where the seen side ends, shape [n]."""
+    """Standard deviation of radii [m] from the uncertain end of the seen side, shape [n]."""
     if not seen.one_sided:
         return np.zeros_like(radius)
     hidden = np.minimum(noise / np.maximum(radius, 1e-300) / _ARC_HIDDEN, 1.0)
@@ -249,7 +250,7 @@ def across_sight(out: np.ndarray, axis: np.ndarray, seen: SeenSides) -> np.ndarr
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
-        seen: What was seen.
+        seen: The sides that were seen.
     """
     return np.einsum("mj,mj->m", out, sides_of(axis, seen.view)[1])
 
@@ -269,11 +270,11 @@ def evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match
                 weight: np.ndarray, across: np.ndarray, noise: float) -> np.ndarray:
     """Whether enough points around each node show all of the side that was seen, shape [n].
 
-    Where a point comes from is weighed by which sides were seen. Of a strip along a branch whose
-    rest is hidden, or of a few points, that makes a cylinder as thin as the strip is wide: measured
-    from the truth as start, twigs with under 7 points a radius of length shrank to 0.8 of theirs,
-    and hidden stems to a third. There the nearest places are the better guess (0.95). Where noise
-    is as wide as the branch they tell little of it, and points from farther along speak.
+    The origin of a point is weighted by the sides that were seen. For a strip along a branch whose
+    rest is hidden, or for a few points, that makes a cylinder as thin as the strip is wide. Started
+    from the truth, twigs with under 7 points a radius of length shrank to 0.8 of theirs, and hidden
+    stems to a third. There the nearest positions are the better estimate (0.95). Where noise is as
+    wide as the branch, they carry little information, and points from farther along are used.
     """
     sums = np.stack([np.bincount(match.segment, weight * value, len(nodes))
                      for value in (np.ones(len(across)), across, across**2)], axis=1)

@@ -1,8 +1,8 @@
-"""What the image of a depth camera says of a skeleton: twigs and radii against silhouettes.
+"""Check of a skeleton against a depth camera's image: twigs and radii against silhouettes.
 
-Across the line of sight a depth camera is exact to a pixel; along it, readings scatter by
-millimetres or centimetres, together over whole patches. So a twig that only sticks out along the
-line of sight is taken for such scatter, and no branch is thicker than its silhouette is wide.
+Across the line of sight a depth camera is accurate to a pixel. Along it, readings scatter by
+millimetres or centimetres, correlated over whole patches. So a twig that only sticks out along the
+line of sight is taken for such scatter, and no branch is thicker than its silhouette.
 """
 
 from dataclasses import replace
@@ -27,19 +27,20 @@ def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
 
     Args:
         skeleton: Fitted to the cloud.
-        view: Where it was seen from.
+        view: The camera's view of the cloud.
         factor: A twig stays if, as the camera saw it, it or a twig on it reaches this many radii
             of its carrier beyond the carrier's axis.
 
     Returns:
-        The skeleton, and of each twig dropped its ``length`` [m] and its tip's place ``at``.
+        The skeleton, and for each dropped twig its ``length`` [m] and the position ``at`` of its
+        tip.
     """
     runs = skeleton.runs()
     keep = np.ones(skeleton.node_count, bool)
     dropped = []
     carriers = {int(skeleton.branch[members[0]]) for members in runs[1:]}
     for run in range(len(runs) - 1, 0, -1):
-        # A twig with twigs of its own is never dropped: too much hangs on it.
+        # A twig with twigs of its own is never dropped: it carries too much.
         if run in carriers:
             continue
         members = runs[run]
@@ -54,19 +55,19 @@ def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
 
 def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
                       ) -> tuple[Skeleton, int]:
-    """Clamp radii to what the silhouettes are wide, and widen their intervals by the pixels.
+    """Limit radii to the width of the silhouettes, and widen their intervals by the pixels.
 
     The pixels of a piece of branch cover its length, as the camera sees it, times its width. Where
-    the scatter of the depth hides how thick a branch is, they tell its radius, and it stays
+    the scatter of the depth hides the thickness of a branch, they determine its radius, which stays
     marked as not resolved.
 
     Args:
         skeleton: Fitted to the cloud.
-        points: The cloud [m], shape [n, 3], a point a pixel of those that it has.
-        view: Where it was seen from.
+        points: The cloud [m], shape [n, 3], one point per pixel that it has.
+        view: The camera's view of the cloud.
 
     Returns:
-        The skeleton, and how many radii were limited.
+        The skeleton, and the number of limited radii.
     """
     segment, _ = nearest_cylinders(skeleton, points)
     pixel = view.pitch * np.linalg.norm(points - view.eye, axis=1)
@@ -86,11 +87,12 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
             if count[own[near]].sum() < _LEAST or total <= 0 or aside[near].min() < _ASIDE:
                 continue
             half, pixels = float(area[own[near]].sum()) / (2 * total), width[own[near]].max()
-            # Half a pixel to each side, that the edge may have lost, and as much for its place.
+            # Half a pixel to each side for what the edge may have lost, and as much for its
+            # position.
             cap = _SLACK * half + pixels
             if state[node] == UNRESOLVED:
-                # Images that take a pixel for the branch's if any of it is are half a pixel wider
-                # to each side, those that take it by its middle are not.
+                # Images that assign a pixel to the branch if any part of it is on the branch are
+                # half a pixel wider to each side; those that decide by its middle are not.
                 radius[node] = max(half - 0.25 * pixels, 0.25 * pixels)
                 sigma[node] = max(_WIDE * radius[node], 0.5 * pixels)
             elif radius[node] > cap:
@@ -104,7 +106,7 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
 
 def _beyond(skeleton: Skeleton, twig: np.ndarray, carrier: np.ndarray, view: View,
             ) -> tuple[float, float]:
-    """How far a twig reaches beside its carrier's axis in the image [m], and that's radius [m]."""
+    """Reach of a twig beside its carrier's axis in the image [m], and the carrier's radius [m]."""
     nodes = skeleton.nodes
     depth = float(np.linalg.norm(nodes[twig].mean(axis=0) - view.eye))
     twig_ray, carrier_ray = _rays(nodes[twig], view), _rays(nodes[carrier], view)

@@ -1,4 +1,4 @@
-"""How smoothly axes and radii run: second differences along each run, by their bandwidth."""
+"""Smoothness of axes and radii: second differences along each run, by their bandwidth."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -13,13 +13,13 @@ def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_no
                noise: float) -> sparse.csc_matrix:
     """Second differences along each run, weighted as a smoothing spline of a given bandwidth.
 
-    A spline with penalty lambda on the squared second derivative and rho data a length averages
-    over (lambda / rho)^(1/4); that length grows with the noise, in local radii.
+    A spline with penalty lambda on the squared second derivative and rho data per length averages
+    over (lambda / rho)^(1/4). That length grows with the noise, in local radii.
 
     Args:
-        skeleton: As the fit began.
-        nodes: Positions now [m], shape [n, 3].
-        radius: Radii now [m], shape [n].
+        skeleton: At the start of the fit.
+        nodes: Current positions [m], shape [n, 3].
+        radius: Current radii [m], shape [n].
         per_node: Weight of the points at each node, shape [n].
         noise: Standard deviation of the points [m].
     """
@@ -44,13 +44,13 @@ def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_no
 def _bandwidth(skeleton: Skeleton, chain: np.ndarray, forks: np.ndarray, noise: float,
                ) -> np.ndarray:
     """Smoothing length [m] at the inner nodes of a chain, shape [k - 2]."""
-    # The first radii, since a radius that grows by mistake must not blur its own axis.
+    # The first radii are used, since a radius that grows by mistake must not blur its own axis.
     thick = skeleton.radius[chain[1:-1]]
-    # Thinner than the noise, it bends no finer than if it were as thick as that: free to, its
-    # axis would follow single points, until nothing is left of its radius.
+    # A branch thinner than the noise bends no finer than one as thick as the noise. Otherwise its
+    # axis would follow single points until its radius vanished.
     band = np.clip(_BAND * thick + 8.0 * noise, _BAND * thick,
                    _BAND_LIMIT * np.maximum(thick, noise))
-    # Axes kink at forks: a branch's leader gives way to a strong twig.
+    # Axes kink at forks, where a branch's leader deflects at a strong twig.
     return band * (np.where(forks[chain[1:-1]], 0.6, 1.0) * _straightness(skeleton.nodes[chain]))
 
 
@@ -82,7 +82,7 @@ def _straightness(nodes: np.ndarray) -> np.ndarray:
 
 def _slope_terms(chains: list[np.ndarray], steps: list[np.ndarray], radius: np.ndarray,
                  density: float) -> sparse.csr_matrix:
-    """Weak penalty on a radius's slope: branches are no cones, whatever stray points say."""
+    """Weak penalty on a radius's slope: branches are not cones, whatever stray points suggest."""
     low = np.concatenate([chain[:-1] for chain in chains])
     high = np.concatenate([chain[1:] for chain in chains])
     step = np.concatenate(steps)

@@ -1,8 +1,8 @@
-"""Radii that a scan does not resolve, weighed with what branches are like, and their intervals.
+"""Radii that a scan does not resolve, combined with prior knowledge, and their intervals.
 
-Where a branch is thinner than the points' spacing, or than their noise, its points tell
-little of its radius. Then what branches are like says more: a twig is thinner than what carries it
-and tapers. Both are weighed, and the interval is as wide as that leaves it.
+Where a branch is thinner than the points' spacing or their noise, its points give little
+information on its radius. The typical shape of branches gives more: a twig is thinner than its
+carrier and tapers. Both are weighted, and the interval has the resulting width.
 """
 
 from dataclasses import replace
@@ -13,20 +13,20 @@ from scipy.spatial import cKDTree
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, UNRESOLVED, Skeleton
 
 SPACINGS = 1.0
-"""Diameter in point spacings, under which a radius is not resolved: too few points a radius."""
+"""Diameter in point spacings, under which a radius is not resolved: too few points around it."""
 _BESIDE = 4  # nodes to each side whose points tell the spacing
 _NOISES = 1.0  # radius in standard deviations of the noise, likewise
 _TWIG, _TAPER = 0.65, 0.4  # a twig's radius over its carrier's, and its loss to the tip
-# Standard deviations of the radius's logarithm: by habit, by points too far apart, by noise alone.
+# Standard deviations of the radius's logarithm: prior, points too far apart, noise alone.
 _PRIOR, _FIT, _FIT_NOISE = 0.35, 0.5, 0.25
-# Of the radius, over (noise / radius)^2: the noise itself is told to 4 %, and a side's radius goes
-# with 3.7 times that (of half a circle, the scatter is twice the noise's square and 0.54 of the
-# radius's).
+# Fraction of the radius, over (noise / radius)^2: the noise itself is known to 4 %, and the radius
+# of one side changes by 3.7 times that (of half a circle, the scatter is twice the square of the
+# noise and 0.54 of the radius's).
 _BIAS = 0.15
 _MODEL = 0.012  # of the radius: branches are not quite round
 _ROUGH_SIGMA = 0.25  # of a radius that was filled in or limited
 _UNRESOLVED_SIGMA = 0.5  # at least, of a radius
-# Standard deviation of the logarithm of an unresolved radius that came out under what is expected:
+# Standard deviation of the logarithm of an unresolved radius that came out below the expected one:
 # such fits collapse. On generated scans they were 0.3 to 0.7 too thin.
 _COLLAPSED = 1.2
 
@@ -36,7 +36,7 @@ def weighed(skeleton: Skeleton, spacing: np.ndarray, noise: float) -> Skeleton:
 
     Args:
         skeleton: Fitted.
-        spacing: Of the points around each node [m], shape [n].
+        spacing: Spacing of the points around each node [m], shape [n].
         noise: Standard deviation of the points [m].
     """
     state, radius = skeleton.radius_state.copy(), skeleton.radius.copy()
@@ -54,13 +54,13 @@ def weighed(skeleton: Skeleton, spacing: np.ndarray, noise: float) -> Skeleton:
 
 def point_spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, noise: float,
                   ) -> np.ndarray:
-    """Mean distance of neighbouring points around each node but for noise [m], shape [n]."""
+    """Mean distance of neighbouring points around each node, corrected for noise [m], shape [n]."""
     distance = cKDTree(points).query(points, k=min(5, len(points)))[0][:, 1:].mean(axis=1)
     total = np.bincount(segment, distance, skeleton.node_count)
     count = np.bincount(segment, minlength=skeleton.node_count).astype(float)
     near = np.full(skeleton.node_count, float(np.median(distance)))
     for own in skeleton.own_runs():
-        # A node without points is as thinly scanned as those beside it.
+        # A node without points has the point spacing of its neighbours.
         around = np.ones(min(2 * _BESIDE + 1, len(own)))
         points_near = np.convolve(count[own], around, "same")
         known = points_near > 0
@@ -70,7 +70,7 @@ def point_spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, n
 
 def _blend(radius: np.ndarray, sigma: np.ndarray, state: np.ndarray, own: np.ndarray, carrier: int,
            vague: np.ndarray, loose: np.ndarray) -> None:
-    """Weigh unresolved radii of a run with what its carrier and its resolved part let expect."""
+    """Combine unresolved radii of a run with those that its carrier and resolved part suggest."""
     if not vague[own].any():
         return
     for node, expected in zip(own, _expected(radius, own, carrier, vague[own]), strict=True):
@@ -84,7 +84,7 @@ def _blend(radius: np.ndarray, sigma: np.ndarray, state: np.ndarray, own: np.nda
 
 
 def _expected(radius: np.ndarray, own: np.ndarray, carrier: int, vague: np.ndarray) -> np.ndarray:
-    """What an even taper from the next resolved node, or from the carrier, lets expect [m]."""
+    """Radius expected from an even taper from the next resolved node, or from the carrier [m]."""
     clear = np.flatnonzero(~vague)
     place = np.arange(len(own))
     if len(clear) == 0:

@@ -1,1 +1,1 @@
-"""What is put right in a skeleton: false ties, backward starts, kinks."""
+"""Repairs of a skeleton: false connections, backward starts, kinks."""

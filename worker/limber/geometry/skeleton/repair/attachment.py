@@ -1,4 +1,4 @@
-"""Where twigs hang on their carriers: the contraction draws a fork towards the twig."""
+"""Attachment of twigs to their carriers: the contraction draws a fork towards the twig."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -7,16 +7,16 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 _HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and that tell where
 _KINK = np.deg2rad(50.0)
-# A twig's start may be as long as so many radii of its carrier, and end in such a kink.
+# Longest start of a twig, in radii of its carrier; least kink at its end; nodes to each side.
 _HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
 _LINE = 2.0  # radii of its carrier that a twig's start is long, which tells where that leads
 
 
 def attached(skeleton: Skeleton) -> Skeleton:
-    """Hang each side run where its own direction meets the carrier's axis.
+    """Attach each side run where its own direction meets the carrier's axis.
 
-    The contraction draws a fork towards the twig. The twig's nodes inside the carrier are
-    dropped, and its line is followed back to the carrier's axis.
+    The contraction draws a fork towards the twig. The twig's nodes inside the carrier are dropped,
+    and its line is extended back to the carrier's axis.
     """
     parent, keep = skeleton.parent.copy(), np.ones(skeleton.node_count, bool)
     runs = skeleton.runs()
@@ -28,7 +28,7 @@ def attached(skeleton: Skeleton) -> Skeleton:
         first = int(np.argmax(outside)) if outside.any() else len(members) - 1
         first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
         keep[members[:first]] = False
-        # A hair's first nodes lie so near each other that only noise is between them.
+        # A very thin run's first nodes are so close together that there is only noise between them.
         along = np.cumsum(np.linalg.norm(np.diff(skeleton.nodes[members[first:]], axis=0), axis=1))
         least = int(np.searchsorted(along, _LINE * skeleton.radius[carrier[near[first]]])) + 2
         ahead = members[first:first + max(least, 5)]
@@ -38,7 +38,7 @@ def attached(skeleton: Skeleton) -> Skeleton:
         direction = skeleton.nodes[ahead[-1]] - skeleton.nodes[ahead[0]]
         direction /= np.linalg.norm(direction)
         parent[members[first]] = _meeting(skeleton, carrier, members[first], direction)
-    # A run that hung on dropped nodes hangs on the next kept ancestor.
+    # A run attached to dropped nodes is attached to the next kept ancestor.
     for node in range(skeleton.node_count):
         while parent[node] >= 0 and not keep[parent[node]]:
             parent[node] = parent[parent[node]]
@@ -46,10 +46,10 @@ def attached(skeleton: Skeleton) -> Skeleton:
 
 
 def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
-    """The place in a twig from which it goes the way that it goes on: its start may be a hook.
+    """The position in a twig from which its direction continues: its start may be a hook.
 
-    Where the scan lacks a twig's base, it hangs on its carrier by a short way across, and kinks
-    where its own axis begins.
+    Where the scan lacks a twig's base, the twig is attached to its carrier by a short path across,
+    with a kink where its own axis begins.
     """
     nodes = skeleton.nodes
     last = min(first + _HOOK, len(members) - _AHEAD)
@@ -77,14 +77,15 @@ def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
 
 
 def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
-    """Carrier node nearest to the twig's line followed back from its first node outside.
+    """Carrier node nearest to the twig's line, extended back from its first node outside.
 
-    A twig grows away from its fork: a node that its line meets ahead is none, unless all are.
+    A twig grows away from its fork: a node that its line meets ahead is excluded, unless all are
+    ahead.
     """
     offset = skeleton.nodes[carrier] - skeleton.nodes[first]
     back = -(offset @ direction)
     across = np.linalg.norm(offset + back[:, None] * direction, axis=1)
-    # No farther back than the carrier is thick: at a small angle the lines meet far away.
+    # No farther back than the carrier's thickness: at a small angle the lines meet far away.
     reach = np.linalg.norm(offset, axis=1).min() * 2.5
     allowed = np.linalg.norm(offset, axis=1) <= reach
     if (allowed & (back > 0)).any():

@@ -1,7 +1,8 @@
-"""Twigs that start backwards, led straight back to their carrier.
+"""Twigs that start backwards, attached again directly to their carrier.
 
-Where a scan lacks a twig's foot, it hangs on what was nearest: often a place farther out on its
-carrier, from which it first comes back. Wood forks forwards: followed back along its own line, such
+Where a scan lacks a twig's foot, the twig is attached to what was nearest: often a position farther
+out on its
+carrier, from which it first runs back. Wood forks forwards: extended back along its own line, such
 a twig meets its carrier nearer to the root.
 """
 
@@ -29,7 +30,7 @@ def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
         if found is None:
             continue
         place, fork = found
-        # What hangs on a start that would go keeps it.
+        # If other runs are attached to the start that would be dropped, it stays.
         if carried.isdisjoint(members[1:place].tolist()):
             keep[members[1:place]] = False
             parent[members[place]] = fork
@@ -39,7 +40,7 @@ def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
 
 def _straight_back(skeleton: Skeleton, members: np.ndarray, carrier: np.ndarray,
                    ) -> tuple[int, int] | None:
-    """The place in a run from which it is straight, and the carrier's node that it comes from."""
+    """The position in a run from which it is straight, and the carrier's node behind it."""
     nodes, radius = skeleton.nodes, skeleton.radius
     inner = carrier[1:]
     outwards = nodes[inner] - nodes[skeleton.parent[inner]]

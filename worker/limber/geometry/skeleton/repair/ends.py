@@ -1,4 +1,4 @@
-"""Ends of runs: the contraction overshoots them or draws them in, and a fit lets them slide."""
+"""Ends of runs: the contraction overshoots or shortens them, and a fit lets them slide."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Draw ends back that a fit let slide along their axis beyond the points."""
+    """Shorten ends that slid along their axis beyond the points during a fit."""
     nodes = skeleton.nodes.copy()
     segment, _ = nearest_cylinders(skeleton, points)
     inner = np.flatnonzero(skeleton.parent == 0)
@@ -49,7 +49,7 @@ def ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
-    """Lengthen the ends that the contraction drew in, as far as there are points.
+    """Lengthen ends that the contraction shortened, as far as there are points.
 
     Args:
         skeleton: With radii.
@@ -79,7 +79,7 @@ def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skel
 
 
 def _told_from(skeleton: Skeleton, end: int, before: int) -> int:
-    """The node from which an end's direction is told: up to three before a tip."""
+    """The node that gives an end's direction: up to three before a tip."""
     for _ in range(2):
         if end and skeleton.parent[before] > 0:
             before = int(skeleton.parent[before])
@@ -88,7 +88,7 @@ def _told_from(skeleton: Skeleton, end: int, before: int) -> int:
 
 def _points_along(offset: np.ndarray, direction: np.ndarray, radius: float, noise: float,
                   ) -> np.ndarray:
-    """How far points around an end lie along its direction, up to the next gap [m], sorted."""
+    """Distances of points around an end along its direction, up to the next gap [m], sorted."""
     along = offset @ direction
     across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
     along = np.sort(along[across < 2.0 * radius + 3 * noise])

@@ -1,10 +1,10 @@
-"""Two ends that a scan's holes tie together sideways, cut apart before pieces are joined.
+"""Ends connected sideways across a scan's holes, cut apart before pieces are joined.
 
-Where the foot of a twig is missing with the stretch of its carrier, what is left of both begins
-side by side, and their points may be near enough to hang together. So the axis goes up the one,
-across, and down the other: a turn that wood does not make. Cut there, each end goes on in its own
-direction. Where so little is left of the twig that it tells none, it hangs on its carrier's end
-like a hook, by a long step aside.
+Where the foot of a twig is missing together with a stretch of its carrier, the remains of both
+begin side by side, and their points may be near enough to be connected. The axis then goes up one,
+across, and down the other: a turn that wood does not make. After a cut there, each end continues in
+its own direction. If too little is left of the twig for a direction, it is attached to its
+carrier's end like a hook, by a long step aside.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ _HOOK, _ASIDE, _STEP = 4.0, np.deg2rad(55.0), 1.5  # radii of a hook; its turn; 
 
 
 def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.ndarray:
-    """Return the edges of a forest without those that tie two ends together, shape [e, 2].
+    """Return the edges of a forest without those that connect two ends, shape [e, 2].
 
     Args:
         nodes: Positions [m], shape [n, 3].
@@ -41,7 +41,7 @@ def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.nd
         cosine = float(arms[0] @ arms[1])
         if cosine > -np.cos(_TURN):
             turning.append((float(np.linalg.norm(nodes[a] - nodes[b])) / thick, place))
-    # Of edges around one turn the longest goes: nothing was scanned beside it.
+    # Of the edges around one turn, the longest is removed: nothing was scanned beside it.
     keep, cut = np.ones(len(edges), bool), []
     for _, place in sorted(turning, reverse=True):
         middle, thick = nodes[edges[place]].mean(axis=0), float(thickness[edges[place]].max())
@@ -53,7 +53,7 @@ def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.nd
 
 def _is_hook(nodes: np.ndarray, near: list[list[int]], thickness: np.ndarray, end: int, first: int,
              ) -> bool:
-    """Whether the chain that ends at ``end`` goes on, by a long step aside, to a short tail."""
+    """Whether the chain that ends at ``end`` continues, by a long step aside, to a short tail."""
     step, thick = nodes[first] - nodes[end], float(thickness[end])
     size = float(np.linalg.norm(step))
     if len(near[end]) != 2 or size < _STEP * thick:
@@ -70,7 +70,7 @@ def _is_hook(nodes: np.ndarray, near: list[list[int]], thickness: np.ndarray, en
 
 def _arm(nodes: np.ndarray, near: list[list[int]], start: int, before: int, thick: float,
          ) -> np.ndarray | None:
-    """Direction in which a chain goes away from an edge, a unit vector; None if it is too short."""
+    """Direction of a chain away from an edge, a unit vector; None if it is too short."""
     chain, length = [], 0.0
     node = start
     while length < (_ARM + _LEAVE) * thick:

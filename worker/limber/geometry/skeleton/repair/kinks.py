@@ -1,4 +1,4 @@
-"""Kinks within a branch that wood does not make: folded ends go, others are rounded."""
+"""Kinks within a branch that wood does not make: folded ends are dropped, others rounded."""
 
 from dataclasses import replace
 
@@ -14,14 +14,14 @@ _ROUNDS = 60
 
 
 def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
-    """Mend kinks of over 70 degrees within runs.
+    """Repair kinks of over 70 degrees within runs.
 
     Where a run folds back near its tip and carries nothing beyond, contraction led it back along
-    itself: it ends at the kink. Elsewhere nodes around the kink are evened out, as far as wood
-    bends.
+    itself: it ends at the kink. Elsewhere nodes around the kink are smoothed to a bend that wood
+    can make.
 
     Returns:
-        The skeleton, and how many kinks were mended.
+        The skeleton, and the number of repaired kinks.
     """
     count = 0
     while True:
@@ -54,7 +54,7 @@ def _folded(skeleton: Skeleton) -> np.ndarray:
 
 
 def _round_off(skeleton: Skeleton, nodes: np.ndarray, members: np.ndarray) -> None:
-    """Even out a run's ``nodes`` around its kinks, in place."""
+    """Smooth a run's ``nodes`` around its kinks, in place."""
     for _ in range(_ROUNDS):
         now = skeleton.moved(nodes)
         sharp = np.flatnonzero(turns(now, members) > KINK)

@@ -1,4 +1,4 @@
-"""The repairs that lead a skeleton from the contracted points to the scan, as a list in order."""
+"""The repairs that fit a skeleton of contracted points to the scan, as an ordered list."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -37,20 +37,20 @@ _ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # of the last fit
 
 @dataclass(frozen=True)
 class Repaired:
-    """A skeleton between two passes, and what they go by.
+    """A skeleton between two passes, and the state that they use.
 
     Attributes:
-        skeleton: As far as it is.
+        skeleton: Its current state.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
         prune: A twig is kept if it extends this many radii of its parent beyond the parent.
         camera: The points are a depth camera's.
         fit: The last fit.
-        pinched: What the first fit started from, where one side alone was seen of wood: that may
-            make a hair of a stem.
-        strands: How many the last search for strands has dropped.
+        pinched: Start of the first fit, where only one side of wood was seen: it may make a stem
+            far too thin.
+        strands: Number of strands that the last search dropped.
         pruned: Number of twigs dropped.
-        progress: Called as a fit goes.
+        progress: Called during a fit.
     """
 
     skeleton: Skeleton
@@ -80,7 +80,7 @@ class Repaired:
 
     @property
     def beside(self) -> float:
-        """Fraction of points farther off their axis than twice its radius, as leaves lie."""
+        """Fraction of points farther off their axis than twice its radius, as on leaves."""
         fit = self.last_fit
         return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
 
@@ -96,10 +96,10 @@ class Pass:
     """One repair.
 
     Attributes:
-        name: Names it in tests and to developers.
-        repairs: What is wrong before it, a sentence.
+        name: Its name, for tests and developers.
+        repairs: The fault that it repairs, a sentence.
         run: The repair.
-        until: Fraction of all passes' work that is done after it; None: it takes next to no time.
+        until: Fraction of all passes' work that is done after it; None: it takes hardly any time.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Pass:
 
 def _fit_coarsely(now: Repaired) -> Repaired:
     after = now.fitted(resampled(now.skeleton, _COARSE), uncertainty=False)
-    # Of leaves too unpinched radii would make thick stems, that seem to have none.
+    # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
     may_be = after.last_fit.seen.one_sided and after.beside <= LEAF_SHARE
     return replace(after, pinched=now.skeleton if may_be else None)
 
@@ -134,7 +134,7 @@ def _drop_strands(now: Repaired) -> Repaired:
 
 
 def _settle(now: Repaired) -> Repaired:
-    # Noise leaves little information a round.
+    # Noise leaves little information per round.
     noisy = now.noise > _NOISY * float(np.median(now.skeleton.radius))
     rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.strands else 0
     return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.strands,
@@ -142,7 +142,8 @@ def _settle(now: Repaired) -> Repaired:
 
 
 def _fill_in(now: Repaired) -> Repaired:
-    # Where leaves swell or starve the axes, what lies beside a blank tells nothing of it either.
+    # Where leaves thicken or thin the axes, the nodes beside a gap give no information on it
+    # either.
     return now.of(filled_in(now.skeleton, now.points)) if now.beside <= LEAF_SHARE else now
 
 
@@ -207,10 +208,10 @@ def repaired(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings,
     Args:
         skeleton: With first radii.
         points: The scan, thinned [m], shape [m, 3].
-        settings: How.
+        settings: Settings to use.
         diagonal: Size of the cloud [m].
         camera: The points are a depth camera's.
-        progress: Called as fits go.
+        progress: Called during fits.
     """
     now = Repaired(skeleton, points, settings.radius_limits(diagonal), settings.prune, camera)
     done = 0.0

@@ -1,4 +1,4 @@
-"""Nodes along runs, as far apart as the runs are thick."""
+"""Nodes along runs, at distances proportional to the radius."""
 
 import numpy as np
 

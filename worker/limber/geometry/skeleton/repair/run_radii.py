@@ -1,4 +1,4 @@
-"""Radii along a run as wood has them: steady, tapering, and within what a scan can show."""
+"""Radii along a run as in wood: steady, tapering, and within what a scan can show."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ _SPEAK = 1 / 8  # of a run's nodes, and of its points, that speak for what follo
 
 
 def filled_in(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton with radii that no point tells taken from those beside them."""
+    """Return the skeleton, with radii that no point supports taken from their neighbours."""
     blank = skeleton.radius_state == INTERPOLATED
     if not blank.any():
         return skeleton
@@ -25,11 +25,11 @@ def filled_in(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton with each radius the median of those around it that points speak for.
+    """Return the skeleton with each radius the median of those around it that have points.
 
-    Where points are missing, a first radius may be a tenth of its neighbours'. How finely an axis
-    is divided, and how far it is smoothed, go by the radius: such a stretch would be free to
-    follow the noise, and stay a hair.
+    Where points are missing, a first radius may be a tenth of its neighbours'. The spacing of nodes
+    and the smoothing depend on the radius: such a stretch would be free to follow the noise and
+    stay far too thin.
 
     Args:
         skeleton: With first radii.
@@ -55,10 +55,10 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton with no first radius under the median of its run's farther out.
+    """Return the skeleton with no first radius below the median of its run farther out.
 
-    Of a strip along a stem whose rest is hidden, contraction leaves a hair: too far from the axis,
-    in its radii, to be let there by the fit.
+    From a strip along a stem whose rest is hidden, contraction leaves a very thin run, too many of
+    its radii from the axis for the fit to move it there.
 
     Args:
         skeleton: With first radii.
@@ -86,16 +86,15 @@ def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
 def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
     """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
 
-    A run is no thicker than its carrier where it starts, nor 1.25 times the median of what
-    was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
-    not resolve would otherwise become a fat cylinder. What limits counts as thick as its interval
-    allows: a foot that few points show says little of the twig. What is far thinner than most of
-    the run speaks for nothing: a rag at a stem's foot does not make a hair of the stem. Nor do few
-    points.
+    A run is no thicker than its carrier at its start, nor than 1.25 times the median of its
+    measured radii so far, nor at its tip than that median. Otherwise a bunch of twigs that the scan
+    did not resolve would become a fat cylinder. The limiting radius counts at the upper end of its
+    interval: a foot with few points gives little information on the twig. A radius far below most
+    of the run does not count: a ragged stem foot does not make the stem thin. Nor do a few points.
 
     Args:
         skeleton: Fitted.
-        count: Points on each node, shape [n]; None: on each as many.
+        count: Points on each node, shape [n]; None: equal on all.
     """
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
     at_most = radius + _SURE * skeleton.radius_sigma
@@ -110,7 +109,7 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
         told, total = np.cumsum(count[own] * speaks), float(count[own].sum())
         for place, node in enumerate(own):
             before = own[:place][speaks[:place]]
-            # The first few are too few to speak for the run: a cut stem starts with a ragged end.
+            # The first few are too few to represent the run: a cut stem starts with a ragged end.
             if len(before) >= max(6, int(_SPEAK * len(own))) and (
                     told[place - 1] >= _SPEAK * total):
                 allowed = _GROWTH + (1 - _GROWTH) * place / len(own)
@@ -121,7 +120,7 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
 
 
 def _middle(values: np.ndarray, weight: np.ndarray) -> float:
-    """Median of values that count by their weight."""
+    """Weighted median of values."""
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[int(np.searchsorted(total, total[-1] / 2))]])

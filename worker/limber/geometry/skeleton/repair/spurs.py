@@ -5,7 +5,7 @@ import numpy as np
 
 def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, factor: float,
                 ) -> tuple[np.ndarray, int]:
-    """Mark the nodes to keep when twigs shorter than ``factor`` radii of their carrier go.
+    """Mark the nodes to keep when twigs shorter than ``factor`` radii of their carrier are dropped.
 
     Args:
         nodes: Positions [m], shape [n, 3].
@@ -15,7 +15,7 @@ def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, fa
             from beyond that node.
 
     Returns:
-        Mask [n], and how many spurs went.
+        Mask [n], and the number of dropped spurs.
     """
     keep, pruned = np.ones(len(nodes), bool), 0
     step = np.where(parent >= 0, np.linalg.norm(nodes - nodes[parent], axis=1), 0.0)
@@ -33,7 +33,7 @@ def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, fa
                 spurs.append((length, chain))
         if not spurs:
             return keep, pruned
-        # The shortest alone: what was a fork may then be no fork any more.
+        # Only the shortest: the fork may no longer be one afterwards.
         _, chain = min(spurs, key=lambda spur: spur[0])
         keep[chain] = False
         pruned += 1

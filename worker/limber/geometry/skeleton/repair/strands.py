@@ -6,7 +6,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 
 def without_strands(skeleton: Skeleton) -> tuple[Skeleton, int]:
-    """Drop side runs that lie mostly inside the others, thinnest twigs first; and how many."""
+    """Drop side runs that lie mostly inside others, thinnest first; also return their number."""
     count, run = 0, skeleton.branch_count - 1
     while run > 0:
         if _is_strand(skeleton, run):
@@ -17,12 +17,12 @@ def without_strands(skeleton: Skeleton) -> tuple[Skeleton, int]:
 
 
 def _is_strand(skeleton: Skeleton, run: int) -> bool:
-    """Whether a side run has no twigs of its own and lies mostly inside the others."""
+    """Whether a side run has no twigs of its own and is mostly inside the others."""
     own = np.flatnonzero(skeleton.branch == run)
     carried = (skeleton.branch[skeleton.parent[1:]] == run) & (skeleton.branch[1:] != run)
     if carried.any():
         return False
-    # Others that could hold it: only those around.
+    # Other runs that could contain it: only those nearby.
     middle = skeleton.nodes[own].mean(axis=0)
     span = np.linalg.norm(skeleton.nodes[own] - middle, axis=1).max()
     reach = 2 * span + 1.4 * float(skeleton.radius.max())
