@@ -233,6 +233,9 @@ def _array_changed(content: bytes, rng: np.random.Generator) -> bytes:
     except (ValueError, OSError, EOFError, KeyError, TypeError, NotImplementedError, SyntaxError,
             tokenize.TokenError, zipfile.BadZipFile, zlib.error):
         return _bytes_changed(content, rng)
+    if not arrays:
+        # Its last one went in the mutation before.
+        return _bytes_changed(content, rng)
     name = list(arrays)[int(rng.integers(len(arrays)))]
     array = arrays[name]
     way = rng.integers(8)
