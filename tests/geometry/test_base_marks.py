@@ -1,5 +1,7 @@
 """The clamp is the face at the base; a tapered straight axis is meshed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -34,3 +36,13 @@ def test_a_straight_tapered_axis_is_meshed(tip):
     assert mesh.volumes.sum() == pytest.approx(volume, rel=0.08)
     meshed = mesh_branch(rod((0.012, tip)), MeshSettings(mesher="sweep"))
     assert meshed.mesh.tet_count > 50
+
+
+def test_a_node_on_the_root_leaves_the_direction_of_the_base():
+    """A fit to few points put one there: the base had no direction, and no nodes."""
+    skeleton = rod((0.01, 0.01))
+    nodes = skeleton.nodes.copy()
+    nodes[1] = nodes[0]
+    mesh = straight_beam(0.3, 0.01, slice_count=40)
+    held = base_nodes(mesh, replace(skeleton, nodes=nodes))
+    assert np.array_equal(held, base_nodes(mesh, skeleton)) and held.sum() >= 6

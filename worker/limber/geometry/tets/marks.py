@@ -55,8 +55,10 @@ def base_nodes(mesh: TetMesh, skeleton: Skeleton) -> np.ndarray:
     held.
     """
     path = skeleton.main_path()
-    direction = skeleton.nodes[path[1]] - skeleton.nodes[path[0]]
-    direction /= np.linalg.norm(direction)
+    ahead = skeleton.nodes[path[1:]] - skeleton.nodes[path[0]]
+    # A fit to few points may put a node onto the root.
+    direction = ahead[np.argmax(ahead.any(axis=1))]
+    direction = direction / np.linalg.norm(direction)
     offset = mesh.nodes - skeleton.nodes[path[0]]
     along = offset @ direction
     across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
