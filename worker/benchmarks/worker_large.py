@@ -56,7 +56,7 @@ def large(setting: Setting) -> list[Row]:
     counts = [count for count in _LIMITS if not setting.quick or count <= _QUICK]
     for count in setting.budget.items(counts):
         found.append(_sized(count, setting.seed))
-    if setting.budget.remaining() > 2 * _PIECES_SECONDS:
+    if setting.budget.remaining > 2 * _PIECES_SECONDS:
         found.append(_in_pieces(setting))
     return found
 
