@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
+from limber.estimation.vibration.readings import ringing_columns
 from limber.estimation.vibration.ringing import identify, read_record
+from limber.recordings.time_series import Stream
 
 
 def record(rng, *, frequencies=(2.3, 7.9), damping=(0.02, 0.03), size=(1.0, 0.4), noise=0.05,
@@ -21,6 +23,14 @@ def record(rng, *, frequencies=(2.3, 7.9), damping=(0.02, 0.03), size=(1.0, 0.4)
         found += amplitude * np.where(since > 0, way, 0.0)[:, None] * (
             1 - 0.5 * np.arange(channels))
     return times, found + noise * rng.standard_normal(found.shape)
+
+
+def test_a_reading_that_no_sensor_gives_is_refused():
+    """Its square overflowed, and a fit of the drift failed."""
+    times, values = record(np.random.default_rng(1))
+    values[7, 0] = 1e300
+    with pytest.raises(InputError, match="No sensor gives such a number"):
+        ringing_columns(Stream(times, values, ("a", "b")))
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from limber.core.errors import InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics.points import point_operator
 
@@ -29,3 +30,10 @@ def test_quadratic_fields_inside():
     moved = (point_operator(mesh, points) @ field.ravel()).reshape(-1, 3)
     expected = np.column_stack([points[:, 2]**2, points[:, 0] * points[:, 2], points[:, 1]**2])
     assert np.allclose(moved, expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("where", [1e199, np.inf, np.nan])
+def test_a_point_where_no_branch_is_is_refused(where):
+    """Its distance to any tetrahedron overflowed."""
+    with pytest.raises(InputError, match="farther than 1e"):
+        point_operator(straight_beam(0.3, 0.01, slice_count=8), np.array([[0.0, where, 0.1]]))

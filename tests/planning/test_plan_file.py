@@ -100,6 +100,15 @@ def test_what_is_written_is_read(path, tmp_path):
     assert plan.plan.joints is None
 
 
+@pytest.mark.parametrize("robot", [[], 1.0, "ur5"])
+def test_an_arm_that_is_no_object_is_refused(path, tmp_path, robot):
+    """The report asked it for its model."""
+    file = written(path, tmp_path)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"robot": robot}))
+    with pytest.raises(InputError, match="robot"):
+        read_plan(file)
+
+
 def test_format_1_is_read():
     """A plan of the first format: sizes of forces, no vectors, no motion."""
     plan = read_plan(OLD)

@@ -4,10 +4,12 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements.shapes import shape_functions, shape_gradients
 
 _CANDIDATES = 40
+_FARTHEST = 1e9  # [m]
 
 
 def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
@@ -79,6 +81,10 @@ def _slopes(mesh: TetMesh, tets: np.ndarray) -> np.ndarray:
 
 def _located(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tetrahedron, barycentric coordinates [m, 4] and offset from the mesh [m, 3] of points."""
+    if not (np.abs(points) < _FARTHEST).all():
+        raise InputError(f"A point at {points[~(np.abs(points) < _FARTHEST).all(axis=1)][0]} m is "
+                         f"farther than {_FARTHEST:g} m from the origin.",
+                         "No branch is that large.", "Check its coordinates and their unit.")
     count = min(_CANDIDATES, mesh.tet_count)
     near = cKDTree(mesh.centroids).query(points, k=count)[1].reshape(len(points), count)
     tets, local, outside = [], [], []

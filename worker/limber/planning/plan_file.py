@@ -148,6 +148,12 @@ class PlanInMotion(_Told):
     acceleration_m_s2: float = Field(gt=0)
 
 
+class PlanRobot(_Told):
+    """The arm that a plan is for."""
+
+    model: str | None = None
+
+
 class PlanStep(_Told):
     """One entry of a planner's history."""
 
@@ -165,6 +171,7 @@ class PlanSummary(_Told):
     plan: PathScores = PathScores()
     certificate: PlanCertificate | None = None
     in_motion: PlanInMotion | None = None
+    robot: PlanRobot | None = None
     detour: PlanDetour | None = None
     paths_on_field: dict[str, Any] | None = None
     limits: dict[str, dict[str, float]] | None = None

@@ -18,6 +18,8 @@ _JUMP, _LOUD, _ABOVE = 2.5, 0.2, 2.0
 _FLAT = 3
 """Equal readings in a row at a channel's limit."""
 
+_LARGEST = 1e15  # of any reading, in any unit
+
 
 @dataclass(frozen=True)
 class _Spectrum:
@@ -41,8 +43,11 @@ def ringing_columns(record: Stream) -> Stream:
     a counter. If no column rings clearly, all columns that change are kept.
 
     Raises:
-        InputError: no column changes, or all of them are counters.
+        InputError: no column changes, all of them are counters, or a reading is impossible.
     """
+    if not (np.abs(record.values[np.isfinite(record.values)]) < _LARGEST).all():
+        raise InputError(f"The record has a reading over {_LARGEST:g}.",
+                         "No sensor gives such a number.", "Check the file and its units.")
     changing = [k for k in range(record.values.shape[1])
                 if not _is_counter(record.values[:, k])]
     if not changing:
