@@ -205,13 +205,20 @@ def _places(tree: Any, depth: int = 0) -> Any:
         yield from _places(tree[key], depth + 1)
 
 
-def _array_scaled(content: bytes, rng: np.random.Generator) -> bytes:
-    """Numbers of an array in another unit, as dates, or complex."""
+def _arrays(content: bytes) -> dict[str, np.ndarray]:
+    """Arrays of an NPZ file; empty if earlier mutations have left none that can be read."""
     try:
         with np.load(io.BytesIO(content)) as file:
-            arrays = {name: file[name] for name in file.files}
+            return {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, KeyError, TypeError, NotImplementedError, SyntaxError,
             tokenize.TokenError, zipfile.BadZipFile, zlib.error):
+        return {}
+
+
+def _array_scaled(content: bytes, rng: np.random.Generator) -> bytes:
+    """Numbers of an array in another unit, as dates, or complex."""
+    arrays = _arrays(content)
+    if not arrays:
         return _bytes_changed(content, rng)
     numbers = [name for name, array in arrays.items() if array.dtype.kind in "fiu"]
     if not numbers:
@@ -227,14 +234,8 @@ def _array_scaled(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _array_changed(content: bytes, rng: np.random.Generator) -> bytes:
-    try:
-        with np.load(io.BytesIO(content)) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, KeyError, TypeError, NotImplementedError, SyntaxError,
-            tokenize.TokenError, zipfile.BadZipFile, zlib.error):
-        return _bytes_changed(content, rng)
+    arrays = _arrays(content)
     if not arrays:
-        # Its last one went in the mutation before.
         return _bytes_changed(content, rng)
     name = list(arrays)[int(rng.integers(len(arrays)))]
     array = arrays[name]
