@@ -103,6 +103,9 @@ class Witness:
     def _read(self, process: subprocess.Popen[str], seen: list[tuple[float, float]]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
+            if not line.endswith("\n"):
+                # The process ended while it wrote.
+                return
             moment, seconds = map(float, line.split())
             seen.append((moment, seconds))
 
