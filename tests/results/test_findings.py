@@ -10,9 +10,11 @@ from limber.planning.constraints.damage import Strength, assumed
 from limber.results.findings import (
     beyond_sentence,
     certificate_sentence,
+    failure_sentence,
     modulus_origin,
     modulus_sentence,
     path_sentence,
+    peaks_line,
     remarks_on,
 )
 from limber.results.report import estimate_figures, plan_figures
@@ -64,6 +66,19 @@ def test_a_force_beyond_an_arm_is_said_beside_it():
     assert rows[0][-1] == "beyond reach" and all(len(row) == 5 for row in rows)
     force = next(row for row in rows if row[0].startswith("peak force"))
     assert force[1] == "104" and force[-1] == "shortest: more than a UR10 carries (98 N)"
+
+
+def test_peaks_of_a_motion_stand_with_the_limits_that_they_exceed():
+    """A motion without a gripper has no force; values within reach stand alone."""
+    assert peaks_line({"peak_strain": 0.004, "peak_force_n": 20.0}) == (
+        "Largest strain 0.4 %; peak force 20 N.")
+    assert peaks_line({"peak_strain": 0.012, "peak_force_n": 104.0}) == (
+        "Largest strain 1.2 %, over the 0.6 % at which half of such branches break (green wood, "
+        "assumed); peak force 104 N, more than a UR10 carries (98 N).")
+    assert peaks_line({"peak_strain": 0.004, "peak_force_n": 60.0}, "ur3e").endswith(
+        "more than a UR3E carries (29 N).")
+    assert peaks_line({"peak_strain": 0.004, "peak_force_n": 0.0}) == "Largest strain 0.4 %."
+    assert failure_sentence(1.2) == "There the wood fails." and not failure_sentence(1.0)
 
 
 def test_a_plan_over_the_strength_of_the_wood_says_so():

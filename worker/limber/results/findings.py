@@ -6,6 +6,7 @@ from typing import Any
 
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
+from limber.planning.constraints.damage import assumed
 from limber.robot.known_arms import arm_named
 from limber.robot.ur.arms import ARMS
 from limber.store import Branch
@@ -122,10 +123,13 @@ def beyond_sentence(plan: Mapping[str, Any]) -> str:
     return " ".join(f"{labels[key]}, {words}." for key, words in remarks_on(plan).items())
 
 
-def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
-    """State which arm cannot apply a path's force: the plan's, or the strongest known that cannot.
+def force_remark(force: float, model: str | None = None) -> str:
+    """State which arm cannot apply a force [N]; empty if all can.
+
+    Args:
+        force: Largest force on the gripper.
+        model: Name or file of the arm; None for the strongest known one that cannot.
     """
-    force, model = float(plan[path]["peak_force_n"]), (plan.get("robot") or {}).get("model")
     try:
         arms = [arm_named(model)] if model else list(ARMS.values())
     except InputError:
@@ -139,12 +143,52 @@ def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
             f"({arm.payload * STANDARD_GRAVITY:.0f} N)")
 
 
-def _over_wood(path: str, plan: Mapping[str, Any]) -> str:
-    strength = plan.get("strength")
-    if not strength or plan[path]["peak_strain"] <= strength["median_strain"]:
+def strain_remark(strain: float, strength: Mapping[str, Any]) -> str:
+    """State that a strain breaks half of such branches; empty if it does not.
+
+    Args:
+        strain: Largest principal strain.
+        strength: ``median_strain`` and its ``source``
+            (:meth:`limber.planning.constraints.damage.Strength.describe`).
+    """
+    if strain <= strength["median_strain"]:
         return ""
     return (f"over the {100 * strength['median_strain']:.2g} % at which half of such branches "
             f"break ({strength['source']})")
+
+
+def peaks_line(peaks: Mapping[str, Any], model: str | None = None) -> str:
+    """Return the largest strain and force of a motion, each with the limit that it exceeds.
+
+    Args:
+        peaks: ``peak_strain``, and ``peak_force_n`` [N], 0 if no gripper holds the branch.
+        model: Name or file of the arm that applies the force, if known.
+    """
+    strain, force = peaks["peak_strain"], peaks.get("peak_force_n")
+    parts = [("Largest strain", f"{100 * strain:.2g} %", strain_remark(strain, assumed(strain)))]
+    if force:
+        parts.append(("peak force", f"{force:.3g} N", force_remark(force, model)))
+    return "; ".join(f"{name} {value}" + (f", {remark}" if remark else "")
+                     for name, value, remark in parts) + "."
+
+
+def failure_sentence(strain_over_limit: float) -> str:
+    """State that loads strain the wood beyond its failure strain; empty if they do not.
+
+    Args:
+        strain_over_limit: Largest strain over that strain.
+    """
+    return "There the wood fails." if strain_over_limit > 1.0 else ""
+
+
+def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
+    return force_remark(float(plan[path]["peak_force_n"]),
+                        (plan.get("robot") or {}).get("model"))
+
+
+def _over_wood(path: str, plan: Mapping[str, Any]) -> str:
+    strength = plan.get("strength")
+    return strain_remark(plan[path]["peak_strain"], strength) if strength else ""
 
 
 def _with_interval(young: float, interval: Sequence[float | None] | None) -> str:

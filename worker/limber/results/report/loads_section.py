@@ -8,6 +8,7 @@ from pydantic import Field
 
 from limber.core.files.reading import FileContent, read_arrays, read_json_as, require_shapes
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.results.findings import failure_sentence
 from limber.results.motion_files import read_pc2
 from limber.results.report.charts import draw_faces, two_views
 
@@ -72,7 +73,8 @@ def load_rows(load: LoadFile) -> list[list[str]]:
             ["largest strain", f"{load.greatest_strain:.5f}",
              _between(load.greatest_strain_interval, 1.0, 5)],
             ["largest strain over the failure strain of the wood",
-             f"{100 * load.strain_over_limit:.0f} %", ""],
+             f"{100 * load.strain_over_limit:.0f} %",
+             failure_sentence(load.strain_over_limit)],
             ["first frequency [Hz]", f"{load.frequencies_hz[0]:.3f}",
              _between(load.first_frequency_interval_hz, 1.0, 3)],
             ["first frequency before [Hz]", f"{load.frequencies_before_hz[0]:.3f}", ""]]

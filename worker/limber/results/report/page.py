@@ -21,6 +21,7 @@ from limber.results.findings import (
     certificate_sentence,
     modulus_sentence,
     path_sentence,
+    peaks_line,
     simulated_pull,
 )
 from limber.results.motion_files import read_frames_file
@@ -235,6 +236,10 @@ def _simulation(branch: Branch, name: str) -> Section:
         f"{entry.result['frame_count']} frames. At the end the tip has moved by {1e3 * tip:.1f} "
         f"mm and the branch stores {entry.result['energy_j']:.4g} J. The smallest det F is "
         f"{min(frames['min_det_f']):.3f}.")
+    if frames["largest_principal_strains"]:
+        forces = np.linalg.norm(frames["grasp_forces_n"] or [[0.0]], axis=1)
+        section.text.append(peaks_line({"peak_strain": max(frames["largest_principal_strains"]),
+                                        "peak_force_n": float(forces.max())}))
     return section
 
 

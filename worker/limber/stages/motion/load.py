@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -217,6 +218,12 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
            f"{100 * limit * row['strain']:.0f} %"] for row in result["along"])])]
 
 
+def _failure_line(result: Mapping[str, Any]) -> str:
+    from limber.results.findings import failure_sentence
+
+    return failure_sentence(result["strain_over_limit"])
+
+
 STAGE = StageDescription(
     "load", 45, by_name(load, folder="branch_folder"), BranchInputs, LoadSettings, RunOptions,
     key="load:{name}", reads=("mesh.vtu", "skeleton.swc"),
@@ -224,5 +231,6 @@ STAGE = StageDescription(
     tables=_tables,
     found=("Under the loads the tip sags by {sag_m:m}; greatest strain {greatest_strain:share}, "
            "{strain_over_limit:share} of the limit; first frequency {frequencies_hz[0]:Hz}.",
+           _failure_line,
            "It bears {bears_times:.3g} times these loads; then held by: {held_by}."),
     then="limber report {branch_folder}", step="material", label="Wind, Snow, Fruit, Cuts")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -138,6 +139,7 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
     tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
                              axis=1).argmax())
     states = [strain_state(model, moved) for moved in displacement]
+    strains = [float(state.principal_strain[:, -1].max()) for state in states]
     np.savez_compressed(stage.path(f"frames/{settings.name}.npz"),
                         **surface_fields(model.mesh, states))
     frames = {
@@ -148,7 +150,7 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         "grasp_torques_nm": motion.grasp_torque.tolist(),
         "hold_forces_n": motion.hold_forces.tolist(), "min_det_f": motion.min_det_f.tolist(),
         "converged": motion.converged,
-        "largest_principal_strains": [float(s.principal_strain[:, -1].max()) for s in states],
+        "largest_principal_strains": strains,
         "largest_principal_stresses_pa": [
             float(s.principal_stress[:, -1].max()) for s in states]}
     write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
@@ -157,7 +159,8 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         "energy_j": float(motion.energy[-1]),
         "grasp_force_n": motion.grasp_force[-1].tolist(),
         "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
-        "min_det_f": float(motion.min_det_f.min())}
+        "min_det_f": float(motion.min_det_f.min()), "peak_strain": max(strains),
+        "peak_force_n": float(np.linalg.norm(motion.grasp_force, axis=-1).max(initial=0.0))}
 
 
 def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
@@ -225,10 +228,17 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
     return PoseTable(stream.times[known], poses[known])
 
 
+def _peaks_line(result: Mapping[str, Any]) -> str:
+    from limber.results.findings import peaks_line
+
+    return peaks_line(result)
+
+
 STAGE = StageDescription(
     "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY, reads=("mesh.vtu",),
     writes=("frames/{name}.pc2", "frames/{name}.json"),
     found=("{frame_count} frames. At the end the tip has moved by {tip_displacement_m:|m}, the "
-           "force on the grasp is {grasp_force_n:|N} and the branch stores {energy_j:J}.",),
+           "force on the grasp is {grasp_force_n:|N} and the branch stores {energy_j:J}.",
+           _peaks_line),
     then="limber scene {branch_folder} -o scene.blend --motion {name}", step="material",
     label="Simulate a Motion")

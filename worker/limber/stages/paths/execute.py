@@ -484,12 +484,20 @@ def _outcome_line(result: Mapping[str, Any]) -> str:
             else f"The robot stopped: {result['stop_reason']}.")
 
 
+def _arm_line(result: Mapping[str, Any]) -> str:
+    from limber.results.findings import force_remark
+
+    remark = force_remark(max(result["predicted_peak_force_n"], result.get("peak_force_n") or 0.0),
+                          result["robot"])
+    return f"The peak force is {remark}." if remark else ""
+
+
 STAGE = StageDescription(
     "execute", 110, by_name(execute, folder="branch_folder", cell_file="cell"), ExecuteInputs,
     ExecuteSettings, ExecuteOptions, key="execute:{name}",
     reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
     writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
     found=(_outcome_line, "Predicted peak force {predicted_peak_force_n:N}, measured "
-           "{peak_force_n:N}; at most {path_error_m:m} off the path."),
+           "{peak_force_n:N}; at most {path_error_m:m} off the path.", _arm_line),
     then="limber report {branch_folder}", step="robot", label="Check With Robot",
     moves_robot="when armed")
