@@ -41,6 +41,8 @@ FIGURES = {
     "one-sided": Figure("estimation", "the same: error of E", r"one-sided: median (\S+ %)"),
     "drop": Figure("estimation", "silicone_beam: E from", r"\(-?(\S+ %)\)$"),
     "saved": Figure("worker", "limber demo: energy", r"^(\S+ %)"),
+    "swing": Figure("worker", "modulus of generated branches from a noisy swing",
+                    r"error (\S+ %) \(median\)"),
     "held": Figure("worker", "limber demo: 95 % intervals", r"^(\d of \d)"),
 }
 
@@ -59,7 +61,8 @@ ROWS = (
      "`tests/planning`; `scripts/bench planning`"),
     ("recording and execution with a UR arm, under a guard", "on the virtual robot only",
      "`tests/robot` with the real client library; `scripts/bench robot`"),
-    ("wind, snow, fruit, pruning; ringing and free swings", "",
+    ("wind, snow, fruit, pruning; ringing and free swings",
+     "modulus from a noisy free swing: {swing} off (median)",
      "`tests/mechanics`, `tests/estimation`; `scripts/bench worker`"),
     ("many branches, on one machine or a cluster", "", "`tests/batch`; `scripts/bench worker`"),
 )
