@@ -105,7 +105,8 @@ def test_what_is_no_edit_is_refused(edits, tree, change, said):
 def test_the_worker_makes_of_the_edits_what_was_done(edits, tmp_path, seed):
     """Random moves, radii and deletions on a random tree: the edited tree has exactly the nodes
     that the user left, where they are."""
-    from limber.geometry.skeleton.edits import EDITS, edited
+    from limber.core.json_values import validated
+    from limber.geometry.skeleton.edits import Edit, edited
     from limber.geometry.skeleton.skeleton import Skeleton as Tree
 
     rng = np.random.default_rng(seed)
@@ -124,7 +125,7 @@ def test_the_worker_makes_of_the_edits_what_was_done(edits, tmp_path, seed):
     resized = np.where(rng.random(len(keep)) < 0.3, 1.5 * now.radius, now.radius)
     done = edits.edits_of(before, _nodes(edits, before, keep=keep, places=places,
                                          radius=resized.astype(np.float32)))
-    after = edited(made, EDITS.validate_python(done))
+    after = edited(made, validated(list[Edit], done))
     assert after.node_count == len(keep)
     order = [int(np.linalg.norm(after.nodes - place, axis=1).argmin()) for place in places]
     assert sorted(order) == list(range(len(keep)))

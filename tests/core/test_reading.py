@@ -30,7 +30,8 @@ from limber.core.machine_errors import machine_error
 
 
 @pytest.mark.parametrize("text", [
-    "NaN", "[Infinity]", "[1e400]", "{", "[" * 100_000, '{"a": ' + "9" * 400 + "}", "\xff"])
+    "NaN", "[Infinity]", "[1e400]", "[-1e30]", "[" + "9" * 50 + "]", "{", "[" * 100_000,
+    '{"a": ' + "9" * 400 + "}", "\xff"])
 def test_json_that_is_refused(tmp_path, text):
     """Numbers that are not finite, endless nesting, endless digits, no text: one clear error."""
     path = tmp_path / "a.json"
@@ -49,7 +50,7 @@ def test_json_of_a_kind_says_where(tmp_path):
         read_json_as(path, list[float], "numbers")
 
 
-@pytest.mark.parametrize("text", ["a = 1e400", "a = ", "a = [" * 3000])
+@pytest.mark.parametrize("text", ["a = 1e400", "a = -1e30", "a = ", "a = [" * 3000])
 def test_toml_that_is_refused(tmp_path, text):
     """Likewise; TOML's own inf and nan too."""
     path = tmp_path / "a.toml"
@@ -204,14 +205,17 @@ def test_objects_are_never_loaded(tmp_path):
 
 
 def test_shapes_that_do_not_fit(tmp_path):
-    """Missing, of other length, text, not finite: each is named."""
+    """Missing, of other length, text, Booleans, not finite, or too large: each is named."""
     good = {"a": np.zeros((4, 3)), "b": np.zeros(4)}
     shapes = {"a": ("n", 3), "b": ("n",)}
     require_shapes(tmp_path, good, shapes, "arrays")
     for bad in ({"a": good["a"]}, {**good, "b": np.zeros(5)}, {**good, "b": np.array(["x"] * 4)},
-                {**good, "b": np.array([0, 0, np.inf, 0])}):
+                {**good, "b": np.zeros(4, bool)}, {**good, "b": np.array([0, 0, np.inf, 0])},
+                {**good, "b": np.array([0, 0, -1e30, 0])},
+                {**good, "b": np.array([0, 0, 1e30, 0], np.float32)}):
         with pytest.raises(InputError, match="b"):
             require_shapes(tmp_path, bad, shapes, "arrays")
+    require_shapes(tmp_path, {**good, "b": np.zeros(4, bool)}, shapes, "arrays", flags=("b",))
 
 
 def test_columns_of_numbers(tmp_path):
@@ -221,6 +225,9 @@ def test_columns_of_numbers(tmp_path):
     assert list(read_columns(path, ["x"], "a table")) == ["x"]
     with pytest.raises(InputError, match="column y"):
         read_columns(path, ["x", "y"], "a table")
+    path.write_text("x\n1\n1e300\n")
+    with pytest.raises(InputError, match="column x"):
+        read_columns(path, ["x"], "a table")
 
 
 def test_bytes_that_are_no_archive():

@@ -125,6 +125,8 @@ def test_format_1_is_read():
     (lambda content: content.pop("motion"), "motion"),
     (lambda content: content["plan"]["poses"].__setitem__(0, [0.0] * 5), "not a plan"),
     (lambda content: content["motion"]["forces_n"][0].__setitem__(0, float("nan")), "finite"),
+    (lambda content: content["plan"]["forces_n"][0].__setitem__(0, 1e200), "beyond"),
+    (lambda content: content["plan"]["energies_j"].__setitem__(0, True), "not a number"),
 ])
 def test_damaged_plans_are_refused(path, tmp_path, spoil, words):
     """With what is wrong; a newer format by its number."""

@@ -1,5 +1,6 @@
 """A user's edits: applied by place, in order, to whatever the next reconstruction found."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
-from limber.geometry.skeleton.edits import EDITS, edited, edits_text, read_edits
+from limber.core.json_values import validated
+from limber.geometry.skeleton.edits import Edit, edited, edits_text, read_edits
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
 
@@ -21,7 +23,7 @@ def _tree(count: int = 41) -> Skeleton:
 
 
 def _edits(*edits: dict):
-    return EDITS.validate_python(list(edits))
+    return validated(list[Edit], list(edits))
 
 
 def test_edits_do_what_they_say() -> None:
@@ -102,9 +104,10 @@ def test_a_file_of_edits_is_read_or_its_fault_told(tmp_path) -> None:
 
 def test_edits_outlive_a_new_numbering() -> None:
     """The same list, through JSON, on a tree of other nodes cuts the same branch off."""
-    text = EDITS.dump_json(_edits({"do": "delete", "at": (0.1, 0, 0.2)}))
+    text = edits_text(_edits({"do": "delete", "at": (0.1, 0, 0.2)}))
     for count in (41, 81):
-        assert edited(_tree(count), EDITS.validate_json(text)).nodes[:, 0].max() < 0.1
+        cut = edited(_tree(count), validated(list[Edit], json.loads(text)))
+        assert cut.nodes[:, 0].max() < 0.1
 
 
 def test_edits_that_make_no_tree_are_refused() -> None:

@@ -153,11 +153,14 @@ def test_search_trees(tmp_path, mesh):
 
 
 def test_frames_of_another_mesh_are_refused(tmp_path, mesh):
-    """Too few vertices, a file cut short: an error, since Blender would show the rest shape."""
+    """Too few vertices, a file cut short or beyond single precision: an error, since Blender would
+    show the rest shape.
+    """
     surface = mesh.nodes[np.unique(mesh.surface_faces())]
     plan = _plan({}, [[0.0, 0.0, 0.3]])
     for name, content, words in (("fewer", _pc2(surface[None, 1:]), "another mesh"),
                                  ("cut", _pc2(surface[None])[:-4], "not a complete PC2"),
+                                 ("far", _pc2(1e25 * surface[None]), "beyond 1e[+]18"),
                                  ("none", b"", "not a complete PC2")):
         branch = _branch(tmp_path / name, mesh, plan__p=plan | {"frames/p.pc2": content})
         with pytest.raises(InputError, match=words):

@@ -1,11 +1,15 @@
-"""Values in JSON form."""
+"""Values in JSON form, and their check."""
 
 from collections.abc import Mapping
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic_core import InitErrorDetails
+
+Content = TypeVar("Content")
 
 
 def plain(value: Any) -> Any:
@@ -26,3 +30,50 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
+
+
+def number_array(values: Any) -> np.ndarray:
+    """Return nested lists of numbers as an array of floats.
+
+    Raises:
+        ValueError: they are ragged, or there is anything else among them: a text, a Boolean, None.
+    """
+    held = np.array(values, object)
+    if not {type(value) for value in held.ravel().tolist()} <= {int, float}:
+        raise ValueError("a value that is not a number")
+    return held.astype(float)
+
+
+def validated(kind: type[Content], content: Any) -> Content:
+    """Return values from a file or a user as ``kind``, any type that pydantic checks.
+
+    Unlike pydantic by itself, this takes no Boolean for a number: ``width: true`` is no 1.
+
+    Raises:
+        ValidationError: they are not of that kind.
+    """
+    made = TypeAdapter(kind).validate_python(content)
+    if (place := _boolean_as_number(content, made)) is not None:
+        raise ValidationError.from_exception_data("content", [InitErrorDetails(
+            type="float_type", loc=place, input=reduce(lambda held, key: held[key], place,
+                                                       content))])
+    return made
+
+
+def _boolean_as_number(content: Any, made: Any) -> tuple[str | int, ...] | None:
+    """Return the place of a Boolean in ``content`` of which a number was made, or None."""
+    if isinstance(content, bool):
+        return () if isinstance(made, int | float) and not isinstance(made, bool) else None
+    pairs: list[tuple[str | int, Any, Any]] = []
+    if isinstance(content, Mapping) and isinstance(made, BaseModel):
+        names = {field.alias or name: name for name, field in type(made).model_fields.items()}
+        pairs = [(key, item, getattr(made, names[key])) for key, item in content.items()
+                 if key in names]
+    elif isinstance(content, Mapping) and isinstance(made, Mapping):
+        pairs = [(key, item, made.get(key)) for key, item in content.items()]
+    elif isinstance(content, list | tuple) and isinstance(made, list | tuple):
+        pairs = [(number, *both) for number, both in enumerate(zip(content, made, strict=False))]
+    for key, item, part in pairs:
+        if (place := _boolean_as_number(item, part)) is not None:
+            return (key, *place)
+    return None

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import core_schema
 
 from limber.core.errors import InputError
+from limber.core.json_values import validated
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -164,7 +165,7 @@ def nearest(name: str, known: Sequence[str]) -> str:
 def checked_settings(model: type[Model], values: dict[str, Any]) -> Model:
     """Return ``model(**values)``; a refused value becomes an :class:`InputError` that names it."""
     try:
-        return model(**values)
+        return validated(model, values)
     except ValidationError as error:
         raise _refusal(model, values, error) from error
 

@@ -30,7 +30,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as, read_json
-from limber.core.json_values import plain
+from limber.core.json_values import number_array, plain
 from limber.planning.constraints.limits import Limits, with_unit
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.timing import DEFAULT_PACE, Pace, times_along
@@ -304,12 +304,12 @@ def _columns(way: Way) -> dict[str, Any]:
 
 
 def _way(content: dict[str, Any]) -> Way:
-    values = {name: np.array(content[column], float) for name, column in _COLUMNS.items()
+    values = {name: number_array(content[column]) for name, column in _COLUMNS.items()
               if content.get(column) is not None}
     count = len(values["poses"])
-    forces = np.array(content["forces_n"], float)
+    forces = number_array(content["forces_n"])
     known = forces.ndim == 2
-    targets = {name: np.array(positions, float)
+    targets = {name: number_array(positions)
                for name, positions in content.get("targets_m", {}).items()}
     phases = tuple(content["phases"]) if "phases" in content else None
     columns = [*values.values(), forces, *targets.values(), *([] if phases is None else [phases])]

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml, toml_content
-from limber.core.json_values import plain
+from limber.core.json_values import plain, validated
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.time_series import Stream, read_stream, write_stream
 
@@ -216,7 +216,7 @@ def entry_of_text(text: str, where: str) -> PullEntry:
 
 def _checked(content: dict[str, Any], where: str) -> PullEntry:
     try:
-        return PullEntry.model_validate(content)
+        return validated(PullEntry, content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
-from limber.core.files.reading import FileContent, read_json_as
+from limber.core.files.reading import FileContent, read_json_as, require_finite
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import StrainState, strain_state
@@ -57,10 +57,10 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
                          "It is damaged or has another format.",
                          "Write it again.")
     body = np.frombuffer(data, "<f4", offset=_PC2_HEADER.size)
-    if not (frames > 0 and count > 0 and np.isfinite(body).all()
-            and np.isfinite([start, rate]).all()):
-        raise InputError(f"{path} has no frames, or has positions that are not finite.",
-                         "It does not describe a motion.", "Write it again.")
+    if not (frames > 0 and count > 0):
+        raise InputError(f"{path} has no frames.", "It does not describe a motion.",
+                         "Write it again.")
+    require_finite(path, {"positions": body, "start and rate": np.array([start, rate])}, "a motion")
     return body.reshape(frames, count, 3), start, rate
 
 

@@ -15,6 +15,7 @@ from limber.core.alignment import Alignment
 from limber.core.errors import BranchFolderError, InputError
 from limber.core.files.reading import read_json
 from limber.core.files.safe_names import relative_name
+from limber.core.json_values import validated
 from limber.core.machine_errors import machine_error
 from limber.version import VERSION
 
@@ -111,7 +112,7 @@ def read_manifest(folder: Path) -> Manifest:
             f"{folder} has format {version}; this Limber ({VERSION}) reads up to {FORMAT_VERSION}.",
             "It was made by a newer Limber.", "Update Limber.")
     try:
-        manifest = Manifest.model_validate(content)
+        manifest = validated(Manifest, content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

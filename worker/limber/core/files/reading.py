@@ -1,8 +1,9 @@
 """Checked reading of files of other programs and of branch folders: JSON, TOML, CSV, arrays.
 
-Such files may be truncated, corrupt or malicious. Therefore numbers must be finite, declared sizes
-are compared with the file's size before memory is allocated, nothing is unpickled, and every fault
-is an :class:`~limber.core.errors.InputError` that names the file.
+Such files may be truncated, corrupt or malicious. Therefore numbers must be finite and at most
+``LARGEST_NUMBER``, declared sizes are compared with the file's size before memory is allocated,
+nothing is unpickled, and every fault is an :class:`~limber.core.errors.InputError` that names the
+file.
 """
 
 import contextlib
@@ -24,6 +25,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import require_no_pipe
+from limber.core.json_values import validated
 
 Content = TypeVar("Content")
 
@@ -32,6 +34,12 @@ LARGEST_EXPANSION = 100.0
 measurements compress tenfold at best.
 """
 HARMLESS_BYTES = 256e6
+LARGEST_NUMBER = 1e18
+"""Largest size of a number in a file. No quantity in SI units comes near it, and squares of it are
+still finite in single precision.
+"""
+_MOST_DIGITS = 40
+"""Of an integer: a seed has up to 39."""
 MOST_TOML_BYTES = 2 << 20
 """Largest hand-written TOML file; its parser takes two seconds per megabyte of tables."""
 MOST_JSON_BYTES = 512 << 20
@@ -73,10 +81,18 @@ def read_json(path: str | os.PathLike, what: str) -> Any:
     """Return the content of a JSON file; all its numbers are finite.
 
     Raises:
-        InputError: it is not JSON, or a number in it is not finite.
+        InputError: it is not JSON, or a number in it is not finite, or beyond ``LARGEST_NUMBER``.
     """
     _require_modest_text(path, MOST_JSON_BYTES, what)
-    text = read_text(path, what)
+    return json_content(read_text(path, what), path, what)
+
+
+def json_content(text: str, path: str | os.PathLike, what: str) -> Any:
+    """Return the content of a JSON text read from ``path``, as :func:`read_json` does.
+
+    Raises:
+        InputError: as :func:`read_json`.
+    """
     try:
         return json.loads(text, parse_constant=_refused, parse_float=_finite, parse_int=_integer)
     except (ValueError, RecursionError) as error:
@@ -97,17 +113,16 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
     """Return content read from ``path`` as ``kind``.
 
     Args:
-        strict: Whether a number must be a number in the file as well, not text or a Boolean. For
-            content that is used unconverted.
+        strict: Whether a number must be a number in the file as well, not a text; a Boolean is
+            never one. For content that is used unconverted.
 
     Raises:
         InputError: it is not of that kind; the message names the position.
     """
-    adapter = TypeAdapter(kind)
     try:
         # Only pydantic's strict JSON mode accepts a list for a tuple.
-        return (adapter.validate_json(json.dumps(content), strict=True) if strict
-                else adapter.validate_python(content))
+        return (TypeAdapter(kind).validate_json(json.dumps(content), strict=True) if strict
+                else validated(kind, content))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"])
@@ -219,7 +234,7 @@ def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
     for name, *values in zip(*rows, strict=False):
         with contextlib.suppress(ValueError):
             numbers = np.array([float(value) for value in values])
-            if np.isfinite(numbers).all():
+            if _are_moderate(numbers):
                 columns[name.strip()] = numbers
     missing = [name for name in needed if not len(columns.get(name, ()))]
     if missing:
@@ -230,24 +245,26 @@ def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
 
 
 def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], what: str) -> None:
-    """Refuse arrays that contain numbers that are not finite.
+    """Refuse arrays that contain numbers that are not finite, or beyond ``LARGEST_NUMBER``.
 
     Raises:
         InputError: there is such an array; the message names it.
     """
     for name, values in arrays.items():
-        if values.dtype.kind in "fc" and not np.isfinite(values).all():
-            raise InputError(f"{path}: {name} has values that are not finite.",
-                             f"{what[0].upper()}{what[1:]} holds numbers.",
+        if not _are_moderate(values):
+            raise InputError(f"{path}: {name} has values that are not finite, or beyond "
+                             f"{LARGEST_NUMBER:g}.", f"{what[0].upper()}{what[1:]} holds numbers.",
                              "It is damaged. Make it again.")
 
 
 def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
-                   shapes: Mapping[str, tuple[int | str, ...]], what: str) -> None:
+                   shapes: Mapping[str, tuple[int | str, ...]], what: str,
+                   flags: Sequence[str] = ()) -> None:
     """Refuse arrays that are missing, not finite numbers, or of another shape.
 
     Args:
         shapes: Name to shape; the same letter means the same length everywhere.
+        flags: Names of the arrays that may hold Booleans.
 
     Raises:
         InputError: an array does not fit; the message names the first.
@@ -255,8 +272,8 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
     lengths: dict[int | str, int] = {}
     for name, shape in shapes.items():
         array = arrays.get(name)
-        fits = array is not None and array.dtype.kind in "iufb" and (
-            array.ndim == len(shape)) and all(
+        fits = array is not None and array.dtype.kind in (
+            "iufb" if name in flags else "iuf") and (array.ndim == len(shape)) and all(
             length == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length))
             for wanted, length in zip(shape, array.shape, strict=True))
         if not fits:
@@ -311,15 +328,21 @@ def _require_modest(expanded: float, size: float) -> None:
         raise ValueError(f"its {size} bytes would expand to {expanded:.3g} bytes")
 
 
+def _are_moderate(values: np.ndarray) -> bool:
+    """Whether all numbers are finite and at most ``LARGEST_NUMBER``."""
+    return values.dtype.kind not in "fc" or bool((np.abs(values) <= LARGEST_NUMBER).all())
+
+
 def _finite(text: str) -> float:
     number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(f"{text} is not a finite number")
+    if not abs(number) <= LARGEST_NUMBER:
+        raise ValueError(f"{text} is not a finite number" if not math.isfinite(number) else
+                         f"{text} is beyond {LARGEST_NUMBER:g}")
     return number
 
 
 def _integer(text: str) -> int:
-    if len(text) > 300:
+    if len(text) > _MOST_DIGITS:
         raise ValueError(f"it contains a number of {len(text)} digits")
     return int(text)
 

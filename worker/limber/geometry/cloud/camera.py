@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml
+from limber.core.json_values import validated
 from limber.core.numerics.rigid import rotation_matrix, rotation_vector
 
 _MOST = 1e6
@@ -137,7 +138,7 @@ def read_camera(path: Path) -> Camera:
     """
     content = read_toml(path, "a file of camera intrinsics (depth images need it)")
     try:
-        return Camera.model_validate(content)
+        return validated(Camera, content)
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}.",

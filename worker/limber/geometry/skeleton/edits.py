@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial import cKDTree
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
+from limber.core.files.reading import read_json
+from limber.core.json_values import validated
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 
 Place = tuple[float, float, float]
@@ -106,8 +108,6 @@ class ConfirmBranch(_Edit):
 
 Edit = Annotated[MoveNode | DeleteBranch | MergeBranch | Bridge | SplitBranch | SetRoot | SetRadius
                  | ConfirmBranch, Field(discriminator="do")]
-EDITS = TypeAdapter(list[Edit])
-"""Reads and writes edits as JSON."""
 
 
 def read_edits(path: Path) -> list[Edit]:
@@ -117,10 +117,7 @@ def read_edits(path: Path) -> list[Edit]:
         InputError: the file cannot be read, is not JSON, or has an invalid edit, which is named.
     """
     try:
-        return EDITS.validate_json(Path(path).read_bytes())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).",
-                         "A JSON file of edits was expected.", "Check the path.") from error
+        return validated(list[Edit], read_json(path, "a JSON file of edits"))
     except ValidationError as error:
         first = error.errors()[0]
         place = first["loc"]

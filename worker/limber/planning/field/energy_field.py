@@ -72,7 +72,6 @@ _OPTIONAL_SHAPES = {
            "gradient_weights": (f"{fit} g", 3, f"{fit} c"),
            "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
 """Shapes of the arrays in a file; equal letters are equal lengths."""
-_LARGEST = 1e60
 """In any unit here: with larger numbers, sums would not be finite."""
 _CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
 
@@ -323,11 +322,7 @@ class EnergyField:
             arrays = read_arrays(path, _WHAT)
             require_shapes(path, arrays, _SHAPES | {
                 name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
-                           _WHAT)
-            for name, values in arrays.items():
-                if "_fit_" in name and values.dtype.kind == "f" and (
-                        np.abs(values) > _LARGEST).any():
-                    raise ValueError(f"{name} contains a number above {_LARGEST:g}")
+                           _WHAT, flags=("reduced",))
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
-from limber.core.json_values import plain
+from limber.core.json_values import plain, validated
 from limber.core.numerics.rigid import inverted, matrices
 from limber.robot.cell.slips import FAR, slips
 from limber.robot.interface import Arm
@@ -320,7 +320,7 @@ def read_cell(path: str | Path) -> Cell:
         if isinstance(entry, dict) and str(entry.get("model", "")).lower().endswith(ENDING):
             entry["model"] = str(path.absolute().parent / entry["model"])
     try:
-        return Cell.model_validate(content)
+        return validated(Cell, content)
     except ValidationError as error:
         told = "; ".join(_told(path, item) for item in error.errors())
         raise InputError(told, "The robot's position or reach would be wrong.",
