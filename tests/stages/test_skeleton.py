@@ -12,6 +12,7 @@ import pytest
 from limber import store
 from limber.cli.main import call
 from limber.core.errors import InputError, MeshingError
+from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import Progress
 from limber.geometry import reconstruction
@@ -152,11 +153,21 @@ def test_one_killed_after_its_skeleton_goes_on_from_there(made, tmp_path, monkey
         other.setattr(store, "program_versions", lambda: before.stages["skeleton"].programs | {
             "numpy": "0"})
         assert load_search(branch, SETTINGS, digests) is None
+    # A damaged one counts as none; where its checksum is right all the same, that is said.
+    search, told = target / "scan_skeleton.npz", []
+    whole = search.read_bytes()
+    search.write_bytes(whole[:-200] + bytes(200))
+    assert load_search(branch, SETTINGS, digests) is None
+    entry = branch.manifest.files[search.name]
+    entry.sha256, entry.bytes = file_digest(search), search.stat().st_size
+    assert load_search(branch, SETTINGS, digests, Progress(on_warning=told.append)) is None
+    assert len(told) == 1 and "searched for again" in told[0]
+    search.write_bytes(whole)
 
-    def search(*_given, **_named):
+    def search_again(*_given, **_named):
         raise AssertionError("the skeleton is sought again")
     with monkeypatch.context() as other:
-        other.setattr(reconstruction, "skeletonise", search)
+        other.setattr(reconstruction, "skeletonise", search_again)
         with pytest.raises(AssertionError):
             reconstruct(scan, target, SETTINGS, force=True)
         again = reconstruct(scan, target, SETTINGS)
@@ -189,6 +200,12 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
     for name, value in (("parent", np.arange(6)), ("node_of_point", np.full(40, 6)),
                         ("told", np.array("{}")), ("nodes", np.full((6, 3), np.nan)),
                         ("nodes", np.zeros((6, 3))), ("radius", np.zeros(6)),
+                        ("radius", np.full(6, 1e-300)), ("radius_sigma", np.full(6, 1e200)),
+                        ("nodes", arrays["nodes"] > 0), ("probability", np.full(6, 1.5)),
+                        ("branch", np.arange(6) + 1), ("branch", np.array([0, 0, 0, 2, 2, 2])),
+                        ("branch", np.array([0, 0, 1, 1, 0, 0])), ("order", np.zeros(6)),
+                        ("branch", np.zeros(6, bool)), ("radius_state", np.full(6, 9)),
+                        ("told", np.array(str(arrays["told"]).replace("0.3333", "1e300"))),
                         ("leaf_points", np.array([40, 3, 7])),
                         ("leaf_points", np.array([40, 3, 7, 45, 0]))):
         np.savez(path, **arrays | {name: value})

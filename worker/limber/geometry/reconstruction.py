@@ -108,7 +108,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         edits: Changes of the user to the skeleton, in the file's coordinates; those that no longer
             fit are skipped and reported.
         eye: Position of the depth camera [m], shape [3], if the scan is its image.
-        known: Result of an earlier run on this scan with these settings that was not used further.
+        known: Result of an earlier run on this scan with these settings that was not used
+            further; where it does not fit the scan, it counts as none.
         keep: Receives the alignment, the skeleton and the result of the search as soon as found,
             before later steps that may fail or refuse it; not called for ``known``.
         progress: Called during the work; receives warnings for the user.
@@ -121,6 +122,10 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                        up=np.array(settings.up, float))
     for text in prepared.warnings:
         progress.warn(text)
+    if known is not None and not known.fits(len(prepared.cloud)):
+        progress.warn("The skeleton that an earlier run stored belongs to another number of "
+                      "points. It is searched for again.")
+        known = None
     found, wood, leaves = (
         _searched(prepared, settings, own, progress.part(0.02, 0.55)) if known is None
         else _found_before(prepared, known, progress))
@@ -181,11 +186,6 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
 
 def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
                   ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
-    cut = sum(len(leaf.points) for leaf in known.leaves)
-    if len(known.result.node_of_point) + cut != len(prepared.cloud):
-        raise InputError(f"The stored skeleton belongs to {len(known.result.residual)} points, but "
-                         f"the scan has {len(prepared.cloud) - cut}.",
-                         "The skeleton belongs to another scan.", "Reconstruct again with --force.")
     wood, leaves = cut_off(prepared, known.leaves)
     progress(0.55, "skeleton of an earlier run")
     return known.result, wood, leaves

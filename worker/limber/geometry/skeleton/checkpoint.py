@@ -10,10 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_arrays, require_shapes
+from limber.core.files.reading import (
+    checked_as,
+    json_content,
+    read_arrays,
+    require_shapes,
+)
 from limber.core.json_values import plain
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.skeleton.contraction.laplacian_contraction import (
@@ -21,7 +26,7 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import (
     ContractionStatus,
 )
 from limber.geometry.skeleton.search_result import SkeletonResult
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import STATES, Skeleton
 
 _WHAT = "a skeleton stored by reconstruct"
 _SKELETON: dict[str, tuple[int | str, ...]] = {
@@ -30,6 +35,8 @@ _SKELETON: dict[str, tuple[int | str, ...]] = {
 _POINTS: dict[str, tuple[int | str, ...]] = {
     "node_of_point": ("m",), "residual": ("m",), "contracted": ("c", 3), "linearity": ("c",),
     "leaf_points": ("l",)}
+_FARTHEST = 1e6
+"""Largest length [m]; a radius is at least one over it."""
 _Place = tuple[float, float, float]
 
 
@@ -44,6 +51,11 @@ class FoundSkeleton:
 
     result: SkeletonResult
     leaves: list[Leaf]
+
+    def fits(self, count: int) -> bool:
+        """Whether it is of a prepared cloud of ``count`` points."""
+        return len(self.result.node_of_point) + sum(
+            len(leaf.points) for leaf in self.leaves) == count
 
     def write(self, path: Path) -> None:
         """Write an NPZ file."""
@@ -73,8 +85,10 @@ class FoundSkeleton:
         if not _is_tree(skeleton.parent) or not _are_below(
                 arrays["node_of_point"], skeleton.node_count):
             raise _damaged(path, "Its nodes do not form a tree.")
-        if not ((skeleton.radius > 0).all() and 0 < skeleton.length < np.inf):
-            raise _damaged(path, "Its axes have no length or no thickness.")
+        if not _are_runs(skeleton):
+            raise _damaged(path, "Its nodes are not on unforked runs.")
+        if not _is_possible(skeleton):
+            raise _damaged(path, "Its axes have an impossible length, thickness or probability.")
         contraction = Contraction(arrays["contracted"], arrays["linearity"], told.iterations,
                                   told.status)
         return cls(SkeletonResult(
@@ -142,11 +156,7 @@ def _told(path: Path, arrays: dict[str, np.ndarray]) -> _Told:
     text = arrays.get("told", np.zeros(0))
     if text.dtype.kind != "U" or text.ndim != 0:
         raise _damaged(path, "The report of the search is missing.")
-    try:
-        return _Told.model_validate_json(str(text))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise _damaged(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
+    return checked_as(path, _Told, json_content(str(text), path, _WHAT), _WHAT, strict=True)
 
 
 def _leaves(path: Path, arrays: dict[str, np.ndarray], told: _Told) -> list[Leaf]:
@@ -164,6 +174,34 @@ def _is_tree(parent: np.ndarray) -> bool:
     """Whether the first node is the root and every other node follows its parent."""
     return (parent.dtype.kind == "i" and len(parent) > 1 and parent[0] == -1
             and bool(((parent[1:] >= 0) & (parent[1:] < np.arange(1, len(parent)))).all()))
+
+
+def _are_runs(skeleton: Skeleton) -> bool:
+    """Whether each run is a chain of nodes, and the first of it is the root or forks off another.
+    """
+    branch, parent = skeleton.branch, skeleton.parent
+    if branch.dtype.kind != "i" or skeleton.order.dtype.kind != "i":
+        return False
+    found, first = np.unique(branch, return_index=True)
+    if not np.array_equal(found, np.arange(len(found))):
+        return False
+    # The node before, in the same run; every node but the first of a run has it as its parent.
+    by_run = np.argsort(branch, kind="stable")
+    before = np.empty(len(branch), np.int64)
+    before[by_run[1:]] = by_run[:-1]
+    before[first] = parent[first]
+    return bool((parent == before).all() and (branch[parent[first[1:]]] != found[1:]).all()
+                and branch[0] == 0 and (branch == 0).sum() > 1 and (skeleton.order >= 0).all())
+
+
+def _is_possible(skeleton: Skeleton) -> bool:
+    """Whether lengths [m], radii [m] with their deviations, and probabilities make sense."""
+    radius, sigma, probability = skeleton.radius, skeleton.radius_sigma, skeleton.probability
+    return bool(((radius >= 1 / _FARTHEST) & (radius <= _FARTHEST)).all()
+                and ((sigma >= 0) & (sigma <= _FARTHEST)).all()
+                and ((probability >= 0) & (probability <= 1)).all()
+                and (np.abs(skeleton.nodes) <= _FARTHEST).all() and skeleton.length > 0
+                and np.isin(skeleton.radius_state, list(STATES.values())).all())
 
 
 def _are_below(index: np.ndarray, count: int) -> bool:

@@ -127,7 +127,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         progress.keeping(warnings).warn(
             "The edits in edits.json were not applied, because a skeleton was given.")
     searched = {name: value for name, value in digests.items() if name != "edits"}
-    known = None if force else load_search(branch, settings, searched)
+    known = None if force else load_search(branch, settings, searched,
+                                           progress.keeping(warnings))
     is_kept = known is not None
 
     def keep(alignment: Alignment, skeleton: Skeleton, found: FoundSkeleton) -> None:
@@ -217,11 +218,10 @@ def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit:
 
 
 def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str, str],
-                ) -> FoundSkeleton | None:
+                progress: Progress = SILENT) -> FoundSkeleton | None:
     """Return the skeleton that an earlier run of this version found in a scan, if no mesh followed.
 
-    Raises:
-        InputError: the file was changed together with its checksum.
+    A file that cannot be used counts as none; ``progress`` receives a warning.
     """
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
     from limber.store import program_versions
@@ -232,7 +232,11 @@ def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str
         return None
     if program_versions().items() - entry.programs.items():
         return None
-    return FoundSkeleton.read(branch.path(SEARCH))
+    try:
+        return FoundSkeleton.read(branch.path(SEARCH))
+    except InputError as error:
+        progress.warn(f"{error.seen} {error.why} The skeleton is searched for again.")
+        return None
 
 
 def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
