@@ -266,6 +266,7 @@ def _wind(_template: Path, path: Path) -> Any:
     from limber.mechanics.loads.gust_response import Swaying, recorded
 
     wind = WindRecord.read(path)
+    wind.even_wind((1.0, 0.0, 0.0))
     return recorded(Swaying(np.ones(1), np.full(1, 0.05), np.ones(1)), wind.times, wind.speeds)
 
 

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from limber.core.errors import InputError
+from limber.mechanics.loads.gust_loads import WindRecord
 from limber.mechanics.loads.gust_response import Swaying, recorded, turbulent, wind_spectrum
 
 LENGTH, SPEED = 27.0, 8.0
@@ -57,3 +59,12 @@ def test_a_slow_gust_pushes_with_the_square_of_its_speed():
     speeds = 5.0 + 1.0 * np.sin(2 * np.pi * times / 100)
     found = recorded(one_mode(20.0, 0.05), times, speeds)
     assert found.factor == pytest.approx(36.0 / np.mean(speeds**2), rel=0.01)
+
+
+@pytest.mark.parametrize(("step", "factor"), [(1e-300, 1.0), (0.1, 1e-200), (0.0, 1.0)])
+def test_what_no_wind_is_makes_no_record(step, factor):
+    """Its steps or its speeds would leave no finite number."""
+    times, speeds = step * np.arange(20), factor * (3.0 + np.cos(np.arange(20)))
+    with pytest.raises(InputError, match="not a wind record"):
+        WindRecord.checked(times, speeds, "this")
+    WindRecord.checked(0.1 * np.arange(20), speeds / factor, "this")

@@ -18,6 +18,8 @@ LEAST_RECORD = 16
 FASTEST = 150.0
 """Winds [m/s] above this indicate a wrong unit."""
 _MOST_STEPS = 2e6
+_LEAST_STEP = 1e-5  # [s]; hot wires take 1e5 readings a second at most
+_CALM = 0.01  # [m/s]
 
 
 @dataclass(frozen=True)
@@ -50,12 +52,13 @@ class WindRecord:
             InputError: as for :meth:`read`.
         """
         if len(times) != len(speeds) or len(times) < LEAST_RECORD or not (
-                np.diff(times) > 0).all() or not speeds.mean() > 0 or (
+                np.diff(times) >= _LEAST_STEP).all() or not speeds.mean() >= _CALM or (
                 not np.abs(speeds).max() < FASTEST):
             raise InputError(
                 f"{what} is not a wind record.", f"A wind record has at least {LEAST_RECORD} "
-                f"rows, ascending times, and a wind below {FASTEST:g} m/s that blows along --wind "
-                "on average.", "Give another record.")
+                f"rows, ascending times at least {_LEAST_STEP:g} s apart, and a wind below "
+                f"{FASTEST:g} m/s that blows along --wind with {_CALM:g} m/s or more on average.",
+                "Give another record.")
         if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
             raise InputError(f"{what} has gaps that are much longer than its time steps.",
                              "The record must have even time steps.",
