@@ -24,6 +24,8 @@ from benchmarks.scan_cases import (
 from benchmarks.scan_plants import crown_case, leafy_case
 from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_part
 from benchmarks.table import Setting
+from benchmarks.worlds.dropped_points import dropped_points
+from benchmarks.worlds.sources import WORLDS
 from limber.core.alignment import Alignment
 from limber.core.errors import LimberError
 from limber.geometry.io.skeletons import read_cylinders
@@ -119,12 +121,13 @@ def _measured(task: tuple[str, int], out: Path | None) -> CaseRun:
 def case_source() -> str:
     """Digest of all that a case's scores depend on."""
     return source_digest(("geometry",), __file__, scan_cases.__file__, scan_plants.__file__,
-                         scan_scores.__file__)
+                         scan_scores.__file__,
+                         *sorted((Path(__file__).parent / "worlds").glob("*.py")))
 
 
 def measured(kind: str, seed: int, out: Path | None) -> CaseRun:
     """One case; its picture is written to ``out``."""
-    case, began, source = KINDS[kind](seed), time.perf_counter(), case_source()
+    case, began, source = (KINDS | WORLDS)[kind](seed), time.perf_counter(), case_source()
     with tempfile.TemporaryDirectory() as folder:
         try:
             scored, found = run_case(case, Path(folder))
@@ -164,6 +167,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
                    0.0)}
     if case.leaf is not None:
         scored["leaf_points_on_stems"] = points_on_axes(case.points[case.leaf], case.truth, found)
+    scored |= dropped_points(case, branch)
     return scored, found
 
 

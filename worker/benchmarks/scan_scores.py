@@ -116,6 +116,7 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "centre_radii": float(in_radii.mean()), "centre_worst_radii": float(in_radii.max()),
         "radius_error": float(np.median(np.abs(error))), "radius_bias": float(np.median(error)),
         "sigma_m": float(np.median(sigma)), "covered": float(covered[on_axis].mean()),
+        **twig_lengths(there, back, truth, here, right, found),
         "measured": float((found.radius_state[here.high] == MEASURED).mean()),
         "forks": len(truth.forks()), "forks_found": hits, "forks_false": int((~true_fork).sum()),
         "root_diameters": float(np.linalg.norm(found.nodes[0] - truth.nodes[0])
@@ -126,6 +127,16 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "told_nodes": _told_nodes(found.probability[here.high], right, found.branch[here.high]),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
         "right": float(right.mean())}
+
+
+def twig_lengths(there: Dense, back: np.ndarray, truth: Skeleton, here: Dense,
+                 right: np.ndarray, found: Skeleton) -> dict[str, float]:
+    """Length of side runs [m]: true, of these found, and of found ones what is false."""
+    twig = truth.branch[there.high] != 0
+    held = back[twig] < np.maximum(there.radius[twig], 0.001)
+    false = (found.branch[here.high] != 0) & ~right
+    return {"twig_m": _STEP * float(twig.sum()), "twig_found_m": _STEP * float(held.sum()),
+            "twig_false_m": _STEP * float(false.sum())}
 
 
 def doubled(found: Skeleton, here: Dense, near: np.ndarray) -> np.ndarray:

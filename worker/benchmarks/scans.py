@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.scan_files import REAL_ROW, SCANS, real_rows, same_tree_asked, same_tree_rows
 from benchmarks.scan_runs import Outcomes, outcomes
 from benchmarks.table import Asked, Part, Row, Setting
+from benchmarks.worlds import rows as worlds
 
 _COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60,
            "crowns": 12, "leafy": 8}
@@ -214,6 +215,7 @@ LEAFY = " of leafy plants"
 PARTS = {
     "one-sided": _part("one-sided", partial(_view_rows, view=ONE_SIDED), ONE_SIDED.rows),
     "round": _part("round", partial(_view_rows, view=ROUND), ROUND.rows),
+    **worlds.PARTS,
     "real": Part(real_rows, 60, (REAL_ROW,), grows=True),
     "gaps": _part("gaps", gap_rows, (GAP_ROW,)),
     "2-mm": _part("2-mm", partial(_noise_rows, kind="2 mm"), noise_asked("2 mm")),
@@ -226,7 +228,9 @@ PARTS = {
     "probabilities": Part(partial(_told, kinds=tuple(_COUNTS), rows=_probabilities), 30, (
         *probability_asked(""), *probability_asked(LEAFY)), grows=True),
     "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
-"""The table, in order of importance; ``--only`` also accepts one scan of the same tree's row."""
+"""The table, in order of importance; ``--only`` also accepts one source of the worlds, and one scan
+of the same tree's row.
+"""
 PARTS |= {f"same-tree:{name}": Part(
     partial(same_tree_rows, only=name), 60, (same_tree_asked(name),), grows=True, alone=True)
     for name in (Path(file).stem for file in SCANS)}

@@ -1,0 +1,75 @@
+"""Cases of all worlds by name: a plant, dressed, seen by a sensor; each draws all of its seed.
+
+No constant of the program was set on any of them. Once one is, its source leaves ``LEFT_OUT``.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from benchmarks.scan_cases import ScanCase
+from benchmarks.worlds import scenes
+from benchmarks.worlds.allometry import dichotomous, opposite, weber_penn
+from benchmarks.worlds.colonisation import colonised
+from benchmarks.worlds.l_systems import monopodial, sympodial
+from benchmarks.worlds.plant import Plant
+from benchmarks.worlds.scenes import Scene
+from benchmarks.worlds.sensors import ALL_AROUND, ONE_SIDED, Seen
+
+SOURCES: dict[str, Callable[[np.random.Generator], Plant]] = {
+    "colonisation": colonised, "monopodial": monopodial, "sympodial": sympodial,
+    "opposite": opposite, "dichotomous": dichotomous, "weber-penn": weber_penn}
+LEFT_OUT = frozenset(SOURCES)
+"""Sources that no constant was set on."""
+_STREAM = 35  # separates these draws from those of other cases of a seed
+BARE_VIEWS = ("one-sided", "round")
+
+
+def bare_case(seed: int, source: str, view: str) -> ScanCase:
+    """A bare plant from one side, noise 1 or 2 mm, or from all around, 0.5 to 1 mm."""
+    rng = _generator(seed, source, view)
+    plant = SOURCES[source](rng)
+    one_sided = view == "one-sided"
+    sensor = rng.choice(ONE_SIDED if one_sided else ALL_AROUND)
+    noise = (0.001, 0.002)[seed % 2] if one_sided else rng.uniform(0.0005, 0.001)
+    return _case(f"{source}_{view}_{seed}", seed, plant,
+                 sensor(Scene.bare(plant), rng, noise), {"leave_out": True})
+
+
+def leafy_case(seed: int, source: str) -> ScanCase:
+    """A plant in leaf from all around; its user asks to cut leaves."""
+    rng = _generator(seed, source, "leafy")
+    plant = SOURCES[source](rng)
+    seen = rng.choice(ALL_AROUND)(scenes.leafy(plant, rng), rng, 0.0005)
+    return _case(f"{source}_leafy_{seed}", seed, plant, seen,
+                 {"leave_out": True, "leaves": "cut"}, seen.label == scenes.LEAF)
+
+
+def potted_case(seed: int, source: str) -> ScanCase:
+    """A plant in a pot, tied to a stake."""
+    rng = _generator(seed, source, "potted")
+    plant = SOURCES[source](rng)
+    seen = rng.choice(ALL_AROUND)(scenes.potted(plant, rng), rng, 0.0005)
+    return _case(f"{source}_potted_{seed}", seed, plant, seen, {"leave_out": True},
+                 seen.label == scenes.SUPPORT)
+
+
+def _generator(seed: int, *words: str) -> np.random.Generator:
+    return np.random.default_rng([seed, _STREAM, *"".join(words).encode()])
+
+
+def _case(name: str, seed: int, plant: Plant, seen: Seen, settings: dict,
+          not_wood: np.ndarray | None = None) -> ScanCase:
+    skeleton = plant.skeleton
+    up = tuple((seen.turn @ [0.0, 0.0, 1.0]).tolist())
+    return ScanCase(name, seed, skeleton.moved(seen.placed(skeleton.nodes)), seen.points,
+                    plant.volume(), settings | {"up": up}, not_wood)
+
+
+WORLDS: dict[str, Callable[[int], ScanCase]] = {
+    **{f"{source}:{view}": partial(bare_case, source=source, view=view)
+       for view in BARE_VIEWS for source in SOURCES},
+    **{f"{source}:leafy": partial(leafy_case, source=source) for source in SOURCES},
+    **{f"{source}:potted": partial(potted_case, source=source) for source in SOURCES}}
+"""Cases by source and view, from a seed."""
