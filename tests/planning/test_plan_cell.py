@@ -12,7 +12,7 @@ from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import blocked_by, clearance_in, places_in
+from limber.stages.paths.plan_cell import KeptClear, blocked_by, clearance_in, places_in
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
@@ -150,6 +150,20 @@ def test_the_clearance_is_what_the_base_leaves_uncertain():
     assert blocked_by(cell, (post,))(flange, joints) is None
     refused = blocked_by(cell, (post,), 0.25)(flange, joints)
     assert "from a post, nearer than the clearance of 250.0 mm" in refused.seen
+
+
+def test_an_executed_branch_keeps_the_plans_clearance():
+    """Not nearer than planned, but for what a clamped piece moves; never inside; and it is stated.
+    """
+    post = Box("a post", np.full(3, 0.01), np.zeros(3), np.eye(3))
+    clear = KeptClear((post,), 0.02)
+    clear.require(np.zeros(3), np.array([[0.05, 0.0, 0.0], [0.0295, 0.0, 0.0]]))
+    assert clear.describe() == {"clearance_m": 0.02, "branch_clearance_m": pytest.approx(0.0195)}
+    with pytest.raises(NoPathError, match=r"15.0 mm from a post, .* clearance of 20.0 mm"):
+        clear.require(np.zeros(3), np.array([[0.025, 0.0, 0.0]]))
+    with pytest.raises(NoPathError, match=r"5.0 mm inside a post"):
+        KeptClear((post,), 0.0).require(np.zeros(3), np.array([[0.005, 0.0, 0.0]]))
+    assert KeptClear((), 0.0).describe()["branch_clearance_m"] is None
 
 
 def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):

@@ -219,6 +219,29 @@ def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder
                 ExecuteOptions())
 
 
+def test_the_planned_clearance_is_kept_when_executed(planned_folder, tmp_path, monkeypatch):
+    """Gripper and arm keep what the plan states, not just the obstacle's surface."""
+    from limber.stages.paths import execute as stage
+
+    monkeypatch.setattr(stage, "_predicted", lambda *_: pytest.fail("forces were solved"))
+    monkeypatch.setattr("limber.robot.motion.execution._TURNS", 2)
+    branch = Branch.open(planned_folder)
+    cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)
+    place = load_skeleton(branch).point_at(FRACTION) + [0.0, 0.0, 0.08]
+    finger = {"start_m": (0, 0, 0), "end_m": (0, 0, 0.01), "radius_m": 0.01}
+    box = {"kind": "box", "name": "shelf", "size_m": (0.2, 0.2, 0.01), "pose": (
+        *map(float, place), 0, 0, 0)}
+    near = cell_file(Cell.model_validate(cell.model_dump() | {
+        "tool": cell.tool.model_dump() | {"parts": [finger]}, "obstacles": [box]}), tmp_path)
+    stated = {"clearance_m": 0.2}
+    monkeypatch.setattr(stage, "_told", lambda *_: stated)
+    with pytest.raises(NoPathError, match=r"from shelf, nearer than the clearance of 200.0 mm"):
+        execute(planned_folder, "path", near, ExecuteSettings(), ExecuteOptions())
+    stated["clearance_m"] = 0.0
+    with pytest.raises(pytest.fail.Exception, match="forces were solved"):
+        execute(planned_folder, "path", near, ExecuteSettings(), ExecuteOptions())
+
+
 @pytest.mark.slow
 def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):
     branch = Branch.open(planned_folder)

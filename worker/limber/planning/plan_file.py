@@ -175,6 +175,7 @@ class PlanSummary(_Told):
     detour: PlanDetour | None = None
     paths_on_field: dict[str, Any] | None = None
     limits: dict[str, dict[str, float]] | None = None
+    clearance_m: float | None = Field(None, ge=0)
     targets: list[str] = []
     energy_saved_percent: float | None = None
     length_added_percent: float | None = None

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from limber.robot.motion.execution import RobotMotion
     from limber.robot.motion.expected_wrench import Predicted
     from limber.robot.motion.trajectory import Trajectory
+    from limber.stages.paths.plan_cell import KeptClear
 
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
 # a branch by 3 micrometres
@@ -124,25 +125,26 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
         require_payload(cell)
     from limber.robot.motion.execution import robot_motion
     from limber.robot.motion.expected_wrench import Predicted
-    from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
+    from limber.stages.paths.plan_cell import KeptClear, blocked_by
     from limber.store.loading import load_grasp_model
 
     progress(0.02, "inverse kinematics")
     model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
+    clear = KeptClear.of(cell, Path(cell_file).parent, model, told.get("clearance_m"))
     # The plan's own rotation of the gripper is the one checked against obstacles.
     rotation = settings.gripper_rotation or (told.get("robot") or {}).get("gripper_rotation")
     asked = {"speed": settings.speed, "rotation": rotation,
-             "blocked": blocked_by(cell, cell_obstacles(cell, Path(cell_file).parent))}
+             "blocked": blocked_by(cell, clear.obstacles, clear.clearance)}
     planned = _planned(branch, name, model.rest_position)
     if np.isfinite(planned).all():
         # With the plan's own poses: whether the arm reaches them is known at once, forces are not.
         at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
         robot_motion(cell, at_once, model.reach.axis, **asked)
     progress(0.05, "forces along the path")
-    predicted = _predicted(branch, model, planned[:, :3], progress)
+    predicted = _predicted(branch, model, planned[:, :3], clear, progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
-    result = _summary(cell, motion)
+    result = _summary(cell, motion) | clear.describe()
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
     return branch, cell, settings, motion, result
 
@@ -166,12 +168,16 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
 
 
 def _told(branch: Branch, name: str) -> dict[str, Any]:
-    """The robot and the check in motion that a plan's file states, if in this program's format."""
+    """The robot, the clearance and the check in motion that a plan's file states, if in this
+    program's format.
+    """
     from limber.planning.plan_file import read_plan_summary
 
     file = f"plans/{name}.json"
     found = read_plan_summary(branch.path(file)) if branch.has(file) else {}
-    return {key: found[key] for key in ("robot", "in_motion") if isinstance(found.get(key), dict)}
+    told = {key: found[key] for key in ("robot", "in_motion") if isinstance(found.get(key), dict)}
+    clearance = found.get("clearance_m")
+    return told if clearance is None else told | {"clearance_m": clearance}
 
 
 def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSettings, cell: Cell,
@@ -191,13 +197,16 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
             cell.model_copy(update={"limits": limits}))
 
 
-def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progress: Progress,
-               ) -> Predicted:
+def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, clear: KeptClear,
+               progress: Progress) -> Predicted:
     """Prediction of the model from rest to the path's end, through ``positions`` [n, 3].
 
     The grasp passes the plan's positions, rotated as the branch itself would rotate. Steps are
     small enough that straight lines between positions stretch nothing. The wrench is that of the
     branch clamped in this way.
+
+    Raises:
+        NoPathError: the branch comes nearer to an obstacle than ``clear`` allows.
     """
     from limber.mechanics import Grasp, follow_poses
     from limber.mechanics.sensitivities import grasp_slopes
@@ -229,6 +238,7 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
                                             "there.",
                             "Plan a gentler path.")
         held = result.displacement
+        clear.require(pose[:3], model.mesh.nodes + held)
         poses.append(pose)
         wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
         stiffness.append(grasp_slopes(firm, clamped, held).wrench)

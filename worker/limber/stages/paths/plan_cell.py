@@ -1,5 +1,6 @@
 """Requirements of a robot's cell on a plan: workspace, obstacles, and the arm's reach."""
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from limber.core.progress import Progress
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
+from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import CellPlace
 from limber.planning.goals.regions import Ball
@@ -34,6 +36,7 @@ _BETWEEN = 0.006  # [m] by which parts are thicker for what lies between both
 _SIGHT_SPACING = 0.005  # [m] of points on a line of sight
 _DEVIATIONS = 2.0  # of where the robot holds the branch, that a clearance covers
 _AT_REST = 0.9  # of the branch's clearance at rest, that is kept at most where none was asked for
+_CLAMPED = 0.001  # [m] by which a piece that is clamped, not only held, moves the branch at most
 _LARGE = 20.0  # [m] an obstacle that is larger is in another unit
 
 
@@ -159,6 +162,56 @@ def clearance_in(cell: Cell, asked: float | None, obstacles: tuple[Obstacle, ...
                                   cell.robot.pose_sigma_m]))
     own = min(float(body.clearance(nodes).min()) for body in obstacles)
     return max(min(_DEVIATIONS * sigma, _AT_REST * own), 0.0)
+
+
+@dataclass
+class KeptClear:
+    """Check of the clearance that a plan was made with, when it is executed.
+
+    Attributes:
+        obstacles: Obstacles of the cell, branch frame.
+        clearance: Distance that branch, gripper and arm keep from them [m].
+        least: Least distance of the branch so far [m]; infinite without obstacles.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    clearance: float
+    least: float = np.inf
+
+    @classmethod
+    def of(cls, cell: Cell, folder: Path, grasp_model: GraspModel, planned: float | None,
+           ) -> "KeptClear":
+        """Return the check with the clearance ``planned`` [m]; None: the one of a plan of today.
+        """
+        obstacles = cell_obstacles(cell, folder)
+        nodes = grasp_model.mesh.nodes + grasp_model.rest.displacement
+        return cls(obstacles, clearance_in(cell, planned, obstacles, grasp_model.rest_position,
+                                           nodes))
+
+    def require(self, grasp: np.ndarray, nodes: np.ndarray) -> None:
+        """Check the branch with its grasp at ``grasp`` [3] and its nodes at ``nodes`` [n, 3].
+
+        Raises:
+            NoPathError: it is nearer to an obstacle than the plan allows.
+        """
+        for obstacle in self.obstacles:
+            away = float(obstacle.clearance(nodes).min())
+            self.least = min(self.least, away)
+            if away > max(self.clearance - _CLAMPED, 0.0):
+                continue
+            place = ", ".join(f"{x:.3f}" for x in grasp)
+            raise NoPathError(
+                f"With the grasp at ({place}) m the branch would be "
+                + (f"{1e3 * away:.1f} mm from {obstacle.name}, nearer than the plan's clearance "
+                   f"of {1e3 * self.clearance:.1f} mm." if away > 0.0 else
+                   f"{-1e3 * away:.1f} mm inside {obstacle.name}."),
+                "The obstacle, the branch or its Young's modulus has changed since the plan was "
+                "made.", "Plan again with this cell.")
+
+    def describe(self) -> dict[str, Any]:
+        """Return the clearance, and the least distance of the branch, as plain data."""
+        return {"clearance_m": self.clearance,
+                "branch_clearance_m": self.least if np.isfinite(self.least) else None}
 
 
 def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clearance: float = 0.0,
