@@ -36,7 +36,7 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     is_over = bool(strength.get("over")) or stress_share > 1.0
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
-                 f"Proven: at most {gap:.1f} % above the minimum",
+                 f"Proven on the field: at most {gap:.1f} % above the minimum",
                  icon="QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
     if strength.get("over"):
         layout.label(text=f"Strain {strength['peak_strain'] / strength['median_strain']:.1f} x "

@@ -231,7 +231,7 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
         assert f"{result[key]['energy_sum_nmm']:.3g}" in texts
         assert f"{1e3 * result[key]['length_m']:.3g}" in texts
     gap = result["certificate"]["gap_percent"]
-    assert f"Proven: at most {gap:.1f} % above the minimum" in texts
+    assert f"Proven on the field: at most {gap:.1f} % above the minimum" in texts
     estimated = json.loads((EXAMPLE / "estimate.json").read_text())
     low, high = estimated["young_interval_pa"][0]
     for value in (low, high):

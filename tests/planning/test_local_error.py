@@ -14,9 +14,13 @@ from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.local_error import LocalError
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.regions import Ball
+from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
 from limber.planning.plan_file import read_plan
 from limber.planning.planners.easiest import EasiestWay
+
+AT_REST = GraspGoal((0.0, 0.0, 0.0), 0.01)
 
 
 def noisy(count, seed):
@@ -95,21 +99,43 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     none = NoWayError("No path exists.", "Proven on a grid.", "").behind(places)
     low, high = Limits(force=0.3 * forces.min()), Limits(force=3.0 * forces.max())
     monkeypatch.setattr(Limits, "errors", lambda self, known: {})
-    check = checked_wall(field, small_model, low, none, workers=1)
+    check = checked_wall(field, small_model, low, none, AT_REST, workers=1)
     assert check.bears_out and check.learnt is None and check.solved == 2
     assert "2 states of the full model, where the way is closed, confirm it" in str(
         confirmed(none, check))
-    refuted = checked_wall(field, small_model, high, none, workers=1)
+    refuted = checked_wall(field, small_model, high, none, AT_REST, workers=1)
     assert not refuted.bears_out and len(refuted.learnt.poses) == 2
     again = small_model.follow(refuted.learnt.poses[:1, :3], small_model.rest.displacement)[0]
     assert np.allclose(again.reaction_force, refuted.learnt.forces[0], atol=1e-3 * forces.max())
     wrong = LocalError(np.zeros((1, 3)), np.zeros(1), 1.0, 0.0, -1.0)  # the field says too much
     monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
-    assert checked_wall(field, small_model, low, none, workers=1).learnt is not None
-    assert checked_wall(field, small_model, low, NoWayError("No."), workers=1).bears_out
+    assert checked_wall(field, small_model, low, none, AT_REST, workers=1).learnt is not None
+    assert checked_wall(field, small_model, low, NoWayError("No."), AT_REST, workers=1).bears_out
     monkeypatch.setattr(closed_passages, "solve_branch", lambda *_, **__: ([None], []))
-    unsolved = checked_wall(field, small_model, low, none, workers=1)
+    unsolved = checked_wall(field, small_model, low, none, AT_REST, workers=1)
     assert not unsolved.bears_out and unsolved.learnt is None
+
+
+def test_a_target_out_of_reach_is_confirmed_by_the_full_model(apart, small_model, monkeypatch):
+    """States near the goal confirm that the target stays outside it; one in it, or nearer than the
+    field's error allows, refutes that. A state over a limit refutes nothing."""
+    field, places, forces = apart
+    monkeypatch.setattr(closed_passages, "_STATES", 2)
+    none = NoWayError("No path exists.", "Proven on a grid.", "").behind(
+        np.empty((0, 3)), places[:1])
+    tip = field.tip(places[:1])[0]
+    off = float(field.place_errors(None, places[:1])[0])
+    away = TargetGoal(Ball(tuple(tip + [0.0, 0.0, 0.02 + 3.0 * off]), 0.01))
+    check = checked_wall(field, small_model, Limits(), none, away, workers=1)
+    assert check.bears_out and check.solved == 1
+    inside = TargetGoal(Ball(tuple(tip), 0.01 + 3.0 * off))
+    refuted = checked_wall(field, small_model, Limits(), none, inside, workers=1)
+    assert not refuted.bears_out and len(refuted.learnt.poses) == 1
+    low = Limits(force=0.3 * forces.min())
+    assert checked_wall(field, small_model, low, none, inside, workers=1).bears_out
+    monkeypatch.setattr(TargetGoal, "uncertainty", lambda self, field, points: np.full(
+        len(points), -1.0))
+    assert not checked_wall(field, small_model, Limits(), none, away, workers=1).bears_out
 
 
 def test_a_proof_that_is_not_borne_out_is_none():

@@ -2,9 +2,10 @@
 
 The proof is about the field including its error, and that error was measured at other positions. So
 before the proof is passed on, the branch is solved where cells block the path: at those least over
-a limit, along the border of the region reached from the start. If the full model keeps the limits
-there, or differs from the field by more than its error, the proof does not hold, and the states
-found become samples.
+a limit, along the border of the region reached from the start, and, for a goal of a target, where
+that region comes nearest to it. If the full model keeps the limits or meets the goal there, or
+differs from the field by more than its error, the proof does not hold, and the states found become
+samples.
 """
 
 from dataclasses import dataclass, replace
@@ -17,8 +18,10 @@ from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.limited_quantities import limited
 from limber.planning.field.sampling import solve_branch
-from limber.planning.field.solved import samples_of
+from limber.planning.field.solved import Solved, samples_of
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.goals.goal import Goal
+from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.path_problem import UNPROVEN, NoWayError
 from limber.planning.planners.easiest import EasiestWay
 
@@ -33,8 +36,8 @@ class WallCheck:
 
     Attributes:
         solved: How many states have a solution.
-        bears_out: Whether these states confirm the proof; also true if no limit blocks the path,
-            but the border of the sampled region does.
+        bears_out: Whether these states confirm the proof; also true if neither a limit nor a
+            target's position blocks the path, but the border of the sampled region does.
         learnt: The states as samples, if they do not confirm the proof.
     """
 
@@ -43,14 +46,16 @@ class WallCheck:
     learnt: GraspSamples | None = None
 
 
-def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: NoWayError, *,
-                 workers: int | None = None, progress: Progress = SILENT) -> WallCheck:
+def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: NoWayError,
+                 goal: Goal, *, workers: int | None = None, progress: Progress = SILENT,
+                 ) -> WallCheck:
     """Solve the branch where ``none`` states that the path is blocked.
 
     A pose without a solution is closed as well: the branch cannot be there. Without any solution
     nothing is confirmed.
     """
-    places = _chosen(none.wall)
+    wall = _chosen(none.wall)
+    places = np.concatenate([wall, _chosen(none.nearest)])
     if not len(places):
         return WallCheck(0, True)
     with SolverPool(grasp_model, workers) as solvers:
@@ -61,7 +66,10 @@ def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, no
     samples = samples_of(states, np.empty((0, 3)))
     nodes = grasp_model.mesh.nodes + np.array([one.displacement for one in states])
     samples = replace(samples, added=limits.values(samples.positions, nodes))
-    if not _contradicts(field, limits, samples).any():
+    is_wall = np.array([one.target < len(wall) for one in states])
+    over, off = _over_and_off(field, limits, samples)
+    meets = np.array([_meets(field, goal, one) for one in states])
+    if not np.where(is_wall, ~over | off, ~over & meets).any():
         return WallCheck(len(states), True)
     away = np.linalg.norm(samples.positions[:, None] - field.samples.positions[None], axis=2)
     new = np.flatnonzero(away.min(axis=1) > _LEARNT_APART)
@@ -86,8 +94,23 @@ def _chosen(wall: np.ndarray) -> np.ndarray:
     return np.reshape(chosen, (-1, 3))
 
 
-def _contradicts(field: EnergyField, limits: Limits, samples: GraspSamples) -> np.ndarray:
-    """Return which states [n] keep all limits, or are farther below the field than its error."""
+def _meets(field: EnergyField, goal: Goal, one: Solved) -> bool:
+    """Return whether a state is in the goal, or nearer to it than the field's error allows."""
+    place = one.pose[None, :3]
+    missed = goal.missed_by(SolvedPoses(
+        one.pose[None], np.array([one.energy]), one.force[None], one.torque[None],
+        np.array([one.strain]), one.strain_place[None], np.array([one.stress]),
+        np.array([one.min_det_f]), one.tip[None], one.targets[None],
+        np.array([one.axial_force]), one.displacement[None]))
+    by_field = float(goal.distance(field, place)[0]) - goal.tolerance
+    return missed <= 0.0 or missed < by_field - float(goal.uncertainty(field, place)[0])
+
+
+def _over_and_off(field: EnergyField, limits: Limits, samples: GraspSamples,
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Return which states break a limit, and which are farther below the field than its error,
+    bool [n] each.
+    """
     sizes, points = sampled_sizes(samples), samples.positions
     errors, asked = limits.errors(field), limits.asked()
     places = field.region.chart.plain.map(points)
@@ -99,7 +122,7 @@ def _contradicts(field: EnergyField, limits: Limits, samples: GraspSamples) -> n
         over |= np.abs(size) > asked[one.name]
         if one.name in errors:
             off |= one.size(points) - np.abs(size) > errors[one.name].at(places)
-    return ~over | off
+    return over, off
 
 
 def confirmed(none: NoWayError, check: WallCheck) -> NoWayError:

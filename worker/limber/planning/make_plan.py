@@ -201,7 +201,7 @@ class _Rounds:
         """
         if none.is_proven:
             ahead(0.0, "checking on the full model where the way is closed")
-            check = checked_wall(self.field, self.grasp_model, self.limits, none,
+            check = checked_wall(self.field, self.grasp_model, self.limits, none, self.goal,
                                  workers=self.workers, progress=ahead)
             if check.learnt is not None and not is_last:
                 self.progress.warn(

@@ -23,19 +23,22 @@ class NoWayError(NoPathError):
     """No path from the start to the goal keeps the limits on the field: proven, or none found.
 
     ``wall`` are grasp positions where limits block the path, those least over them first [m], shape
-    [k, 3].
+    [k, 3]; ``nearest`` positions that are reached, those nearest to the goal first, if the field
+    does not know the target's position exactly.
     """
 
     wall: np.ndarray = np.empty((0, 3))
+    nearest: np.ndarray = np.empty((0, 3))
 
     @property
     def is_proven(self) -> bool:
         """Whether the field, including its error, allows no path."""
         return UNPROVEN not in self.seen
 
-    def behind(self, wall: np.ndarray) -> "NoWayError":
+    def behind(self, wall: np.ndarray, nearest: np.ndarray | None = None) -> "NoWayError":
         """Return the error with the positions where the path is blocked."""
         self.wall = wall
+        self.nearest = self.nearest if nearest is None else nearest
         return self
 
 

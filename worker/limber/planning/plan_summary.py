@@ -71,7 +71,7 @@ def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMe
         np.abs(field.missed[:, 0]).max())
     cost = found.energy_integral_jm if detour else (
         weights.energy * found.energy_integral_jm + weights.length * found.length_m)
-    if not np.isfinite(error) or goal.uncertainty(field) > 0.0:
+    if not np.isfinite(error) or goal.uncertainty(field, pair.plan.points[-1:])[0] > 0.0:
         return {"field_error_j": error if np.isfinite(error) else None, "lower_bound": None,
                 "cost": cost, "gap_percent": None}
     lower = pair.certificate.lower - error * detour.longest if detour else (

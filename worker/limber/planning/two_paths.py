@@ -131,7 +131,7 @@ def _check_any_way(field: EnergyField, start: np.ndarray, goal: Goal, limits: Li
         goal_points(goal, field, problem.limits)
     except GoalOverLimitsError as nobody:
         raise NoWayError(nobody.seen, f"{nobody.why} {none.why}", nobody.fix).behind(
-            none.wall) from nobody
+            none.wall, none.nearest) from nobody
     raise none
 
 
@@ -202,7 +202,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         if nobody is None or UNPROVEN in error.seen:
             raise
         raise NoWayError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix).behind(
-            error.wall) from error
+            error.wall, error.nearest) from error
     if detour is not None:
         weighed = replace(weighed, distance=detour.weight * weighed.distance)
         problem = replace(problem, weights=weighed.weights)

@@ -85,14 +85,15 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
 
 
 def certificate_sentence(plan: Mapping[str, Any]) -> str:
-    """Return how far a plan's cost can be above the optimum, as far as proven."""
+    """Return how far a plan's cost can be above the optimum, and what is proven of it."""
     certificate = plan.get("certificate") or {}
-    gaps = [(certificate.get("gap_percent"), "on the energy field"),
-            ((certificate.get("full_model") or {}).get("gap_percent"), "on the full model")]
+    gaps = [(certificate.get("gap_percent"), "on the energy field (proven)"),
+            ((certificate.get("full_model") or {}).get("gap_percent"),
+             "on the full model, by the field's error at 95 % of the samples,")]
     known = [f"{gap:.1f} % {where}" for gap, where in gaps if gap is not None]
     if not known:
         return "No bound on its cost is proven."
-    return f"Proven: its cost is at most {' and '.join(known)} above the least possible."
+    return f"Its cost is at most {' and '.join(known)} above the least possible."
 
 
 def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:

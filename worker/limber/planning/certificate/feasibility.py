@@ -33,6 +33,8 @@ _EVEN = 26  # each way where there is no shell
 _MOST_CELLS = 100_000  # that are asked at once
 _DOUBTED = 0.5  # of the axis with the most doubt, from which on another is cut with it
 _FINE = 0.001  # [m] between points of a way
+_MOST_NEAREST = 500  # of the reached cells, those nearest to the goal
+_NOWHERE = np.empty((0, 3))
 _WIDE = 1 << 20  # more cells than there are along any axis
 _CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 _STENCIL = np.unique(np.concatenate([_CORNERS + side * step for step in np.eye(3, dtype=int)
@@ -132,14 +134,16 @@ class _Cells:
 class Verdict:
     """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
     there is no path; a ``way`` [k, 3] through cells that keep all limits at their corners, if any;
-    and the ``wall`` [k, 3], middles of the cells that block the path, those least over a limit
-    first.
+    the ``wall`` [k, 3], middles of the cells that block the path, those least over a limit first;
+    and, where the field does not know the target's position exactly, ``nearest`` [k, 3]: middles of
+    reached cells, those that come nearest to the goal first.
     """
 
     edges: np.ndarray
     proven: bool = False
     way: np.ndarray | None = None
     wall: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    nearest: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
 
 def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
@@ -148,15 +152,15 @@ def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
     """
     most = most_cells or _MOST_CELLS
     exact = replace(problem, beyond=problem.limits, errors={})
-    on_field = _judged(exact, 0.0, most)
+    on_field = _judged(exact, most, is_exact=True)
     if not on_field.proven:
         return on_field
-    return _judged(problem, problem.goal.uncertainty(problem.energy_field), most)
+    return _judged(problem, most)
 
 
-def _judged(problem: GentleProblem, goal_uncertainty: float, most_cells: int) -> Verdict:
-    """Cut cells until they prove that no path keeps the sure limits and comes as near as
-    ``goal_uncertainty`` [m] to the goal, or contain a path, or become too many.
+def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> Verdict:
+    """Cut cells until they prove that no path keeps the sure limits and comes as near to the goal
+    as the field's error there, which is 0 if ``is_exact``; or contain a path, or become too many.
     """
     cells, wall = _first(problem), _Wall(problem)
     while True:
@@ -166,15 +170,20 @@ def _judged(problem: GentleProblem, goal_uncertainty: float, most_cells: int) ->
         begin = cells.holding(problem.start)
         away = problem.goal.distance(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
-        tolerance = problem.goal.tolerance
-        ends = ~over & (least <= tolerance + goal_uncertainty)
+        tolerance, off = problem.goal.tolerance, np.zeros(len(positions))
+        if not is_exact:
+            off = problem.goal.uncertainty(problem.energy_field, positions)
+        short = least - off[nodes].max(axis=1) - tolerance
+        ends = ~over & (short <= 0.0)
         kept = allowed_points(positions, problem.limits)[nodes]
         open_cells = np.flatnonzero(~over | begin)
         wall.add(cells.take(np.flatnonzero(over & ~begin)))
         cells, begin, ends = cells.take(open_cells), begin[open_cells], ends[open_cells]
         prestress = cells.prestress(begin) if begin.any() else begin
         if not (prestress & ends).any():
-            return Verdict(cells.edges, proven=True, wall=wall.about(cells.take(prestress)))
+            reached = cells.take(prestress)
+            return Verdict(cells.edges, proven=True, wall=wall.about(reached), nearest=_nearest(
+                reached, short[open_cells][prestress]) if off.any() else _NOWHERE)
         free = kept[open_cells][:, _AT].all(axis=1)
         reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
         inner = cells.take(free)
@@ -193,6 +202,11 @@ def _judged(problem: GentleProblem, goal_uncertainty: float, most_cells: int) ->
         if prestress.sum() * parts.prod() > most_cells:
             return Verdict(cells.edges)
         cells = cells.take(prestress).cut(parts)
+
+
+def _nearest(cells: _Cells, short: np.ndarray) -> np.ndarray:
+    """Return the middles [k, 3] of the cells that are least ``short`` of the goal [n], in order."""
+    return cells.middles()[1][np.argsort(short, kind="stable")[:_MOST_NEAREST]]
 
 
 class _Wall:

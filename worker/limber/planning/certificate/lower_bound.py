@@ -232,7 +232,8 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
     goal = about_goal(problem, grid, ground)
     if not goal.meets:
-        if problem.goal.uncertainty(problem.energy_field) > 0.0:
+        centres = grid.points(np.argwhere(open_cells) + 0.5)
+        if (problem.goal.uncertainty(problem.energy_field, centres) > 0.0).any():
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
                             "of reach, but by less than the error of the energy field.")
         wall = over & scipy.ndimage.binary_dilation(open_cells, _NEAR)

@@ -20,7 +20,7 @@ from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
-from limber.planning.field.local_error import Slack, slack_at, slack_of
+from limber.planning.field.local_error import LocalError, Slack, slack_at, slack_of
 from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.field.trust import TrustRegion, trusted_at
 
@@ -247,6 +247,17 @@ class EnergyField:
         off = self.misplaced[~self.region.is_face(), 0 if target is None else 1 + target]
         return float(np.max(off, where=np.isfinite(off), initial=0.0)) if (
             np.isfinite(off).any()) else np.inf
+
+    def place_errors(self, target: int | None, points: np.ndarray) -> np.ndarray:
+        """Return the possible error of the tip's position, or a target's, with the grasp at
+        ``points`` [n, 3]: no left-out sample exceeded it, nowhere more than :meth:`place_error`
+        [m], shape [n].
+        """
+        inner, chart = ~self.region.is_face(), self.region.chart.plain
+        error = LocalError.of(chart.map(self.samples.positions)[inner],
+                              self.misplaced[inner, 0 if target is None else 1 + target], 1.0,
+                              self.place_error(target))
+        return error.at(chart.map(_rows(points)))
 
     def tip_gradient(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
         """Return d tip_c / d x_k, shape [n, 3 (k), 3 (c)]."""

@@ -53,9 +53,11 @@ class CellGoal(TargetGoal):
         nearer = nearest_of(points, self.taken)[0] - nearest_of(points, self.refused)[0]
         return np.maximum(within, self.tolerance + 0.5 * nearer)
 
-    def uncertainty(self, field: EnergyField) -> float:
+    def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         # Between invalid poses there may be a valid one: then nothing is proven.
-        return np.inf if len(self.refused) else super().uncertainty(field)
+        if len(self.refused):
+            return np.full(len(points), np.inf)
+        return super().uncertainty(field, points)
 
     def drawn_in(self, states: SolvedPoses) -> Self:
         places = states.tips if self.target is None else states.targets[:, self.target]

@@ -34,9 +34,9 @@ class Goal(Protocol):
         """Return the branch's distance from the goal with its grasp at ``points`` [m], [n]."""
         ...
 
-    def uncertainty(self, field: EnergyField) -> float:
-        """Return how much nearer than its ``distance`` the branch may be at most [m]; infinite if
-        the field's error is not known.
+    def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        """Return how much nearer than its ``distance`` the branch may be at most with its grasp at
+        ``points`` [m], shape [n]; infinite if the field's error is not known.
         """
         ...
 

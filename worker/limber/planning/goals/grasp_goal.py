@@ -23,8 +23,8 @@ class GraspGoal:
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.asarray(points) - self.position, axis=1)
 
-    def uncertainty(self, field: EnergyField) -> float:
-        return 0.0
+    def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        return np.zeros(len(points))
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         inside = ball(count, generator) * self.tolerance + self.position

@@ -46,8 +46,8 @@ class TargetGoal:
         outside = self.region.distance(field.tip(points, self.target))
         return outside + self.tolerance + self.inset
 
-    def uncertainty(self, field: EnergyField) -> float:
-        return self.inset + field.place_error(self.target)
+    def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        return self.inset + field.place_errors(self.target, points)
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         # A small region is a thin bent lens in grasp space: draw everywhere, then walk onto it.

@@ -83,7 +83,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
 def separated(problem: GentleProblem, verdict: Verdict) -> NoWayError:
     """Return the error for a goal that cells separate from the start."""
     return no_way(problem, f"This is proven on {_grid(verdict)}: forbidden cells separate the "
-                  "start from the goal.").behind(verdict.wall)
+                  "start from the goal.").behind(verdict.wall, verdict.nearest)
 
 
 def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:
