@@ -217,9 +217,9 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     # One corner more than the active cells': for the second differences there.
     corners = np.argwhere(widened(corners_of(widened(open_cells, RIM))))
     points = grid.points(corners)
-    energy = grid.spread(corners, problem.energy_field.energy(points))
-    force = grid.spread(corners, problem.energy_field.force(points))
-    over = _surely_over(problem, grid, open_cells, energy, force)
+    # Rows for the corners that count, not the whole box: that would be most of the memory.
+    energy, force = problem.energy_field.energy(points), problem.energy_field.force(points)
+    over = _surely_over(problem, grid, open_cells, corners, energy, force)
     open_cells &= ~over
     if not open_cells[tuple(cell)]:
         raise _separated(problem, grid, open_cells, grid.points(cell[None] + 0.5))
@@ -229,7 +229,9 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     raw = energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
     slopes = problem.weights.energy * grid.along_edges(force)
-    ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
+    ground = terrain(grid.spread(corners, rate), grid.spread(corners, slopes),
+                     grid.spread(corners, raw) > 0.0, open_cells, grid.spacing,
+                     problem.weights.length)
     goal = about_goal(problem, grid, ground)
     if not goal.meets:
         centres = grid.points(np.argwhere(open_cells) + 0.5)
@@ -239,9 +241,8 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
         wall = over & scipy.ndimage.binary_dilation(open_cells, _NEAR)
         raise _separated(problem, grid, open_cells, grid.points(np.argwhere(wall) + 0.5))
     if problem.longest < np.inf:
-        open_cells = _short_enough(problem, grid, open_cells, goal.near, cell)
-        ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing,
-                         problem.weights.length)
+        ground = ground._replace(
+            open_cells=_short_enough(problem, grid, open_cells, goal.near, cell))
     to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
     lower = spline_value(to_goal, cell) - slack
@@ -285,10 +286,10 @@ def _surely_outside(problem: GentleProblem, grid: Grid) -> np.ndarray:
     return outside
 
 
-def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: np.ndarray,
-                 force: np.ndarray) -> np.ndarray:
+def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, corners: np.ndarray,
+                 energy: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Return those of ``cells`` in which no point keeps the limits, including the field's error;
-    ``energy`` and ``force`` at their corners and next to them.
+    ``energy`` [n] and ``force`` [n, 3] at ``corners`` [n, 3]: theirs and those next to them.
     """
     limits, field, over = problem.sure_limits, problem.energy_field, np.zeros(cells.shape, bool)
     nodes = np.argwhere(corners_of(cells))
@@ -297,7 +298,8 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: 
         at_nodes = grid.spread(nodes, problem.spare(name, grid.points(nodes)))
         return np.nan_to_num(corner_values(at_nodes).min(axis=0))
     if limits.max_energy < np.inf:
-        over |= least_between(energy, grid.along_edges(force), cells) > (
+        over |= least_between(grid.spread(corners, energy),
+                              grid.spread(corners, grid.along_edges(force)), cells) > (
             limits.max_energy + problem.field_error - spare("energy"))
     for name, limit in zip(field.load_names, limits.max_loads, strict=True):
         if limit < np.inf:
@@ -308,7 +310,7 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, energy: 
             over |= least_between(grid.spread(beside, load**2), grid.spread(beside, slopes),
                                   cells) > (limit - spare(name))**2
     if limits.max_force < np.inf:
-        over |= least_size(force, cells) > limits.max_force - spare("force")
+        over |= least_size(grid.spread(corners, force), cells) > limits.max_force - spare("force")
     return over
 
 

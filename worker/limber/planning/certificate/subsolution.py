@@ -95,7 +95,9 @@ def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cel
     corners where the energy is not cut off; corners that were not evaluated are nan in ``rate`` and
     are not neighbours of an open cell's.
     """
-    bends = np.maximum(_bends(rate, open_cells), 0.25 * turns(slopes, open_cells))
+    bends = turns(slopes, open_cells)
+    bends *= 0.25
+    np.maximum(_bends(rate, open_cells), bends, out=bends)
     level = with_corner(positive) & with_corner(~positive)
     return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
 
