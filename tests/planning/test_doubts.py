@@ -76,7 +76,7 @@ def test_what_the_field_may_be_wrong_by_is_no_proof(rough_field, name):
 @pytest.mark.parametrize("seen", [f"None was found, {UNPROVEN}.", "No path exists."])
 def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch, seen):
     """With the limit looser by that error, for the full model to decide; and it is said. What is
-    proven is not tried."""
+    proven is tried neither so nor without margins."""
     settings, limits, told, tried = PlanSettings(), Limits(strain=2.4), [], []
     there = two_paths.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
 
@@ -98,7 +98,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     else:
         with pytest.raises(NoWayError, match="No path exists"):
             two_paths.plan_within(*arguments, progress=progress)
-        assert max(tried) == 2.4
+        assert max(tried) <= 2.4 and len(tried) == 1, "without margins it is proven as well"
 
 
 def test_a_target_may_be_nearer_than_the_field_has_it(rough_field):

@@ -1,8 +1,8 @@
 """Goals in regions of any size: balls, a second arm's reach, a camera's view; and unreachable ones.
 
-A region is drawn so that its border passes through the reachable positions of the tip: a fraction
-of the poses, 20 to 80 % for large regions, is inside. The start is outside. The end is checked on
-the full model.
+A region is drawn so that its border passes near a position that the tip has in a state of the full
+model, a sample of the field: so it is reachable. A fraction of the poses, 20 to 80 % for large
+regions, is inside. The start is outside. The end is checked on the full model.
 """
 
 import time
@@ -84,8 +84,9 @@ def _drawn(found: RegionGoal, kind: float | str, known: EnergyField, model: Gras
            ) -> tuple[PlanSettings, dict[str, CellPlace], np.ndarray]:
     """Return settings, the cell's places and a start outside the goal."""
     points = known.region.draw(_POSES, generator)
+    reached = known.samples.tips[known.region.contains(known.samples.positions)]
     for _ in range(_TRIES):
-        settings, cell = _asked(kind, known.tip(points), generator)
+        settings, cell = _asked(kind, reached, generator)
         try:
             goal = goal_of(GoalRequest(known, model, settings, known.limited(), cell))
         except NoPathError:
@@ -105,7 +106,7 @@ def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
     outward /= np.linalg.norm(outward)
     common = {"inertia": False, "iterations": 500, "field_error": 20.0}
     if not isinstance(kind, str):
-        # Its border is a little beyond a position that the tip reaches.
+        # Its border is a little behind a position that the tip reaches.
         centre = place + (kind - min(0.5 * kind, 0.01)) * outward
         return PlanSettings(tip_goal=tuple(map(float, centre)), goal_tolerance=kind, **common), {}
     settings = PlanSettings(**{kind: True}, **common)

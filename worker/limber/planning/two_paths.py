@@ -101,7 +101,9 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                               beyond=surely, errors=errors, before=before,
                               progress=progress.part(0.0, 0.5))
             return replace(found, margins=part)
-        except NoPathError:
+        except NoPathError as error:
+            if isinstance(error, NoWayError) and error.is_proven:
+                raise  # by the limits and the field's error alone: without margins as well
             progress.warn("No path keeps the limits with margins for the energy field's error "
                           f"({_told(part)}). The path is planned without margins. The full "
                           "model decides whether it is allowed.")
