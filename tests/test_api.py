@@ -191,6 +191,8 @@ def test_the_plan_has_its_certificate(example):
     assert plan.gap == pytest.approx(100 * (plan.cost / plan.bound - 1))
     assert plan.path.shape == (len(plan.times), 6) and plan.forces.shape == (len(plan.times), 3)
     assert plan.plot_along().axes
+    with pytest.raises(InputError, match="no strains along the branch"):
+        dataclasses.replace(plan, _damage=None).plot_damage()
 
 
 def test_the_energy_field_answers_between_its_samples(example):

@@ -43,6 +43,10 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
                      f"the strength ({strength['source']})", icon="ERROR")
     elif is_over:
         layout.label(text=f"May break: stress {stress_share:.2g} times the strength", icon="ERROR")
+    if legs := result.get("legs"):
+        draw_table(layout, [["Leg", "Time [s]", "Force [N]"], *(
+            [str(leg["name"]).capitalize(), _number(leg.get("duration_s"), 1.0),
+             _number(leg.get("peak_force_n"), 1.0)] for leg in legs)])
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (
         record.stages.items() if record else ()) if key.startswith(_PLAN)}
     if len(others) > 1:

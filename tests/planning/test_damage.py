@@ -9,8 +9,10 @@ import scipy
 from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.planning.constraints.damage import Strength, assumed, read_break_tests
+from limber.planning.constraints.damage_along import DamageAlong
 from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSettings
+from limber.results.report.damage_figure import damage_along_branch
 from limber.results.report.report_tables import comparison_rows
 from limber.stages.paths.plan_strength import strength_for, strength_of_plan, with_damage
 
@@ -116,3 +118,29 @@ def test_a_plan_over_its_strength_is_said_to_be():
     assert np.array_equal(unknown["grasp_m"], [6.0, 7.0, 8.0])
     rows = comparison_rows({"baseline": {}, "plan": {}, "strength": over})
     assert rows[-2][2] == "1.4" and rows[-1][0].startswith("probability of damage")
+
+
+def test_the_branch_is_drawn_where_it_would_break(small_model, small_skeleton, tmp_path):
+    """Bent by its grasp it is strained most where the tetrahedra are; each place has its own
+    probability, the largest strain's that of the plan; the picture survives the file."""
+    place = small_model.rest_position + [0.03, 0.0, 0.0]
+    bent = small_model.follow(place[None], small_model.rest.displacement)[0].displacement
+    strength = Strength.of_species("ash")
+    states = [small_model.rest.displacement, bent]
+    along = DamageAlong.of(small_model, small_skeleton, states, strength)
+    assert along.strains.max() == pytest.approx(small_model.peak_strain(bent), rel=1e-6)
+    assert along.probabilities.max() == pytest.approx(strength.damage(along.strains.max()))
+    assert along.strains.min() < 0.5 * along.strains.max()
+    with open(tmp_path / "damage.csv", "w") as stream:
+        along.write(stream)
+    read = DamageAlong.read(tmp_path / "damage.csv")
+    assert np.allclose(read.probabilities, along.probabilities, rtol=1e-4)
+    assert np.array_equal(read.parents, along.parents)
+    figure = damage_along_branch(read)
+    assert "probability of damage here" in figure.axes[-1].get_ylabel()
+    unknown = DamageAlong.of(small_model, small_skeleton, states, None)
+    assert unknown.probabilities is None
+    assert "largest strain" in damage_along_branch(unknown).axes[-1].get_ylabel()
+    (tmp_path / "damage.csv").write_text("x_m,y_m,z_m,parent,strain\n0,0,0,1,0.1\n0,0,1,0,0.1\n")
+    with pytest.raises(InputError, match="does not come before its node"):
+        DamageAlong.read(tmp_path / "damage.csv")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError, NoPathError
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.obstacles import Box
 from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
@@ -52,6 +53,10 @@ def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     assert np.allclose(np.diff(points["t_s"]), 1 / 500, atol=1e-6)
     assert points["t_s"][-1] == pytest.approx(plan.motion.times[-1], abs=1 / 500)
     assert points["x_m"][-1] == pytest.approx(plan.motion.poses[-1, 0], abs=1e-6)
+    legs = {leg["name"]: leg for leg in plan.summary["legs"]}
+    assert list(legs) == ["approach", "grasp", "path", "hold", "return", "release", "leaving"]
+    assert legs["path"]["peak_force_n"] == pytest.approx(plan.motion.force_sizes.max(), rel=0.01)
+    assert legs["approach"]["peak_force_n"] == 0.0 and legs["path"]["self_distance_m"] > 0.0
 
 
 @pytest.mark.slow
@@ -156,13 +161,15 @@ def test_an_executed_branch_keeps_the_plans_clearance():
     """Not nearer than planned, but for what a clamped piece moves; never inside; and it is stated.
     """
     post = Box("a post", np.full(3, 0.01), np.zeros(3), np.eye(3))
-    clear = KeptClear((post,), 0.02)
-    clear.require(np.zeros(3), np.array([[0.05, 0.0, 0.0], [0.0295, 0.0, 0.0]]))
+    corners = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
+    mesh, clear = TetMesh(corners, np.array([[0, 1, 2, 3]])), KeptClear((post,), 0.02)
+    clear.require(np.zeros(3), mesh, np.tile([0.0295, 0.0, 0.0], (4, 1)))
     assert clear.describe() == {"clearance_m": 0.02, "branch_clearance_m": pytest.approx(0.0195)}
+    assert np.allclose(clear.surfaces, corners + [0.0295, 0.0, 0.0])
     with pytest.raises(NoPathError, match=r"15.0 mm from a post, .* clearance of 20.0 mm"):
-        clear.require(np.zeros(3), np.array([[0.025, 0.0, 0.0]]))
+        clear.require(np.zeros(3), mesh, np.tile([0.025, 0.0, 0.0], (4, 1)))
     with pytest.raises(NoPathError, match=r"5.0 mm inside a post"):
-        KeptClear((post,), 0.0).require(np.zeros(3), np.array([[0.005, 0.0, 0.0]]))
+        KeptClear((post,), 0.0).require(np.zeros(3), mesh, np.tile([0.005, 0.0, 0.0], (4, 1)))
     assert KeptClear((), 0.0).describe()["branch_clearance_m"] is None
 
 

@@ -20,6 +20,7 @@ from limber.robot.ur.arms import ARMS
 from limber.stages.paths.execute import (
     ExecuteOptions,
     ExecuteSettings,
+    _as_planned,
     _as_slow_as_checked,
     _planned,
     execute,
@@ -155,6 +156,9 @@ def test_a_dry_run_moves_nothing_and_says_what_it_would_do(planned_folder, tmp_p
     assert result["armed"] is False and result["reached"] is None
     assert result["predicted_peak_force_n"] > 0.1
     assert result["singularity_distance"] >= cell.limits.singularity
+    legs = {leg["name"]: leg for leg in result["legs"]}
+    assert legs["path"]["peak_force_n"] == pytest.approx(result["predicted_peak_force_n"])
+    assert legs["hold"]["duration_s"] == 2.0 and legs["path"]["branch_distance_m"] is not None
     preview = np.genfromtxt(planned_folder / "executions" / "path-preview.csv", delimiter=",",
                             names=True)
     assert np.all(np.diff(preview["t_s"]) > 0)
@@ -183,6 +187,18 @@ def test_a_plan_that_was_checked_in_motion_is_followed_no_faster():
     settings, same = _as_slow_as_checked({"speed_m_s": 0.2, "acceleration_m_s2": 2.0},
                                          ExecuteSettings(speed=0.03), cell, Progress())
     assert settings.speed == 0.03 and same.limits == cell.limits and len(told) == 1
+
+
+def test_a_plan_is_executed_at_its_own_speed_and_held_as_long_as_it_says():
+    """No faster than the cell allows; what is given counts; a plan of an older program has none."""
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)})
+    plan = {"timing": {"speed_m_s": 0.02}, "legs": [
+        {"name": "path", "duration_s": 5.0}, {"name": "hold", "duration_s": 7.0}]}
+    own = _as_planned(plan, ExecuteSettings(), cell)
+    assert (own.speed, own.hold) == (0.02, 7.0)
+    fast = _as_planned({"timing": {"speed_m_s": 0.2}}, ExecuteSettings(hold=0.0), cell)
+    assert (fast.speed, fast.hold) == (cell.limits.speed_m_s, 0.0)
+    assert _as_planned({}, ExecuteSettings(), cell).speed == 0.03
 
 
 def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folder, tmp_path,

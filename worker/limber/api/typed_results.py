@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from limber.core.errors import InputError
 from limber.core.files.reading import read_json
 from limber.core.optional import require_extra
 from limber.store import Branch as Folder
@@ -22,6 +23,7 @@ from limber.store import Branch as Folder
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from limber.planning.constraints.damage_along import DamageAlong
     from limber.planning.field.energy_field import EnergyField as FittedField
     from limber.planning.plan_file import PlanFile
     from limber.recordings.recording import Pull as Recording
@@ -449,13 +451,16 @@ class Plan(Result):
     gap: float | None
     _file: "PlanFile"
     _field: "FittedField"
+    _damage: "DamageAlong | None"
 
     @classmethod
     def read(cls, branch: Folder, key: str, values: Mapping[str, Any]) -> "Plan":
+        from limber.planning.constraints.damage_along import DamageAlong
         from limber.planning.field.energy_field import EnergyField as FittedField
         from limber.planning.plan_file import read_plan
 
         name = key.partition(":")[2]
+        damage = branch.path(f"plans/{name}-damage.csv")
         found = read_plan(branch.path(f"plans/{name}.json"))
         way, proof = found.plan, values["certificate"]
         return cls(MappingProxyType({**values}), name, _array(way.poses), _array(way.times),
@@ -463,7 +468,8 @@ class Plan(Result):
                    _array(found.baseline.poses), values["plan"]["energy_integral_jm"],
                    values["energy_saved_percent"], float(_array(proof["upper_bound"])),
                    proof["lower_bound"], proof["gap_percent"], found,
-                   FittedField.read(branch.path("energy.npz")))
+                   FittedField.read(branch.path("energy.npz")), DamageAlong.read(damage)
+                   if branch.has(f"plans/{name}-damage.csv") else None)
 
     def table(self) -> dict[str, np.ndarray]:
         """Return the gentle path: ``time_s``, ``x_m`` ... ``rz_rad``, ``energy_j``, ``fx_n`` ...
@@ -476,6 +482,20 @@ class Plan(Result):
         from limber.results.report.plan_figures import paths_over_slice
 
         return drawn(lambda: paths_over_slice(self._field, self._file))
+
+    def plot_damage(self) -> "Figure":
+        """Draw where along the branch the gentle path would damage it, and how probably.
+
+        Raises:
+            InputError: the plan is of a version that did not compute it.
+        """
+        from limber.results.report.damage_figure import damage_along_branch
+
+        if self._damage is None:
+            raise InputError(f"The plan {self.name} has no strains along the branch.",
+                             "An older version of Limber made it.", "Plan again with force=True.")
+        damage = self._damage
+        return drawn(lambda: damage_along_branch(damage))
 
     def plot_along(self) -> "Figure":
         """Draw energy, force and strain over the length of both paths."""

@@ -14,6 +14,14 @@ if a robot is given; ``motion`` also ``phases``.
 ``timing`` has the limits of speed and acceleration that the times keep; a motion is at standstill
 at rest, at the path's end, and at rest again. ``in_motion``, if limits were requested, states that
 they hold at this pace with the branch's inertia, and the peaks in motion and at standstill.
+``legs`` lists what is executed, in order: of a plan in a robot's cell ``approach`` (of the empty
+gripper), ``grasp``, ``path`` (from the hanging branch to the goal), ``hold``, ``return``,
+``release`` and ``leaving``, each with its start and duration [s], length [m], speeds, largest force
+and torque, and least distances of arm and gripper from obstacles and themselves, and of the arm's
+links from the branch [m]; without a cell ``path``, ``hold`` and ``return`` alone.
+``turning``, if the arm cannot let the gripper turn with the branch, has the rotations beyond the
+branch's own: ``along_m`` [n] of approach and path, ``offsets_rad`` [n][3] in the branch's frame,
+and the energy and torque that they cost.
 ``limits`` has for each requested limit its value, the peak of the motion at standstill at each
 pose, and the margin. ``robot`` is null for plans that were not made in a robot's cell.
 
@@ -22,11 +30,12 @@ Format 1 had no version, no motion, and the sizes of forces alone. It is read as
 
 import json
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as, read_json
@@ -154,6 +163,40 @@ class PlanRobot(_Told):
     model: str | None = None
 
 
+class PlanTiming(_Told):
+    """The pace of a plan's motion."""
+
+    speed_m_s: float = Field(gt=0)
+
+
+class PlanLeg(_Told):
+    """One leg of the whole motion, from the gripper's approach to its leaving."""
+
+    name: str
+    start_s: float = Field(ge=0)
+    duration_s: float = Field(ge=0)
+    length_m: float = Field(ge=0)
+    peak_speed_m_s: float = Field(ge=0)
+    peak_force_n: float = Field(ge=0)
+    peak_torque_nm: float = Field(ge=0)
+    obstacle_distance_m: float | None = None
+    branch_distance_m: float | None = None
+
+
+class PlanTurning(_Told):
+    """Rotations of the gripper beyond the branch's own along the path."""
+
+    along_m: list[float] = Field(min_length=2)
+    offsets_rad: list[tuple[float, float, float]]
+
+    @model_validator(mode="after")
+    def _fits(self) -> "PlanTurning":
+        if len(self.along_m) != len(self.offsets_rad) or any(
+                b < a for a, b in pairwise(self.along_m)):
+            raise ValueError("offsets_rad needs a row for each of the ascending along_m")
+        return self
+
+
 class PlanStep(_Told):
     """One entry of a planner's history."""
 
@@ -176,6 +219,9 @@ class PlanSummary(_Told):
     paths_on_field: dict[str, Any] | None = None
     limits: dict[str, dict[str, float]] | None = None
     clearance_m: float | None = Field(None, ge=0)
+    timing: PlanTiming | None = None
+    legs: list[PlanLeg] = []
+    turning: PlanTurning | None = None
     targets: list[str] = []
     energy_saved_percent: float | None = None
     length_added_percent: float | None = None

@@ -42,8 +42,8 @@ class PlanSettings(Settings):
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_damage", "max_stress", "workspace_low",
-                               "workspace_high", "clearance", "confidence"),
-        "timing": ("speed", "acceleration", "inertia", "slowings"),
+                               "workspace_high", "clearance", "turn_slack", "confidence"),
+        "timing": ("speed", "acceleration", "hold", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
@@ -106,6 +106,10 @@ class PlanSettings(Settings):
         "Least distance of branch, gripper and arm from the cell's obstacles [m]. Default: twice "
         "the uncertainty of the robot's base in the cell file, but no more than the branch has at "
         "rest."))
+    turn_slack: float | None = Field(None, gt=0, le=1.5, description=(
+        "Largest rotation of the gripper beyond the branch's own along the path [rad]. It is used "
+        "where the arm, or an obstacle, does not let the gripper turn with the branch; its torque "
+        "is kept within the limits. Default: the gripper turns with the branch."))
     confidence: float | None = Field(None, ge=0.5, lt=1, description=(
         "Probability that the limits hold, given the uncertainty of the estimated Young's "
         "modulus. Default: the limits are checked for the estimate only."))
@@ -113,6 +117,8 @@ class PlanSettings(Settings):
     acceleration: float = Field(0.1, gt=0, le=2.0, description=(
         "Largest acceleration of the gripper [m/s^2]. The motion is at rest at both ends of the "
         "path."))
+    hold: float = Field(2.0, ge=0, le=3600, description=(
+        "Time to hold the branch at the path's end [s]."))
     inertia: bool = Field(True, description=(
         "Also check the limits in motion, with the branch's inertia, and slow the motion down "
         "until they hold. Otherwise they are checked at every pose at rest."))

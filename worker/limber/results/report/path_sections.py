@@ -6,7 +6,7 @@ from limber.planning.field.energy_field import EnergyField
 from limber.results.findings import beyond_sentence
 from limber.results.report import execution_section as execution
 from limber.results.report import figures
-from limber.results.report.report_tables import comparison_rows
+from limber.results.report.report_tables import comparison_rows, leg_rows
 from limber.results.report.section import Section
 from limber.store import Branch
 
@@ -38,6 +38,8 @@ def plan_section(branch: Branch, name: str) -> Section:
     section.tables.append(("Shortest path (length alone) against the gentle one "
                            "(deformation-aware), both scored on the full model",
                            comparison_rows(plan)))
+    if rows := leg_rows(plan.get("legs", [])):
+        section.tables.append(("The whole motion, leg by leg", rows))
     saved, added = plan["energy_saved_percent"], plan["length_added_percent"]
     section.text.append((
         "The start is inside the goal, so the paths have no length and no energy can be saved."

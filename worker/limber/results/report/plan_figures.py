@@ -8,11 +8,13 @@ import numpy as np
 
 from limber.core.constants import PATH_COLOURS
 from limber.core.numerics.rigid import principal_axes
+from limber.planning.constraints.damage_along import DamageAlong
 from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
 from limber.planning.search_files import CostToGo, read_trees
 from limber.results.report.charts import chart
+from limber.results.report.damage_figure import damage_along_branch
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -53,6 +55,15 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
                               "its steepest descent."))
         shown.append((certificate(plan), "Cost of the gentle path, and lower bound on the cost of "
                       "every path on the energy field, as the grid of the certificate is refined."))
+    if branch.has(f"plans/{name}-damage.csv"):
+        damage = DamageAlong.read(branch.path(f"plans/{name}-damage.csv"))
+        shown.append((damage_along_branch(damage), (
+            "Where the gentle path would damage the branch: the probability that the largest "
+            "strain at a place, in any state of the motion, breaks it there. "
+            if damage.probabilities is not None else
+            "Where the gentle path strains the branch most. The strength is not known: give "
+            "--break-tests or --wood for a probability of damage. ")
+            + "The circle marks the largest strain."))
     if any(point["lower_bound_jm"] is not None
            for point in (plan.summary.get("detour") or {}).get("curve", ())):
         shown.append((trade_off(plan), "Energy against length of the gentlest paths for several "

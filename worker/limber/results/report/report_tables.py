@@ -69,6 +69,21 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
         rows + below, ["beyond reach", *told], strict=True)]
 
 
+def leg_rows(legs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return a plan's legs in order; a row is left empty where nothing moves or is known."""
+    rows = [["leg", "from [s]", "for [s]", "length [mm]", "speed [mm/s]", "force [N]",
+             "to obstacles [mm]", "arm to branch [mm]"]]
+    for leg in legs:
+        moves = leg["length_m"] > 0.0
+        rows.append([
+            leg["name"], f"{leg['start_s']:.1f}", f"{leg['duration_s']:.1f}",
+            f"{1e3 * leg['length_m']:.0f}" if moves else "",
+            f"{1e3 * leg['peak_speed_m_s']:.0f}" if moves else "", f"{leg['peak_force_n']:.3g}",
+            *("" if leg.get(key) is None else f"{1e3 * leg[key]:.0f}"
+              for key in ("obstacle_distance_m", "branch_distance_m"))])
+    return rows if len(rows) > 1 else []
+
+
 def _below(plan: Mapping[str, Any]) -> list[list[str]]:
     """Rows with values of the gentle path alone."""
     rows = []

@@ -52,6 +52,9 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
         data.info["notes"].append(
             "no shorter path was found" if max(abs(saved), abs(added)) < SAME else
             f"energy {round(-saved):+d} %, length {round(added):+d} % against the shortest path")
+    if legs := summary.get("legs"):
+        data.info["notes"].append("motion: " + ", ".join(
+            f"{leg['name']} {leg['duration_s']:.0f} s" for leg in legs))
     if beyond := remarks_on(summary).get("peak_strain"):
         data.info["notes"].append(f"strain, {beyond}")
     return plan

@@ -72,11 +72,18 @@ class Predicted:
     young_covariance: np.ndarray
 
     @classmethod
-    def of_forces(cls, poses: np.ndarray, forces: np.ndarray) -> "Predicted":
-        """Return a prediction from forces [n, 3] at poses [n, 6] alone."""
+    def of_forces(cls, poses: np.ndarray, forces: np.ndarray, torques: np.ndarray | None = None,
+                  ) -> "Predicted":
+        """Return a prediction from forces and torques [n, 3] at poses [n, 6] alone."""
         count = len(poses)
-        return cls(poses, np.hstack([forces, np.zeros((count, 3))]), np.zeros((count, 6, 6)),
+        torques = np.zeros((count, 3)) if torques is None else torques
+        return cls(poses, np.hstack([forces, torques]), np.zeros((count, 6, 6)),
                    np.zeros((count, 3, 3)))
+
+    def first(self, count: int) -> "Predicted":
+        """Return the prediction at the first ``count`` poses alone."""
+        return Predicted(self.poses[:count], self.wrenches[:count], self.stiffness[:count],
+                         self.young_covariance[:count])
 
     def felt(self, cell: Cell, rest_pose: np.ndarray) -> ExpectedWrench:
         """Return the wrench expected at a cell's gripper, which has some compliance itself.

@@ -40,16 +40,43 @@ class ArmSurroundings:
         """Return the smallest distance to any obstacle at joint angles [n, joints] [m], shape [n].
         """
         rods = self._rods(joints)
-        found = np.full(len(joints), np.inf)
+        # Links of one arm may come closer to each other than to objects with uncertain positions.
+        found = np.minimum(self._from_itself(rods) + _CLEAR_M, self._from_obstacles(rods))
+        return np.minimum(found, self.from_branch(joints))
+
+    def least_distances(self, joints: np.ndarray) -> dict[str, float | None]:
+        """Return the smallest distances at joint angles [n, joints] of the arm with its gripper
+        from itself and from obstacles [m], as plain data; None: there is nothing.
+        """
+        rods = self._rods(joints)
+        found = {"self_distance_m": self._from_itself(rods),
+                 "obstacle_distance_m": self._from_obstacles(rods)}
+        return {name: float(least) if np.isfinite(least := far.min()) else None
+                for name, far in found.items()}
+
+    def links_from(self, joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the smallest distance of the arm's links, without the gripper, from ``points``
+        [n, k, 3] of the branch frame at joint angles [n, joints] [m], shape [n].
+        """
+        arm, found = self._cell.arm.rods(joints), np.full(len(joints), np.inf)
+        for n, own in enumerate((points - self._base[:3, 3]) @ self._base[:3, :3]):
+            links = Limbs(arm.starts[n], arm.ends[n], np.asarray(arm.radii, float))
+            found[n] = links.clearance(own).min()
+        return found
+
+    def _from_itself(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        found = np.full(len(rods[0]), np.inf)
         for pair in self._pairs:
-            # Links of one arm may come closer to each other than to objects with uncertain
-            # positions.
-            found = np.minimum(found, _apart(rods, *pair) + _CLEAR_M)
+            found = np.minimum(found, _apart(rods, *pair))
+        return found
+
+    def _from_obstacles(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        found = np.full(len(rods[0]), np.inf)
         places, radii = self._places(rods)
         for obstacle in self._obstacles:
-            far = obstacle.clearance(places.reshape(-1, 3)).reshape(len(joints), -1) - radii
+            far = obstacle.clearance(places.reshape(-1, 3)).reshape(len(found), -1) - radii
             found = np.minimum(found, far.min(axis=1))
-        return np.minimum(found, self.from_branch(joints))
+        return found
 
     def from_branch(self, joints: np.ndarray) -> np.ndarray:
         """Return the smallest distance to the branch at joint angles [n, joints] [m], shape [n]."""
@@ -84,7 +111,7 @@ class ArmSurroundings:
 
 
 class Limbs:
-    """The axes of a branch as rods, an :class:`.Obstacle`."""
+    """Rods, an :class:`.Obstacle`: the axes of a branch, or an arm's links."""
 
     name = "the branch"
 

@@ -15,6 +15,7 @@ from pydantic import Field
 
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.files.reading import csv_records, read_columns
+from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
@@ -31,12 +32,14 @@ if TYPE_CHECKING:
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import RobotMotion
     from limber.robot.motion.expected_wrench import Predicted
+    from limber.robot.motion.legs import Leg
     from limber.robot.motion.trajectory import Trajectory
     from limber.stages.paths.plan_cell import KeptClear
 
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
 # a branch by 3 micrometres
 _MOST_POSES = 120
+_SPEED, _HOLD_SECONDS = 0.03, 2.0  # m/s, s: of a plan that states none
 _TARE_SECONDS = 1.0
 _BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
 
@@ -56,8 +59,10 @@ class ExecuteSettings(Settings):
 
     groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation", "gravity")}
 
-    speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
-    hold: float = Field(2.0, ge=0, le=3600, description="Time to wait at the path's end [s].")
+    speed: float | None = Field(None, gt=0, le=0.25, description=(
+        "Speed of the gripper [m/s]. Default: the plan's, no faster than the cell allows."))
+    hold: float | None = Field(None, ge=0, le=3600, description=(
+        "Time to wait at the path's end [s]. Default: the plan's."))
     gripper_rotation: tuple[float, float, float] | None = Field(
         None, description="Rotation vector of the gripper at the grasp, in the branch's frame "
         "[rad]. Default: the direction across the branch that stays farthest from singularities.")
@@ -125,7 +130,9 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
         require_payload(cell)
     from limber.robot.motion.execution import robot_motion
     from limber.robot.motion.expected_wrench import Predicted
+    from limber.robot.motion.turning import turned
     from limber.stages.paths.plan_cell import KeptClear, blocked_by
+    from limber.stages.paths.plan_legs import legs_in_cell
     from limber.store.loading import load_grasp_model
 
     progress(0.02, "inverse kinematics")
@@ -133,18 +140,22 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     clear = KeptClear.of(cell, Path(cell_file).parent, model, told.get("clearance_m"))
     # The plan's own rotation of the gripper is the one checked against obstacles.
     rotation = settings.gripper_rotation or (told.get("robot") or {}).get("gripper_rotation")
-    asked = {"speed": settings.speed, "rotation": rotation,
+    asked = {"speed": present(settings.speed, "speed"), "rotation": rotation,
              "blocked": blocked_by(cell, clear.obstacles, clear.clearance)}
     planned = _planned(branch, name, model.rest_position)
+    offsets = _offsets_along(told.get("turning"), planned[:, :3])
+    planned = turned(planned, offsets) if offsets.any() else planned
     if np.isfinite(planned).all():
         # With the plan's own poses: whether the arm reaches them is known at once, forces are not.
         at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
         robot_motion(cell, at_once, model.reach.axis, **asked)
     progress(0.05, "forces along the path")
-    predicted = _predicted(branch, model, planned[:, :3], clear, progress)
+    predicted = _predicted(branch, model, planned[:, :3], told.get("turning"), clear, progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
-    result = _summary(cell, motion) | clear.describe()
+    result = _summary(cell, motion) | clear.describe() | {"legs": legs_in_cell(
+        cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
+        present(settings.hold, "time at the path's end"), progress)}
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
     return branch, cell, settings, motion, result
 
@@ -163,21 +174,31 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
     told = _told(branch, name)
     if warning := check_plan(told.get("robot"), cell):
         progress.warn(warning)
+    settings = _as_planned(told, settings, cell)
     settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
     return branch, cell, settings, told
 
 
 def _told(branch: Branch, name: str) -> dict[str, Any]:
-    """The robot, the clearance and the check in motion that a plan's file states, if in this
+    """Robot, clearance, pace, legs and the check in motion that a plan's file states, if in this
     program's format.
     """
     from limber.planning.plan_file import read_plan_summary
 
     file = f"plans/{name}.json"
     found = read_plan_summary(branch.path(file)) if branch.has(file) else {}
-    told = {key: found[key] for key in ("robot", "in_motion") if isinstance(found.get(key), dict)}
-    clearance = found.get("clearance_m")
-    return told if clearance is None else told | {"clearance_m": clearance}
+    kept = ("robot", "in_motion", "timing", "legs", "turning", "clearance_m")
+    return {key: found[key] for key in kept if found.get(key) is not None}
+
+
+def _as_planned(told: dict[str, Any], settings: ExecuteSettings, cell: Cell) -> ExecuteSettings:
+    """Return the settings with the plan's own speed and time at its end where none is given."""
+    speed = (told.get("timing") or {}).get("speed_m_s", _SPEED)
+    hold = next((leg["duration_s"] for leg in told.get("legs", ()) if leg["name"] == "hold"),
+                _HOLD_SECONDS)
+    own = {"speed": min(speed, cell.limits.speed_m_s), "hold": hold}
+    return settings.model_copy(update={
+        name: value for name, value in own.items() if getattr(settings, name) is None})
 
 
 def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSettings, cell: Cell,
@@ -186,28 +207,43 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
     if checked is None:
         return settings, cell
     speed, acceleration = checked["speed_m_s"], checked["acceleration_m_s2"]
-    if settings.speed > speed:
+    asked = present(settings.speed, "speed")
+    if asked > speed:
         progress.warn(f"The plan keeps its limits in motion up to {1e3 * speed:.1f} mm/s, so it "
                       "is followed at that speed at most. Plan with a higher --speed to go "
                       "faster.")
     limits = cell.limits.model_copy(update={
         # The plan's motion law uses that fraction of it along the path, the robot's all of it.
         "acceleration_m_s2": min(cell.limits.acceleration_m_s2, np.sqrt(0.5) * acceleration)})
-    return (settings.model_copy(update={"speed": min(settings.speed, speed)}),
+    return (settings.model_copy(update={"speed": min(asked, speed)}),
             cell.model_copy(update={"limits": limits}))
 
 
-def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, clear: KeptClear,
-               progress: Progress) -> Predicted:
+def _offsets_along(turning: dict[str, Any] | None, positions: np.ndarray) -> np.ndarray:
+    """Return a plan's rotations beyond the branch's own at ``positions`` [n, 3] [rad], [n, 3]."""
+    if turning is None:
+        return np.zeros_like(positions)
+    from limber.planning.cost import arc_lengths
+
+    known, along = np.array(turning["along_m"]), arc_lengths(positions)
+    share = along / max(float(along[-1]), 1e-12) * known[-1]
+    return np.column_stack([np.interp(share, known, column)
+                            for column in np.array(turning["offsets_rad"]).T])
+
+
+def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray,
+               turning: dict[str, Any] | None, clear: KeptClear, progress: Progress) -> Predicted:
     """Prediction of the model from rest to the path's end, through ``positions`` [n, 3].
 
-    The grasp passes the plan's positions, rotated as the branch itself would rotate. Steps are
+    The grasp passes the plan's positions, rotated as the branch itself would rotate, and by the
+    plan's offset from that (``turning``) if it has one. Steps are
     small enough that straight lines between positions stretch nothing. The wrench is that of the
     branch clamped in this way.
 
     Raises:
         NoPathError: the branch comes nearer to an obstacle than ``clear`` allows.
     """
+    from limber.core.numerics.rigid import composed
     from limber.mechanics import Grasp, follow_poses
     from limber.mechanics.sensitivities import grasp_slopes
     from limber.planning.field.grasp_model import refusal
@@ -220,6 +256,7 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, clear: 
         progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
                       "The interval of the predicted force does not include it.")
     positions = _closely(positions)
+    offsets = _offsets_along(turning, positions)
     clamped = Grasp.gripping(model.mesh, model.grasp.centre, GRASP_RADIUS_M)
     firm = model.model.gripped(clamped)
     poses, wrenches, stiffness, covariances = [], [], [], []
@@ -230,6 +267,8 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, clear: 
         if reason is None:
             state = free.displacement
             pose = np.r_[position, model.pose(state)[3:]]
+            if offsets[number].any():
+                pose[3:] = composed(offsets[number], pose[3:])
             result = follow_poses(firm, clamped, pose[None], start=held)[0]
             reason = refusal(result)
         if reason is not None:
@@ -238,7 +277,7 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, clear: 
                                             "there.",
                             "Plan a gentler path.")
         held = result.displacement
-        clear.require(pose[:3], model.mesh.nodes + held)
+        clear.require(pose[:3], model.mesh, held)
         poses.append(pose)
         wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
         stiffness.append(grasp_slopes(firm, clamped, held).wrench)
@@ -431,33 +470,37 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
 def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSettings,
            options: ExecuteOptions, batches: list[np.ndarray], live: LiveForce,
            progress: Progress) -> tuple[dict[str, Any], tuple[int, int] | None]:
-    """Execute approach, grasp, path, return and leaving; end at the first one that is stopped."""
+    """Execute the legs in order; end at the first one that is stopped."""
+    from limber.robot.motion.legs import legs_of
+
     _open_at_start(cell, link, motion)
     progress(0.5, "taring: keep the gripper free")
     live.at("taring")
     link.tare(_TARE_SECONDS)
     on_path: tuple[int, int] | None = None
-    legs: list[tuple[str, Trajectory]] = [
-        ("approach", motion.approach), ("path", motion.path), ("return", motion.way_back),
-        ("leaving", motion.leaving)]
     event: dict[str, Any] = {}
-    for number, (title, trajectory) in enumerate(legs):
-        progress(0.55 + 0.1 * number, title)
-        live.at(title)
+    for number, leg in enumerate(legs_of(cell, motion, present(settings.hold, "hold"))):
+        progress(0.55 + 0.06 * number, leg.name)
+        live.at(leg.name)
+        if leg.trajectory is None:
+            _stand(cell, link, leg, progress)
+            continue
         begin = sum(map(len, batches))
-        event = _followed_to_its_end(link, trajectory)
-        if title == "path":
+        event = _followed_to_its_end(link, leg.trajectory)
+        if leg.name == "path":
             on_path = (begin, sum(map(len, batches)))
         if event["event"] != "reached":
             after = retreat_if_chosen(cell, link, options.after_stop, progress)
             return event | {"after_stop": after}, on_path
-        if title == "approach":
-            grip(cell, link, close=True, progress=progress)
-        elif title == "path":
-            time.sleep(settings.hold)
-        elif title == "return":
-            grip(cell, link, close=False, progress=progress)
     return event, on_path
+
+
+def _stand(cell: Cell, link: RobotLink, leg: Leg, progress: Progress) -> None:
+    """Execute a leg on which the gripper stands: it closes, holds or opens."""
+    if leg.name == "hold":
+        time.sleep(leg.duration)
+    else:
+        grip(cell, link, close=leg.name == "grasp", progress=progress)
 
 
 def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:

@@ -6,8 +6,6 @@ finite elements along the paths found; the error of the field is reported beside
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 from collections.abc import Mapping
@@ -21,7 +19,6 @@ from pydantic import Field
 from limber.core.errors import BranchFolderError, Cancelled, InputError, NoPathError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
-from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.planning.settings import PlanSettings
@@ -40,13 +37,7 @@ if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
 
 
-_MOST_NODES = 2000  # of a search tree in its file; those that carry the most others stay
-_SETPOINT_RATE = 125.0  # [Hz] of poses in time, where no robot says its own
 _FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
-_COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
-            "strain")
-_MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx_n", "fy_n", "fz_n",
-                   "tx_nm", "ty_nm", "tz_nm", "energy_j", "strain")
 
 
 class PlanInputs(BranchInputs):
@@ -80,22 +71,24 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         Cancelled: the best result so far was kept, if there was one and no finished plan of that
         name.
     """
+    from limber.planning.constraints.damage_along import DamageAlong
     from limber.planning.constraints.limits import Limits
     from limber.planning.field.energy_field import EnergyField
     from limber.planning.field.sampling import energy_inputs, is_sampled_on
     from limber.planning.make_plan import plan_motion
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
-    from limber.stages.paths.plan_cell import reached_by
+    from limber.stages.paths.plan_legs import legs_without_cell
     from limber.stages.paths.plan_strength import strength_for, strength_of_plan, with_damage
+    from limber.stages.paths.plan_tables import SETPOINT_RATE, setpoints
     from limber.stages.paths.plan_uncertainty import young_uncertainty
-    from limber.store.loading import known_damping, load_grasp_model
+    from limber.store.loading import known_damping, load_grasp_model, load_skeleton
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
-            ("-baseline", "-bound", "-motion", "-setpoints", "-trees")):
+            ("-baseline", "-bound", "-damage", "-motion", "-setpoints", "-trees")):
         raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names, and -baseline, -bound, -motion, "
-                         "-setpoints and -trees are reserved.",
+                         "It becomes part of file names, and -baseline, -bound, -damage, "
+                         "-motion, -setpoints and -trees are reserved.",
                          "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field_path = branch.require("energy.npz", "energy")
@@ -121,6 +114,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     uncertainty = (
         None if settings.confidence is None else young_uncertainty(branch, grasp_model, asked)
     )
+    if settings.turn_slack is not None and cell_file is None:
+        raise InputError("--turn-slack is given without --cell.",
+                         "It is the arm in the cell that may not let the gripper turn with the "
+                         "branch.", "Give --cell, or omit --turn-slack.")
     in_cell = None
     if cell_file is not None:
         in_cell = _InCell.of(branch, cell_file, asked, progress, settings, grasp_model)
@@ -161,18 +158,20 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
                 strength, found.plan, found.summary.get("in_motion"), progress)
         pace = found.pace
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
-        if in_cell is not None:
+        if in_cell is None:
+            found.summary["legs"] = legs_without_cell(motion, settings.hold)
+        else:
             progress(0.95, "inverse kinematics")
-            found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
-                                                in_cell.obstacles, pace.speed,
-                                                in_cell.clearance)
-            found.summary["clearance_m"] = in_cell.clearance
+            found.summary.update(in_cell.taken(motion, grasp_model, found, settings, progress))
         progress(0.95, "writing")
-        rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
+        rate = SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
         found.summary["setpoint_rate_hz"] = rate
-        stage.path(f"plans/{name}-setpoints.csv").write_text(_setpoints(motion, pace, rate),
+        stage.path(f"plans/{name}-setpoints.csv").write_text(setpoints(motion, pace, rate),
                                                              encoding="utf-8")
         _write(stage, name, limits, pace, motion, grasp_model, found)
+        with open(stage.path(f"plans/{name}-damage.csv"), "w", encoding="utf-8") as stream:
+            DamageAlong.of(grasp_model, load_skeleton(branch), found.plan.ahead.displacements,
+                           strength).write(stream)
         stage.result.update(found.summary)
     result = branch.manifest.stages[key].result
     if result["stopped"]:
@@ -214,6 +213,39 @@ class _InCell:
             grasp_model.mesh.nodes + grasp_model.rest.displacement)
         return cls(cell, obstacles, limits_in(cell, limits, obstacles, clearance),
                    places_in(cell, obstacles), clearance)
+
+    def taken(self, motion: Way, grasp_model: GraspModel, found: PlannedMotion,
+              settings: PlanSettings, progress: Progress) -> dict[str, Any]:
+        """Return a plan's entries about its robot, the clearance, the legs of its motion, and how
+        the gripper turns if not with the branch.
+
+        Raises:
+            NoPathError: there is no continuous branch of the inverse kinematics, or the gripper
+                meets an obstacle; the message states where.
+        """
+        from limber.robot.motion.execution import robot_motion
+        from limber.stages.paths.plan_cell import blocked_by, predicted_ahead, robot_summary
+        from limber.stages.paths.plan_legs import legs_in_cell, surface_points
+
+        predicted, states, turning = predicted_ahead(motion), found.plan.ahead, None
+        asked: dict[str, Any] = {"speed": found.pace.speed, "blocked": blocked_by(
+            self.cell, self.obstacles, self.clearance)}
+        try:
+            taken = robot_motion(self.cell, predicted, grasp_model.reach.axis, **asked)
+        except NoPathError:
+            if settings.turn_slack is None:
+                raise
+            from limber.stages.paths.plan_turning import turned_by
+
+            progress(0.95, "turning the gripper beyond the branch's own rotation")
+            held, turning = turned_by(self.cell, predicted, grasp_model, states,
+                                      settings.turn_slack, self.limits, **asked)
+            taken = held.motion
+        return {"robot": robot_summary(self.cell, taken), "clearance_m": self.clearance,
+                "turning": turning, "legs": legs_in_cell(
+                    self.cell, self.obstacles, taken, states.poses[:, :3],
+                    surface_points(grasp_model.mesh, states.displacements), settings.hold,
+                    progress)}
 
     def slowed(self, pace: Pace) -> Pace:
         """Return the pace, no faster than the cell allows."""
@@ -262,6 +294,7 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
     from limber.mechanics.strain import strain_state
     from limber.planning.plan_file import limits_of_motion, plan_text, way_of
     from limber.results.motion_files import surface_fields, write_pc2
+    from limber.stages.paths.plan_tables import motion_table, path_table, trees_table
 
     names = tuple(target.name for target in grasp_model.branch.targets)
     baseline, plan = (way_of(path.solved, names, pace=pace,
@@ -270,10 +303,10 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
     stage.path(f"plans/{name}.json").write_text(plan_text(
         found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace),
         encoding="utf-8")
-    stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
-    stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
-    stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")
-    stage.path(f"plans/{name}-trees.csv").write_text(_trees_table(found), encoding="utf-8")
+    stage.path(f"plans/{name}.csv").write_text(path_table(plan), encoding="utf-8")
+    stage.path(f"plans/{name}-baseline.csv").write_text(path_table(baseline), encoding="utf-8")
+    stage.path(f"plans/{name}-motion.csv").write_text(motion_table(motion), encoding="utf-8")
+    stage.path(f"plans/{name}-trees.csv").write_text(trees_table(found.trees), encoding="utf-8")
     if found.to_go is not None:
         found.to_go.write(stage.path(f"plans/{name}-bound.npz"))
     displacements = found.plan.solved.displacements
@@ -290,61 +323,12 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
     np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
 
 
-def _table(way: Way) -> str:
-    from limber.planning.cost import arc_lengths
-
-    along = arc_lengths(way.poses[:, :3])
-    return _csv(_COLUMNS, np.column_stack(
-        [along, way.poses, way.energies, way.force_sizes, way.strains]))
-
-
-def _motion_table(motion: Way) -> str:
-    targets = [f"{name}_{axis}_m" for name in motion.targets for axis in "xyz"]
-    times = present(motion.times, "time of the motion")
-    forces = present(motion.forces, "force of the motion")
-    torques = present(motion.torques, "torque of the motion")
-    rows = np.column_stack([times, motion.poses, forces, torques,
-                            motion.energies, motion.strains, *motion.targets.values()])
-    return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
-
-
-def _setpoints(motion: Way, pace: Pace, rate: float) -> str:
-    """Return the grasp's poses every 1 / ``rate`` [s], and at the motion's end."""
-    from limber.planning.timing import poses_at, time_law
-
-    phases = present(motion.phases, "phase of the motion")
-    end = phases.count("approach") + phases.count("path") - 1
-    law = time_law(motion.poses[:, :3], pace, (end,))
-    instants = np.arange(int(np.ceil(law.duration * rate)) + 1) / rate
-    return _csv(_MOTION_COLUMNS[:7], np.column_stack(
-        [instants, poses_at(motion.poses, law, instants, (end,))]))
-
-
-def _trees_table(found: PlannedMotion) -> str:
-    """One row per node: its tree, its position, and the row of its parent in that tree (-1: none).
-    """
-    lines = ["planner,x_m,y_m,z_m,parent"]
-    for planner, tree in found.trees.items():
-        small = tree.pruned(_MOST_NODES)
-        lines += [f"{planner},{x:.6g},{y:.6g},{z:.6g},{parent}"
-                  for (x, y, z), parent in zip(small.nodes, small.parents, strict=True)]
-    return "\n".join(lines) + "\n"
-
-
-def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | None = None) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*columns, *(() if phases is None else ("phase",))))
-    for number, row in enumerate(rows):
-        writer.writerow([*(f"{value:.9g}" for value in row),
-                         *(() if phases is None else (phases[number],))])
-    return text.getvalue()
-
-
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.report_tables import comparison_rows
+    from limber.results.report.report_tables import comparison_rows, leg_rows
 
-    return [("Both paths, on the full model", comparison_rows(result))]
+    legs = leg_rows(result.get("legs", []))
+    return [("Both paths, on the full model", comparison_rows(result)),
+            *([("The whole motion, leg by leg", legs)] if legs else [])]
 
 
 def _found_lines(values: Mapping[str, Any]) -> str:
@@ -366,6 +350,6 @@ STAGE = StageDescription(
     ParallelOptions, key="plan:{name}", reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
             "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
-            "plans/{name}-bound.npz", "frames/{name}.pc2", "frames/{name}.json",
-            "frames/{name}.npz"), tables=_tables, found=(_found_lines,),
+            "plans/{name}-damage.csv", "plans/{name}-bound.npz", "frames/{name}.pc2",
+            "frames/{name}.json", "frames/{name}.npz"), tables=_tables, found=(_found_lines,),
     then="limber report {branch_folder}", step="plan", label="Plan Path")

@@ -1,6 +1,6 @@
 """Requirements of a robot's cell on a plan: workspace, obstacles, and the arm's reach."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from limber.core.numerics.rigid import inverted, matrices
 from limber.core.present import present
 from limber.core.progress import Progress
 from limber.geometry.io.surfaces import SURFACES, usable_surface
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.field.grasp_model import GraspModel
@@ -24,8 +25,9 @@ from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
 from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
-from limber.robot.motion.execution import Blocked, robot_motion
+from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.expected_wrench import Predicted
+from limber.stages.paths.plan_legs import surface_points
 from limber.store import Branch
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -172,11 +174,13 @@ class KeptClear:
         obstacles: Obstacles of the cell, branch frame.
         clearance: Distance that branch, gripper and arm keep from them [m].
         least: Least distance of the branch so far [m]; infinite without obstacles.
+        surfaces: Points of the branch's surface at each state so far [m], shape [k, 3] each.
     """
 
     obstacles: tuple[Obstacle, ...]
     clearance: float
     least: float = np.inf
+    surfaces: list[np.ndarray] = field(default_factory=list)
 
     @classmethod
     def of(cls, cell: Cell, folder: Path, grasp_model: GraspModel, planned: float | None,
@@ -188,12 +192,15 @@ class KeptClear:
         return cls(obstacles, clearance_in(cell, planned, obstacles, grasp_model.rest_position,
                                            nodes))
 
-    def require(self, grasp: np.ndarray, nodes: np.ndarray) -> None:
-        """Check the branch with its grasp at ``grasp`` [3] and its nodes at ``nodes`` [n, 3].
+    def require(self, grasp: np.ndarray, mesh: TetMesh, moved: np.ndarray) -> None:
+        """Check the branch with its grasp at ``grasp`` [3] and its nodes displaced by ``moved``
+        [n, 3].
 
         Raises:
             NoPathError: it is nearer to an obstacle than the plan allows.
         """
+        nodes = mesh.nodes + moved
+        self.surfaces.append(surface_points(mesh, moved[None])[0])
         for obstacle in self.obstacles:
             away = float(obstacle.clearance(nodes).min())
             self.least = min(self.least, away)
@@ -227,19 +234,16 @@ def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clear
                             cell.limits.soft_force_n, obstacles, clearance)
 
 
-def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obstacle, ...],
-               speed: float, clearance: float = 0.0) -> dict[str, Any]:
-    """Return the robot's motion of the gripper along approach and path, at a speed [m/s].
-
-    Raises:
-        NoPathError: there is no continuous branch of the inverse kinematics, or the gripper meets
-            an obstacle; the message states where.
-    """
+def predicted_ahead(motion: Way) -> Predicted:
+    """Return poses and wrenches of a motion along approach and path."""
     there = np.array(motion.phases) != "return"
     forces = present(motion.forces, "force of the motion")
-    predicted = Predicted.of_forces(motion.poses[there], forces[there])
-    found = robot_motion(cell, predicted, axis, speed=speed, blocked=blocked_by(
-        cell, obstacles, clearance))
+    torques = present(motion.torques, "torque of the motion")
+    return Predicted.of_forces(motion.poses[there], forces[there], torques[there])
+
+
+def robot_summary(cell: Cell, found: RobotMotion) -> dict[str, Any]:
+    """Return a plan's entries about its robot, as plain data."""
     return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
             "gripper_rotation": found.rotation,
             "duration_s": found.approach.duration + found.path.duration,

@@ -1,0 +1,41 @@
+"""The torque of a gripper that turns the branch: second order, and on the full model."""
+
+import numpy as np
+import pytest
+
+from limber.core.errors import InputError, NoPathError
+from limber.planning.constraints.limits import Limits
+from limber.planning.path_on_full_model import resolve_path
+from limber.planning.settings import PlanSettings
+from limber.stages.paths.plan import plan
+from limber.stages.paths.plan_turning import Clamped
+
+
+@pytest.fixture(scope="module")
+def clamped(small_model):
+    """The small branch at six states along a way aside."""
+    rest = small_model.rest_position
+    way = rest + np.linspace(0.0, 1.0, 7)[:, None] * [0.03, 0.0, -0.002]
+    return Clamped.of(small_model, resolve_path(small_model, way, rest[None]).ahead)
+
+
+def test_the_torque_is_second_order_in_the_offset(clamped):
+    """Twice the offset has four times the error, which is small; the energy is its integral."""
+    share = np.linspace(0.0, 1.0, len(clamped.rows))[:, None]
+    errors = []
+    for size in (0.04, 0.08):
+        offsets = share * [size, 0.5 * size, 0.0]
+        found = clamped.checked(offsets, Limits())
+        assert found["torque_error_nm"] < 0.1 * found["peak_torque_nm"]
+        errors.append(found["torque_error_nm"])
+    assert 2.5 < errors[1] / errors[0] < 6.0
+    slope = (clamped.cost.energy(1.001 * offsets) - clamped.cost.energy(0.999 * offsets)) / 0.002
+    work = (clamped.cost.wrench(offsets)[:, 3:] * offsets).sum(axis=1)
+    assert slope == pytest.approx(work, rel=0.02, abs=1e-9)
+    with pytest.raises(NoPathError, match=r"torque .* on the full model"):
+        clamped.checked(offsets, Limits(torque=0.5 * found["peak_torque_nm"]))
+
+
+def test_a_slack_without_an_arm_is_refused(planned_branch):
+    with pytest.raises(InputError, match="--turn-slack is given without --cell"):
+        plan(planned_branch, PlanSettings(turn_slack=0.2), name="turned")
