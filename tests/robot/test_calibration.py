@@ -1,6 +1,9 @@
 """The base from touched points: by the controller's own pose, and no mirrored frame passes."""
 
 import json
+import socket
+import struct
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +15,16 @@ from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.base_calibration import fit_base, touched_place
 from limber.robot.cell.cell import Cell, read_cell, write_cell
+from limber.robot.cell.controller_settings import differences
 from limber.robot.interface import Sample
+from limber.robot.ur.arms import ARMS
+from limber.robot.ur.factory_calibration import (
+    PRIMARY_PORT,
+    FactoryCalibration,
+    kinematics_message,
+    one_arm,
+    read_calibration,
+)
 
 GRASP = (0.01, 0.0, 0.15, 0.0, 0.0, 0.3)
 BASE = np.array([0.6, -0.2, 0.1, 0.3, -0.4, 1.2])
@@ -121,3 +133,44 @@ def test_the_command_states_each_points_residual(branch_folder, tmp_path, capfd)
     assert pose_vectors(held) == pytest.approx(BASE, abs=5e-3)
     code, told = run(3)
     assert code == 2 and "Four or more" in told["error"]
+
+
+def test_the_arms_own_dimensions_are_read_from_its_controller(own_address):
+    """In a thread: bytes as a controller sends them, between others and cut anywhere."""
+    arm = one_arm(ARMS["ur5e"], 0.004, np.random.default_rng(3))
+    sent = FactoryCalibration.of(arm)
+    other = struct.pack(">iB", 12, 0) + bytes(7)
+    inner = kinematics_message(sent)[5:]
+    state = struct.pack(">iB", 5 + len(other) + len(inner), 16) + other + inner
+    stream = struct.pack(">iBi", 9, 20, 1) + struct.pack(">iB", 17, 16) + other + state
+    with socket.create_server((own_address, PRIMARY_PORT)) as server:
+        def serve() -> None:
+            for end in (len(stream), 40, 0):
+                theirs, _ = server.accept()
+                with theirs:
+                    for part in (stream[:end // 2], stream[end // 2:end]):
+                        theirs.sendall(part)
+        threading.Thread(target=serve, daemon=True).start()
+        found = read_calibration(own_address)
+        assert read_calibration(own_address) is None and read_calibration(own_address) is None
+    assert found.checksums == sent.checksums
+    joints = np.array([0.3, -1.2, 1.4, -1.0, -1.5, 0.4])
+    assert found.forward(joints) == pytest.approx(arm.forward(joints), abs=1e-12)
+    off, turned = found.off_nominal(ARMS["ur5e"], joints)
+    assert 1e-3 < off < 0.02 and turned < 1e-6
+    assert read_calibration(own_address) is None
+
+
+def test_a_tool_off_by_five_millimetres_shows_in_an_older_controller_too():
+    """Nominal dimensions explain a centimetre; those that the controller reports, nothing."""
+    own = one_arm(ARMS["ur5"], 0.004, np.random.default_rng(1))
+    joints = np.array([0.3, -1.2, 1.4, -1.0, -1.5, 0.4])
+    cell = Cell(robot={"model": "ur5"}, base={"pose": (0,) * 6},
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)}, sensor={"kind": "ft300"})
+
+    def told(tool: tuple) -> list[str]:
+        pose = pose_vectors(own.forward(joints) @ matrices(np.array(tool)))
+        sample = Sample(0.0, 0.0, joints, np.zeros(6), pose, np.zeros(6), np.zeros(6), 7, 1, 1, 1.0)
+        return [each.what for each in differences(cell, sample, FactoryCalibration.of(own))]
+    assert told((0, 0, 0.15, 0, 0, 0)) == []
+    assert told((0.005, 0, 0.15, 0, 0, 0)) == ["tool centre point"]

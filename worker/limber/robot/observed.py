@@ -12,9 +12,10 @@ from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices
 from limber.robot.cell.cell import Cell
 from limber.robot.cell.controller_settings import Difference, differences, plays
-from limber.robot.driver.controls import control_of
+from limber.robot.driver.controls import calibration_of, control_of
 from limber.robot.driver.force_sensors import ForceTorqueSensor, open_sensor
 from limber.robot.interface import ArmControl, Sample
+from limber.robot.ur.factory_calibration import FactoryCalibration
 
 _FEWEST = 3
 _FIRST_READING_SECONDS = 0.2
@@ -33,12 +34,14 @@ class Observed:
         readings: Reading of the force sensor with each, flange axes, not tared [N, N m], shape [n,
         6].
         differences: Differences between the controller and the cell.
+        calibration: Dimensions of the arm that its controller reports; None if it does not.
     """
 
     facts: dict[str, Any]
     samples: list[Sample]
     readings: np.ndarray
     differences: list[Difference]
+    calibration: FactoryCalibration | None = None
 
     @property
     def program_runs(self) -> bool:
@@ -56,8 +59,23 @@ class Observed:
                                        for each in self.differences):
             return None
         tool = np.array(cell.tool.grasp_pose) if sample.tool is None else sample.tool
-        nominal = cell.arm.forward(sample.joints) @ matrices(tool)
-        return float(np.linalg.norm(nominal[:3, 3] - sample.pose[:3]))
+        return self._off(cell.arm.forward(sample.joints), tool)
+
+    def calibrated_off(self, cell: Cell) -> float | None:
+        """Return the deviation of the controller's pose from that of the reported dimensions [m].
+
+        More than rounding is a tool that is not the one assumed: an arm that has been repaired or
+        calibrated again, or a tool centre point that an older controller does not report. None
+        without reported dimensions.
+        """
+        if self.calibration is None:
+            return None
+        sample = self.samples[-1]
+        tool = np.array(cell.tool.grasp_pose) if sample.tool is None else sample.tool
+        return self._off(self.calibration.forward(sample.joints), tool)
+
+    def _off(self, flange: np.ndarray, tool: np.ndarray) -> float:
+        return float(np.linalg.norm((flange @ matrices(tool))[:3, 3] - self.samples[-1].pose[:3]))
 
     def implausible(self, cell: Cell) -> list[str]:
         """Return implausible properties of the sensor's readings at rest, in words."""
@@ -105,7 +123,9 @@ def observe(cell: Cell, seconds: float) -> Observed:
                          "Check its cable and network.") from error
     finally:
         control.close()
-    return Observed(control.facts, samples, readings, differences(cell, samples[-1]))
+    calibration = calibration_of(cell)
+    return Observed(control.facts, samples, readings,
+                    differences(cell, samples[-1], calibration), calibration)
 
 
 def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:

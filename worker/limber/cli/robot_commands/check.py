@@ -1,11 +1,17 @@
 """Read a robot and compare it with its cell: `limber robot check`."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from limber.cli.main import Run, stage_command
+
+if TYPE_CHECKING:
+    from limber.robot.cell.cell import Cell
+    from limber.robot.observed import Observed
 
 _SECONDS = 1.0
 
@@ -45,7 +51,20 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
         "differences": [vars(each) for each in seen.differences],
         "samples_per_second": len(seen.samples) / _SECONDS,
         "force_without_tare_n": force.mean(axis=0), "force_sigma_n": force.std(axis=0),
-        "nominal_kinematics_off_m": seen.nominal_off(cell)}
+        "nominal_kinematics_off_m": seen.nominal_off(cell),
+        "calibrated_kinematics_off_m": seen.calibrated_off(cell),
+        "factory_calibration": _calibration(cell, seen)}
+
+
+def _calibration(cell: Cell, seen: Observed) -> dict[str, Any] | None:
+    """The arm's own dimensions as its controller reports them, and what they change here."""
+    own = seen.calibration
+    if own is None:
+        return None
+    off_m, off_rad = own.off_nominal(cell.arm, seen.samples[-1].joints)
+    return {"theta_rad": own.theta, "a_m": own.a, "d_m": own.d, "alpha_rad": own.alpha,
+            "checksums": own.checksums, "flange_off_nominal_m": off_m,
+            "flange_off_nominal_rad": off_rad}
 
 
 def _computer(run: Run) -> dict[str, bool]:

@@ -6,6 +6,7 @@ from limber.core.errors import InputError, WorkError
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.ur_control import UrControl
 from limber.robot.interface import ArmControl
+from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.samples import Dashboard
 
 _JOINTS = 6  # of which samples and recordings have columns
@@ -31,6 +32,14 @@ def register_control(kind: str, opened: Callable[[Cell], ArmControl]) -> None:
         opened: Takes the cell, connects to its controller, and raises if the arm cannot move now.
     """
     _CONTROLS[kind] = opened
+
+
+def calibration_of(cell: Cell) -> FactoryCalibration | None:
+    """Return the dimensions that a cell's controller reports of its arm; None if it reports none.
+    """
+    if _CONTROLS.get(cell.arm.controller) not in (UrControl, _virtual):
+        return None
+    return read_calibration(cell.robot.address)
 
 
 def stop_from_outside(cell: Cell, seconds: float) -> bool:

@@ -22,6 +22,8 @@ def main() -> int:
     parser.add_argument("--mass", type=float, default=0.0, help="kg at the flange")
     parser.add_argument("--centre", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="m")
     parser.add_argument("--ft300", action="store_true")
+    parser.add_argument("--off-nominal", type=float, default=0.0,
+                        help="m, of each length of the arm")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--branch", type=Path, help="JSON file of a BranchSetting")
     options = parser.parse_args()
@@ -32,7 +34,7 @@ def main() -> int:
             load = HeldBranch(BranchSetting(**{**known, "mesh": Path(known["mesh"])}))
         controller = Controller(options.model, joints=options.joints, mass=options.mass,
                                 centre=tuple(options.centre), seed=options.seed,
-                                ft300=options.ft300, load=load)
+                                ft300=options.ft300, load=load, off_nominal=options.off_nominal)
         claim_real_time(VIRTUAL_ROBOT_PRIORITY)
         serve(controller, options.address, control=True)
     except LimberError as error:

@@ -16,6 +16,8 @@ from limber.core.errors import InputError
 from limber.core.numerics.rigid_kernels import crossed, frame_of, weight_wrench
 from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
+from limber.robot.ur.arms import UrArm
+from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
 from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
 from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
 from limber.robot.virtual.payload import Load, Nothing
@@ -27,10 +29,12 @@ _SLOW_HZ = 125.0  # the rate of a CB3
 
 
 class SafetyMode(IntEnum):
-    """As in RTDE's ``safety_mode``."""
+    """As in RTDE's ``safety_mode`` (Universal Robots, "RTDE guide", controller output data)."""
 
     NORMAL = 1
+    REDUCED = 2
     PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
     ROBOT_EMERGENCY_STOP = 7
 
 
@@ -58,11 +62,13 @@ class SensorFault:
         added: Wrench added to the sensor's report, flange frame [N, N m].
         frozen: Repeats the last reading.
         nan: Reports no numbers.
+        joints_nan: Reports no numbers as joint angles.
     """
 
     added: np.ndarray = field(default_factory=lambda: np.zeros(6))
     frozen: bool = False
     nan: bool = False
+    joints_nan: bool = False
 
 
 class Controller:
@@ -74,12 +80,18 @@ class Controller:
         mass, centre: Actual payload at the flange [kg], [m].
         seed: Seed of the sensors' noise.
         load: The gripper's load.
+        off_nominal: Largest difference of a length of this arm from the nominal one [m].
     """
 
     def __init__(self, model: str, *, joints: np.ndarray | None = None, mass: float = 0.0,
                  centre: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0,
-                 load: Load | None = None, ft300: bool = False):
+                 load: Load | None = None, ft300: bool = False, off_nominal: float = 0.0):
         self.arm: Arm = arm_named(model)
+        self.calibration: FactoryCalibration | None = None
+        """The arm's own dimensions, if it is one of Universal Robots."""
+        if isinstance(self.arm, UrArm):
+            self.arm = one_arm(self.arm, off_nominal, np.random.default_rng([seed, 1]))
+            self.calibration = FactoryCalibration.of(self.arm)
         self.version = (3, 15, 8, 106339) if self.arm.rate == _SLOW_HZ else (5, 11, 6, 1010327)
         self.seconds = 1.0 / self.arm.rate
         self.joints = _six(self.arm.home if joints is None else joints)
@@ -97,6 +109,7 @@ class Controller:
         self.load: Load = load or Nothing()
         self.fault = SensorFault()
         self.step_count, self.clock_offset = 0, 0.0
+        self.clock_stands_at: float | None = None
         self.since_step: Callable[[], float] = lambda: 0.0
         """Wall-clock seconds since the last step, if the controller is stepped by the clock."""
         self.robot_mode, self.safety_mode = RobotMode.RUNNING, SafetyMode.NORMAL
@@ -122,6 +135,8 @@ class Controller:
     @property
     def clock(self) -> float:
         """Seconds since the controller was started, as it reports them."""
+        if self.clock_stands_at is not None:
+            return self.clock_stands_at
         return self.step_count * self.seconds + self.clock_offset
 
     def step(self) -> None:
@@ -180,11 +195,41 @@ class Controller:
 
     def protective_stop(self, reason: str) -> None:
         """Stop the arm and pause the program, as on a collision."""
-        if self.safety_mode == SafetyMode.NORMAL:
+        if self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
             self.say(f"protective stop: {reason}")
             self.safety_mode = SafetyMode.PROTECTIVE_STOP
             self.paused = self.program is not None
             self._brake()
+
+    def safeguard_stop(self) -> None:
+        """Open the safeguard input, as a light curtain does: the arm stops, the program is paused.
+
+        It stays paused until it is played (user manual, "Safety functions": category 2 stop).
+        """
+        if self.can_move:
+            self.say("safeguard stop")
+            self.safety_mode = SafetyMode.SAFEGUARD_STOP
+            self.paused = self.program is not None
+            self._brake()
+
+    def reduce(self) -> None:
+        """Switch to reduced mode, as its input or a safety plane does: programs go on.
+
+        The controller then holds other, lower limits (user manual, "Safety modes").
+        """
+        if self.safety_mode == SafetyMode.NORMAL:
+            self.say("reduced mode")
+            self.safety_mode = SafetyMode.REDUCED
+
+    def power_off(self) -> None:
+        """Switch the arm off: the brakes engage."""
+        self.stop_program("power off")
+        self.robot_mode = RobotMode.POWER_OFF
+
+    def hold_clock(self, stands: bool) -> None:
+        """Let the reported clock stand still, or go on."""
+        self.clock_stands_at = None
+        self.clock_stands_at = self.clock if stands else None
 
     def emergency_stop(self) -> None:
         """Press the button: the arm stops, the program ends, power is switched off."""
@@ -234,7 +279,8 @@ class Controller:
     @property
     def can_move(self) -> bool:
         """Whether programs may run at all."""
-        return self.safety_mode == SafetyMode.NORMAL and self.robot_mode == RobotMode.RUNNING
+        return (self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+                and self.robot_mode == RobotMode.RUNNING)
 
     def load_script(self, text: str) -> None:
         """Run an uploaded script, ending the running one; refused in local control."""
@@ -323,9 +369,12 @@ class Controller:
         protective = self.safety_mode == SafetyMode.PROTECTIVE_STOP
         emergency = self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP
         normal = self.safety_mode == SafetyMode.NORMAL
+        reduced = self.safety_mode == SafetyMode.REDUCED
+        safeguard = self.safety_mode == SafetyMode.SAFEGUARD_STOP
         values: dict[str, Any] = dict(_STEADY)
         values.update(
-            timestamp=self.clock, target_q=self.joints, actual_q=self.joints,
+            timestamp=self.clock, target_q=self.joints,
+            actual_q=np.full(6, np.nan) if self.fault.joints_nan else self.joints,
             target_qd=self.speeds, actual_qd=self.speeds, target_qdd=self.accelerations,
             actual_TCP_pose=self.pose, target_TCP_pose=self.pose,
             actual_TCP_speed=self.tool_speed, target_TCP_speed=self.tool_speed,
@@ -336,8 +385,8 @@ class Controller:
             safety_status=int(self.safety_mode), runtime_state=int(self.runtime_state),
             robot_status_bits=int(self.robot_mode == RobotMode.RUNNING)
             | (self.runtime_state == RuntimeState.PLAYING) << 1,
-            safety_status_bits=int(normal) | protective << 2 | emergency << 6 | emergency << 7
-            | (not normal) << 10,
+            safety_status_bits=int(normal) | reduced << 1 | protective << 2 | safeguard << 4
+            | emergency << 6 | emergency << 7 | (not normal and not reduced) << 10,
             actual_digital_output_bits=self.digital_outputs,
             standard_analog_output0=self.analog_outputs[0],
             standard_analog_output1=self.analog_outputs[1],

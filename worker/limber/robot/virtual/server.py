@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from limber.core.errors import InputError, WorkError
 from limber.geometry.cloud.camera import Camera
 from limber.robot.ur import rtde
+from limber.robot.ur.factory_calibration import PRIMARY_PORT, kinematics_message
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import GREETING, answer
 
@@ -44,6 +45,8 @@ class Server:
     Attributes:
         delay: Delay of every message in each direction (a bad cable) [s].
         silent: Ports accept and read, but do not answer.
+        ft300_fault: ``silent`` sends nothing, ``nonsense`` no numbers, ``cut`` ends the
+            connection; empty: none.
     """
 
     def __init__(self, controller: Controller, address: str):
@@ -54,6 +57,7 @@ class Server:
         self.address = address
         self.delay = 0.0
         self.silent = False
+        self.ft300_fault = ""
         self.lost_seconds = 0.0
         self._servers: list[asyncio.Server] = []
         self.transports: set[asyncio.Transport] = set()
@@ -69,6 +73,8 @@ class Server:
         """
         ports: dict[int, Callable[[Any, Any], Awaitable[None]]] = {
             SCRIPT_PORT: self._serve_scripts}
+        if self.controller.calibration is not None:
+            ports[PRIMARY_PORT] = self._serve_primary
         if self.controller.ft300 is not None:
             ports[FT300_PORT] = self._serve_ft300
         if self.controller.load.seen():
@@ -171,12 +177,23 @@ class Server:
                 script, text = text[:stop], text[stop:]
                 self.later(lambda script=script: self.controller.load_script(script))
 
+    async def _serve_primary(self, reader: asyncio.StreamReader,
+                             writer: asyncio.StreamWriter) -> None:
+        """The arm's dimensions, once to each client; other states are not sent. Takes scripts."""
+        assert self.controller.calibration is not None
+        self.send(writer, kinematics_message(self.controller.calibration))
+        await self._serve_scripts(reader, writer)
+
     async def _serve_ft300(self, _reader: asyncio.StreamReader,
                            writer: asyncio.StreamWriter) -> None:
         due = time.perf_counter()
         while not writer.is_closing():
             fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
-            self.send(writer, f"( {fields} )".encode())
+            if self.ft300_fault == "cut":
+                return
+            if self.ft300_fault != "silent":
+                told = "( - , - , - )" if self.ft300_fault else f"( {fields} )"
+                self.send(writer, told.encode())
             # After a delay it omits readings and keeps its cycle.
             behind = time.perf_counter() - due
             due += _FT300_SECONDS * (1 + behind // _FT300_SECONDS)
