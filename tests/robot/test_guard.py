@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from limber.core.errors import SafetyStop
+from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
 from limber.robot.driver.guard import Guard, GuardSettings, State, Verdict
 from limber.robot.interface import Sample
@@ -31,9 +32,10 @@ class Bench:
 
     def sample(self, **changes) -> Sample:
         self.clock += self.step
-        return replace(Sample(self.clock, self.clock, JOINTS, np.zeros(6),
-                              np.array([0.4, 0.1, 0.5, 0, 0, 0]), np.zeros(6), np.zeros(6),
-                              7, 1, 2, 1.0), **changes)
+        joints = changes.get("joints", JOINTS)
+        pose = pose_vectors(ARM.forward(joints if np.isfinite(joints).all() else JOINTS))
+        return replace(Sample(self.clock, self.clock, JOINTS, np.zeros(6), pose, np.zeros(6),
+                              np.zeros(6), 7, 1, 2, 1.0), **changes)
 
     def noise(self) -> np.ndarray:
         return 0.05 * self.rng.standard_normal(6)
@@ -414,3 +416,16 @@ def test_the_guard_keeps_to_the_arms_table(name):
         bench.guard.acknowledge()
         bench.guard.begin()
         assert reason in bench.look(**changed).reason
+
+
+@pytest.mark.parametrize("offset, told", [((0.005, 0, 0, 0, 0, 0), "5.0 mm and 0.0 degrees"),
+                                          ((0, 0, 0, 0, 0.05, 0), "0.0 mm and 2.9 degrees")])
+def test_a_tool_that_is_changed_in_the_controller_stops_at_the_next_sample(bench, offset, told):
+    """No joint moves, the reported pose does; nominal dimensions that are off do not matter."""
+    tool = matrices(np.array(offset))
+    poses = [pose_vectors(ARM.forward(JOINTS + [0.001 * k, 0, 0, 0, 0, 0]) @ part)
+             for k, part in enumerate([np.eye(4)] * 20 + [tool])]
+    seen = [bench.look(joints=JOINTS + [0.001 * k, 0, 0, 0, 0, 0], pose=pose)
+            for k, pose in enumerate(poses)]
+    assert [one.verdict for one in seen[:-1]] == [Verdict.GO] * 20
+    assert seen[-1].verdict == Verdict.STOP and told in str(seen[-1])

@@ -5,7 +5,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from limber.core.numerics.rigid import matrices
 from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.robot.cell.cell import Cell
+from limber.robot.known_arms import arm_named
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.stages.pulls.record import RecordOptions, RecordSettings, record
 from limber.stages.pulls.record_path import suggested_pull, there_and_back, way_on_arc, way_through
@@ -114,6 +117,49 @@ def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, robot):
     found = Branch.open(branch_folder).manifest.stages["record:stopped"].result
     assert "force limit" in found["ended"] and found["sample_count"] > 100
     assert read_pull(branch_folder / "pulls" / "stopped").entry.observation == "none"
+
+
+def flange_of(robot) -> np.ndarray:
+    """Position of the flange, base frame [m]; a tool that is set does not move it."""
+    return arm_named(robot.model).forward(np.array(robot.state["joints"]))[:3, 3]
+
+
+@contextmanager
+def after_a_way(robot, way: float, action: str, **values):
+    """Do ``action`` in the robot once its flange is ``way`` [m] away from where it stood."""
+    start, over = flange_of(robot), threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.01):
+            if np.linalg.norm(flange_of(robot) - start) > way:
+                robot.ask(action, **values)
+                return
+    watching = threading.Thread(target=watch)
+    watching.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watching.join()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("action, values, told", [
+    ("creep", {"part": 1.0}, "slips slowly in the gripper"),
+    ("tool", {"offset": [0.005, 0, 0.15, 0, 0, 0]}, "tool centre point in the controller was")])
+def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
+        branch_folder, tmp_path, robot, action, values, told):
+    """Slow: two pulls in real time, beside those of the other tests.
+
+    From 4 mm on the branch slides in the jaws; the tool is set anew on the pendant.
+    """
+    path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
+    begin = flange_of(robot)
+    with after_a_way(robot, 0.004, action, **values), pytest.raises(SafetyStop, match=told):
+        record(branch_folder, path, "wrong", sideways_pull(branch_folder, distance=0.03),
+               RecordOptions(confirm="wrong"))
+    assert 0.004 < np.linalg.norm(flange_of(robot) - begin) < 0.014
+    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
 
 
 def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,

@@ -2,7 +2,9 @@
 
 A pull measures the stiffness of a branch. The direction of the force is known before: a force
 predicted along one direction does not appear along another, nor with the opposite sign. If the
-moduli are known already, its magnitude is predicted as well.
+moduli are known already, its magnitude is predicted as well. If not, its growth still is: one
+factor scales all of the predicted force. A branch that slips slowly in the gripper, or gives way,
+stops to follow it.
 """
 
 from dataclasses import dataclass
@@ -20,12 +22,38 @@ _AGREE = 10  # samples in a row that say the same
 _FROM_M = 0.002  # of travel: before that slack and the bark decide
 _BACK_SHARE = 0.15  # of the peak force that may be left when the gripper is back
 _SMOOTHED = 3  # readings at least in a smoothed force
-_COLUMNS = slice(13, 16)
+_RAW, _COLUMNS = slice(7, 10), slice(13, 16)
+_BIN_M, _MOVED_M = 2.5e-4, 1e-6
+_RECENT_M = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012, 0.02)  # over which the force's growth is
+_RECENT_SHARE = 0.2  # measured, and of the whole way at least: a stop relaxes the wood
+_SLIPS = 0.5  # of the growth before: less is a slip
+_CERTAIN = 5.0  # standard deviations
+_BASE_DEVIATIONS, _AXIS_M = 2.0, 0.002  # of a calibration; error of a scanned axis
+_TURNED_M = 1e-3  # back from the farthest place: the way out is over
+
+
+def off_axis(cell: Cell, gripper: np.ndarray, distance: float) -> str | None:
+    """Return a warning if the gripper is farther from the branch's axis than is explained.
+
+    Args:
+        gripper: Its middle, branch frame [m], shape [3].
+        distance: From the branch's axis [m].
+    """
+    base = cell.base
+    lever = float(np.linalg.norm(gripper - base.pose[:3]))
+    explained = _BASE_DEVIATIONS * float(np.hypot(base.position_sigma_m,
+                                                  base.rotation_sigma_rad * lever)) + _AXIS_M
+    if distance <= explained:
+        return None
+    return (f"The gripper is {1000 * distance:.1f} mm off the branch's axis; the calibration "
+            f"explains {1000 * explained:.1f} mm. If the branch lies in the middle of the jaws, "
+            "base.pose or tool.grasp_pose is wrong, and E with it: touch a known point, or "
+            "calibrate again.")
 
 
 @dataclass(frozen=True)
 class PredictedPull:
-    """Forces at the beginning of a pull, by the branch's model.
+    """Forces along the first way out of a pull, by the branch's model.
 
     Attributes:
         ways: Travel of the gripper [m], ascending from 0, shape [n].
@@ -43,6 +71,70 @@ class PredictedPull:
         return np.array([np.interp(way, self.ways, self.forces[:, k]) for k in range(3)])
 
 
+class _Growth:
+    """The growth of a force along the predicted one, now and before.
+
+    Readings are summed over bins of the way, so that a long pull takes no longer to judge.
+
+    Args:
+        noise: Standard deviation of a single reading [N].
+        end: Way up to which there is a prediction [m].
+    """
+
+    def __init__(self, noise: float, end: float):
+        self._noise = noise
+        # Of each bin: count, and sums of the predicted force, the felt one, and their products.
+        self._sums = np.zeros((int(end / _BIN_M) + 1, 5))
+        self._farthest = 0.0
+        self._is_over = False
+
+    def take(self, way: float, wanted: float, felt: float) -> None:
+        """Take a reading along the prediction [N] at a way [m], where ``wanted`` [N] is predicted.
+        """
+        self._is_over = self._is_over or way < self._farthest - _TURNED_M
+        self._farthest = max(self._farthest, way)
+        place = int(way / _BIN_M)
+        if not self._is_over and place < len(self._sums):
+            self._sums[place] += 1.0, wanted, felt, wanted * wanted, wanted * felt
+
+    def slip(self) -> tuple[float, float] | None:
+        """Return how much of the predicted growth the force has now, over that before, and the
+        way [m] over which; None if it grows on, or if noise explains it.
+        """
+        end = min(int(self._farthest / _BIN_M), len(self._sums))
+        if self._is_over or not self._sums[0, 0]:
+            return None
+        for recent in _RECENT_M:
+            first = end - int(recent / _BIN_M)
+            if first * _BIN_M < _FROM_M:
+                return None
+            if recent < _RECENT_SHARE * self._farthest:
+                continue
+            before, unsure = self._whole(self._sums[1:first].sum(axis=0))
+            now, unsure_now = self._slope(self._sums[first:end].sum(axis=0))
+            missing = _SLIPS * before - now
+            if missing > _CERTAIN * float(np.hypot(_SLIPS * unsure, unsure_now)):
+                return now / before, recent
+        return None
+
+    def _slope(self, sums: np.ndarray) -> tuple[float, float]:
+        """Growth of the force per predicted newton, and its standard deviation."""
+        count, wanted, felt, square, product = sums
+        spread = square - wanted * wanted / max(count, 1.0)
+        if not spread > 0.0:
+            return 0.0, np.inf
+        return (product - wanted * felt / count) / spread, self._noise / float(np.sqrt(spread))
+
+    def _whole(self, sums: np.ndarray) -> tuple[float, float]:
+        """The same since the start, where the first bin's force is that of the resting branch."""
+        _, wanted, _, square, product = sums
+        first, rest = self._sums[0, 0], self._sums[0, 2] / self._sums[0, 0]
+        if not square > 0.0:
+            return 0.0, np.inf
+        unsure = self._noise * float(np.sqrt(1.0 / square + (wanted / square) ** 2 / first))
+        return (product - rest * wanted) / square, unsure
+
+
 class PullPlausibility:
     """Checks the samples of a pull as they arrive.
 
@@ -58,6 +150,7 @@ class PullPlausibility:
         self._noise = _NOISES * cell.sensor.force_sigma_n / np.sqrt(_SMOOTHED)
         self._drift = cell.sensor.drift_n_per_minute / 60.0
         self._predicted = predicted
+        self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.ways[-1]))
         self._start: np.ndarray | None = None
         self._began = self._peak = 0.0
         self._told = ("", 0)
@@ -76,6 +169,9 @@ class PullPlausibility:
             way = float(np.linalg.norm(row[1:4] - self._start))
             if self.reason is None and _FROM_M <= way <= LOOKED_M:
                 self._agree(self._doubt(way, force))
+            self._grow(way, row[_RAW])
+        if self.reason is None:
+            self.reason = self._slip()
         return self.reason
 
     def left_at_end(self, samples: np.ndarray) -> str | None:
@@ -97,6 +193,22 @@ class PullPlausibility:
         self._told = (kind, self._told[1] + 1 if doubt and kind == self._told[0] else 1)
         if doubt and self._told[1] >= _AGREE:
             self.reason = doubt
+
+    def _grow(self, way: float, force: np.ndarray) -> None:
+        # Before it moves nothing is predicted, but the direction is known.
+        wanted = self._predicted.at(max(way, _MOVED_M))
+        size = float(np.linalg.norm(wanted))
+        if size > 0.0:
+            self._growth.take(way, size, float(force @ wanted) / size)
+
+    def _slip(self) -> str | None:
+        slip = self._growth.slip()
+        if slip is None:
+            return None
+        share, way = slip
+        return ("the force stopped to grow as it did before: the branch slips slowly in the "
+                f"gripper, or gives way (over the last {1000 * way:.0f} mm it grew by "
+                f"{100 * max(share, 0.0):.0f} % of what came before)")
 
     def _doubt(self, way: float, force: np.ndarray) -> str:
         wanted = self._predicted.at(way)

@@ -15,6 +15,7 @@ import numpy as np
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
 from limber.robot.cell.cell import Cell
+from limber.robot.cell.controller_settings import require_tool
 from limber.robot.driver.controls import control_of
 from limber.robot.driver.current_motion import Following, UnderWay
 from limber.robot.driver.deadline import CONNECT_SECONDS, RenewedDeadline, set_deadline
@@ -180,6 +181,7 @@ class Driver:
 
     def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
         sample = self._require_sample()
+        require_tool(self.cell, sample)
         # Poses computed from joint angles have the arm's nominal dimensions, not its own.
         start = sample.pose if trajectory.by_joints else trajectory.poses[0]
         require_start(sample.pose, sample.joints, start, start_joints, self.cell.arm.joint_names)

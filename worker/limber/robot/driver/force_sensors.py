@@ -272,7 +272,8 @@ class WrenchChain:
         entry = self.cell.sensor
         if (np.abs(reading.wrench[:3]).max() >= 0.999 * entry.force_range_n
                 or np.abs(reading.wrench[3:]).max() >= 0.999 * entry.torque_range_nm):
-            raw = np.full(6, np.inf)
+            # Not rotated: infinity times zero is no number.
+            return np.full(6, np.inf)
         rotation = self._base[:3, :3] @ flange[:3, :3]
         lever = -rotation @ self._tool[:3, 3]
         return -turned_wrench(rotation, raw - self.bias, lever)

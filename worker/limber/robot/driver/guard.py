@@ -17,6 +17,7 @@ import numpy as np
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
+from limber.robot.cell.controller_settings import SteadySettings
 from limber.robot.interface import Arm, Sample
 from limber.robot.ratings import within_ratings
 
@@ -159,6 +160,7 @@ class Guard:
         self.reason = ""
         self._memory = _Memory()
         self._is_tared = False
+        self._set = SteadySettings(arm)
 
     # Actions of a person
 
@@ -263,7 +265,7 @@ class Guard:
         last, self._memory.grasp = self._memory.grasp, grasp
         self._memory.way = None if last is None or grasp is None else grasp - last
         for check in (self._check_clock(sample), self._check_modes(sample),
-                      self._check_wrench(sample, wrench, raw),
+                      self._check_wrench(sample, wrench, raw), self._check_settings(sample),
                       self._check_place(sample, grasp, sent),
                       self._check_expected(wrench, expected, uncertainty)):
             if check.verdict == Verdict.STOP:
@@ -337,6 +339,10 @@ class Guard:
                               sample.clock - memory.frozen_since, self._settings.frozen_time)
         return self.feel(wrench)
 
+    def _check_settings(self, sample: Sample) -> Decision:
+        changed = self._set.change(sample)
+        return _GO if changed is None else self._stop(changed)
+
     def feel(self, wrench: np.ndarray) -> Decision:
         """Judge a force [6] by the hard limits alone: it arrived between two samples."""
         limits = self._settings.limits
@@ -345,6 +351,8 @@ class Guard:
             return _GO
         if np.isnan(wrench).any():
             return self._stop("a sensor gives no number")
+        if np.isinf(wrench).any():
+            return self._stop("the force sensor is at the end of its range")
         force, torque = length(wrench[:3]), length(wrench[3:])
         most_force, most_torque = limits.hard_force_n, limits.hard_torque_nm
         told = "hard {} limit"
@@ -525,5 +533,6 @@ def _allowed(off: np.ndarray, covariance: np.ndarray, least: float, most: float)
     return float(1.0 / np.sqrt((along**2 / radii).sum()))
 
 
-_SAFETY = {3: "protective stop", 4: "recovery mode", 5: "safeguard stop", 6: "emergency stop",
-           7: "emergency stop", 8: "safety violation", 9: "safety fault"}
+_SAFETY = {2: "reduced mode: the controller holds other limits", 3: "protective stop",
+           4: "recovery mode", 5: "safeguard stop", 6: "emergency stop", 7: "emergency stop",
+           8: "safety violation", 9: "safety fault"}

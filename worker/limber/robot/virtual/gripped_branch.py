@@ -54,6 +54,8 @@ class HeldBranch:
         self._past: deque[Solution] = deque(maxlen=_PAST)
         self._twist, self._last_patch = np.zeros(6), np.eye(4)
         self._gripper = self._closed_at = np.eye(4)
+        self.creep = 0.0
+        """Part of the gripper's motion by which the branch slides back in the jaws: slow slip."""
         self._view: dict[str, Any] | None = None
         self._is_looking = False
         self.picture: bytes | None = None
@@ -73,7 +75,7 @@ class HeldBranch:
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         """Return the wrench of the branch on the flange, flange frame, shape [6]."""
-        self._gripper = self._base @ flange @ self._tool
+        before, self._gripper = self._gripper, self._base @ flange @ self._tool
         self._take_picture()
         if self.state == "closing" and not self._is_looking:
             self._close_jaws()
@@ -81,6 +83,8 @@ class HeldBranch:
             return np.zeros(6)
         self._age += seconds
         self._asked_age += seconds
+        if self.creep > 0.0:
+            self._move_in_jaws(-self.creep * (self._gripper[:3, 3] - before[:3, 3]))
         patch = self._gripper @ self._offset
         self._follow_twist(patch, seconds)
         if not self._is_looking:
@@ -132,6 +136,7 @@ class HeldBranch:
 
     def release(self) -> None:
         """Open the gripper: the branch returns to rest."""
+        self.creep = 0.0
         self.lose("free")
 
     def lose(self, how: str) -> None:
@@ -143,8 +148,12 @@ class HeldBranch:
         if self._solution is None:
             return
         step = np.linalg.solve(self._solution.stiffness[:3, :3], self._solution.wrench[:3])
+        self._move_in_jaws(-part * step)
+
+    def _move_in_jaws(self, way: np.ndarray) -> None:
+        """Move the branch by ``way`` [m], shape [3], while the gripper stays."""
         moved = np.eye(4)
-        moved[:3, 3] = -part * step
+        moved[:3, 3] = way
         self._offset = inverse_of(self._gripper) @ moved @ self._gripper @ self._offset
 
     def close(self) -> None:

@@ -145,7 +145,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
               options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
     from limber.robot.driver.link import RobotLink
     from limber.robot.driver.live_force import LiveForce
-    from limber.robot.pull_plausibility import PullPlausibility
+    from limber.robot.pull_plausibility import PullPlausibility, off_axis
     from limber.robot.recorder import MarkerStream, PullRecorder
     from limber.stages.pulls.record_prediction import predicted_pull
 
@@ -169,7 +169,9 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 link.stop()
         with live, RobotLink(cell, take) as link:
             sample = link.wait_for_samples()
-            point = _grasp_point(branch, sample[1:4])
+            point, off = _grasp_point(branch, sample[1:4])
+            if told := off_axis(cell, sample[1:4], off):
+                progress.warn(told)
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
             # Before the tare: during long work the sensor would drift.
@@ -216,11 +218,11 @@ def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder],
 
 
 def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
-    """``reached``, or why the pull was stopped: by the guard, or because of a sensor fault."""
+    """``reached``, or why the pull was stopped: by the guard, or by an implausible force."""
     if event["event"] == "reached":
         return "reached"
     reason = doubts[0].reason if doubts else None
-    return event["reason"] if reason is None else f"the force sensor cannot be right: {reason}"
+    return event["reason"] if reason is None else f"implausible: {reason}"
 
 
 def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder,
@@ -296,8 +298,9 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
                           pause=settings.pause, start=joints, blocked=blocked)
 
 
-def _grasp_point(branch: Branch, gripper: np.ndarray) -> np.ndarray:
-    """The branch's axis nearest to the gripper's middle [3], branch frame [m], shape [3]."""
+def _grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float]:
+    """The branch's axis nearest to the gripper's middle [3], branch frame [m], shape [3]; and how
+    far away it is [m]."""
     from limber.store.loading import load_skeleton
 
     skeleton = load_skeleton(branch)
@@ -314,7 +317,7 @@ def _grasp_point(branch: Branch, gripper: np.ndarray) -> np.ndarray:
         raise InputError(f"The gripper is {1000 * distance:.0f} mm away from the branch's axis.",
                          "It would close on nothing, or the calibration is wrong.",
                          "Move it onto the branch, or calibrate again.")
-    return nearest
+    return nearest, distance
 
 
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],

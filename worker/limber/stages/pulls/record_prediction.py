@@ -1,4 +1,4 @@
-"""Predicted force at the beginning of a recorded pull, by the branch's model."""
+"""Predicted force along the first way out of a recorded pull, by the branch's model."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
     from limber.robot.motion.trajectory import Trajectory
 
-_PLACES = (0.35, 0.7, 1.0)  # of the way that is looked at
+_PLACES = (0.35, 0.7, 1.0)  # of the way in which a wrong sensor is noticed
+_STEP_M = 0.02  # between places beyond it
+_BENT = 1.1  # times the distance from the start: a longer way is no longer one direction
 _DEVIATIONS, _LEAST_FACTOR = 3.0, 2.0
 
 
 def predicted_pull(branch: Branch, cell: Cell, point: np.ndarray, trajectory: Trajectory,
                    progress: Progress) -> PredictedPull | None:
-    """Return the forces of the first :data:`.LOOKED_M` of a pull; None without a usable model.
+    """Return the forces on the first way out of a pull; None without a usable model.
+
+    Beyond the first :data:`.LOOKED_M` they end where the model does not converge any more.
 
     Args:
         point: Position of the grasp, branch frame [m], shape [3].
@@ -37,19 +41,39 @@ def predicted_pull(branch: Branch, cell: Cell, point: np.ndarray, trajectory: Tr
         deviation = young_deviation(branch)
         grasp = Grasp.gripping(model.mesh, point, GRASP_RADIUS_M)
         frames = matrices(np.array(cell.base.pose)) @ matrices(trajectory.poses)
-        away = np.linalg.norm(frames[:, :3, 3] - frames[0, :3, 3], axis=1)
-        out = int(np.argmax(away >= min(LOOKED_M, 0.999 * away.max())))
-        chosen = np.unique([int(np.argmax(away[:out + 1] >= part * away[out]))
-                            for part in _PLACES])
+        chosen, away = _places(frames[:, :3, 3])
         rest = np.eye(4)
         rest[:3, 3] = point
         poses = pose_vectors(frames[chosen] @ inverted(frames[0]) @ rest)
         results = follow_poses(model.gripped(grasp), grasp, poses)
-        forces = np.array([result.require().reaction_force for result in results])
+        forces = [result.require().reaction_force for result in results[:len(_PLACES)]]
+        for result in results[len(_PLACES):]:
+            if not result.converged:
+                break
+            forces.append(result.reaction_force)
     except LimberError as error:
         progress.warn(f"The force of this pull could not be predicted ({error}), so the sensor's "
                       "sign and axes are not checked by it.")
         return None
     factor = None if deviation is None else max(float(np.exp(_DEVIATIONS * deviation)),
                                                 _LEAST_FACTOR)
-    return PredictedPull(np.r_[0.0, away[chosen]], np.vstack([np.zeros(3), forces]), factor)
+    return PredictedPull(np.r_[0.0, away[:len(forces)]],
+                         np.vstack([np.zeros(3), *forces]), factor)
+
+
+def _places(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of ``positions`` [n, 3] at which the force is predicted, and their ways [m]."""
+    away = np.linalg.norm(positions - positions[0], axis=1)
+    passed = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    # Beyond a corner, or on the way back, the distance does not tell the place any more.
+    straight = away[:int(np.argmin(np.r_[passed <= _BENT * away + 1e-6, False]))]
+    end = int(np.argmax(straight >= 0.999 * straight.max()))
+    looked = min(LOOKED_M, away[end])
+    wanted = [part * looked for part in _PLACES]
+    beyond = away[end] - looked
+    if beyond > 0.0:
+        count = int(np.ceil(beyond / _STEP_M))
+        wanted += (looked + beyond * np.arange(1, count + 1) / count).tolist()
+    chosen = np.array([int(np.argmax(away[:end + 1] >= min(place, away[end])))
+                       for place in wanted])
+    return chosen, away[chosen]
