@@ -12,9 +12,12 @@ from benchmarks.half_open import DIRECTIONS, Cable
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
     FAULTS,
+    MORE_FAULTS,
     cell_for,
+    model_for,
     new_robot,
     provoke,
+    restored,
     set_off,
     straight,
     tared,
@@ -30,11 +33,22 @@ from limber.robot.operator_decisions import _force_left, retreat_if_chosen
 pytest.importorskip("rtde_control")
 
 
-@pytest.mark.parametrize("name", [name for name in FAULTS if name not in ENDS_ROBOT])
-def test_every_fault_ends_in_standstill_and_a_report(e_series, name):
-    """At 50 mm/s: standing within 0.6 s, most of them within a few millimetres."""
-    outcome = provoke(name, e_series, cell_for(e_series.address))
-    assert outcome.report
+@pytest.mark.parametrize("name", [
+    *(name for name in FAULTS if name not in ENDS_ROBOT),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in MORE_FAULTS)])
+def test_every_fault_ends_in_standstill_and_a_report(robots, name):
+    """At 50 mm/s: standing within 0.6 s, most of them within a few millimetres.
+
+    Those of the bench's longer list are slow: two seconds each, and nobody waits for the robot.
+    """
+    robot = robots[model_for(name)]
+    restored(robot)
+    outcome = provoke(name, robot, cell_for(robot.address, robot.model))
+    assert outcome.is_named, outcome.report
+    if name == "slow push":
+        # It begins softly: the force has to grow first, by 5 N a second of a busy machine.
+        assert outcome.way_m < 0.1
+        return
     assert outcome.standstill_s < 0.6 and outcome.way_m < 0.03
 
 

@@ -1,6 +1,7 @@
-"""Faults of a robot while it moves: each must end in standstill and a report."""
+"""Faults of a robot while it moves: each must end in standstill, and a report that names it."""
 
 import os
+import re
 import signal
 import socket
 import time
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.half_open import Cable, Direction
 from limber.core.errors import LimberError
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import RobotLink
@@ -31,12 +33,14 @@ class Outcome:
 
     Attributes:
         report: Message to the user.
+        is_named: Whether it says what the fault is.
         standstill_s: From the fault until the arm was at standstill, by its own state; NaN if the
             robot itself is gone.
         way_m: Distance that the tool still moved.
     """
 
     report: str
+    is_named: bool
     standstill_s: float
     way_m: float
 
@@ -68,7 +72,78 @@ FAULTS: dict[str, Fault] = {
     "two clients": lambda robot, link: _another_program(robot.address),
     "drift of 4 N": _asked("added_wrench", wrench=[0, 0, 4.2, 0, 0, 0]),
 }
+"""The faults of a first robot; the tests provoke each."""
+
+
+def _slow_push(robot: VirtualRobot, link: RobotLink) -> None:
+    """A force that grows by 5 N a second, as of something that is pushed along."""
+    for force in np.arange(0.0, 8.0, 0.1):
+        robot.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
+        time.sleep(0.02)
+
+
+def _button_and_back(robot: VirtualRobot, link: RobotLink) -> None:
+    """An emergency stop that is reset before anybody can have looked."""
+    robot.ask("emergency_stop")
+    robot.ask("reset_emergency")
+
+
+MORE_FAULTS: dict[str, Fault] = {
+    "slider at 0": _asked("slider", value=0.0),
+    "slider at a fifth": _asked("slider", value=0.2),
+    "paused on the pendant": _asked("pause"),
+    "safeguard stop": _asked("safeguard_stop"),
+    "reduced mode": _asked("reduced"),
+    "arm switched off": _asked("power_off"),
+    "emergency stop, reset at once": _button_and_back,
+    "tool moved by 5 mm": _asked("tool", offset=[0.005, 0, 0, 0, 0, 0]),
+    "tool turned by 3 degrees": _asked("tool", offset=[0, 0, 0, 0, 0.052, 0]),
+    "payload changed by 0.3 kg": _asked("payload", value=0.3),
+    "sensor at its range": _asked("added_wrench", wrench=[150, 0, 0, 0, 0, 0]),
+    "slow push": _slow_push,
+    "joints are no numbers": _asked("joints_nan"),
+    "clock stands": _asked("clock_stands"),
+    "clock runs backwards": _asked("clock_jump", value=-1.0),
+    "cable carries nothing to the robot": lambda robot, link: None,
+    "cable carries nothing from the robot": lambda robot, link: None,
+    "FT300 silent": _asked("ft300_fault", value="silent"),
+    "FT300 sends nonsense": _asked("ft300_fault", value="nonsense"),
+    "FT300 cut off": _asked("ft300_fault", value="cut"),
+    "FT300 force spike": _asked("added_wrench", wrench=[0, 0, 40, 0, 0, 0]),
+    "FT300 frozen": _asked("frozen_sensor"),
+}
+"""Further ones, for the bench; in the tests they are slow."""
+EVERY = FAULTS | MORE_FAULTS
 ENDS_ROBOT = ("controller killed",)
+_DIRECTIONS: dict[str, Direction] = {
+    "cable carries nothing to the robot": "to the robot",
+    "cable carries nothing from the robot": "from the robot"}
+_WORDS = {
+    "connection cut": "lost|closed|no data", "controller killed": "lost|closed|no data",
+    "protective stop": "protective stop", "emergency stop": "emergency stop",
+    "local mode": "program", "program stopped": "program", "silent port": "no data",
+    "frozen sensor": "frozen", "sensor NaN": "no number", "force spike": "force",
+    "torque limit": "torque", "clock jump": "clock jumped", "worker killed": "driver has ended",
+    "add-on closed": "program that drives the robot|driver", "200 ms cable delay": "no data",
+    "keep-alive starved": "no data|program", "two clients": "program", "drift of 4 N": "force",
+    "slider at 0": "left its path", "slider at a fifth": "left its path",
+    "paused on the pendant": "program", "safeguard stop": "safeguard stop",
+    "reduced mode": "reduced mode", "arm switched off": "not running|program",
+    "emergency stop, reset at once": "emergency stop|program",
+    "tool moved by 5 mm": "tool centre point .* 5.0 mm",
+    "tool turned by 3 degrees": "tool centre point .* 3.0 degrees",
+    "payload changed by 0.3 kg": "payload", "sensor at its range": "end of its range",
+    "slow push": "force", "joints are no numbers": "no number", "clock stands": "clock",
+    "clock runs backwards": "clock", "cable carries nothing to the robot": "program|answer",
+    "cable carries nothing from the robot": "no data|answer", "FT300 silent": "silent",
+    "FT300 sends nonsense": "silent", "FT300 cut off": "FT300 closed", "FT300 force spike": "force",
+    "FT300 frozen": "frozen"}
+"""What the report of each must contain, as a regular expression."""
+
+
+def model_for(name: str) -> str:
+    """Return the arm on which a fault is provoked."""
+    return "ur5" if name.startswith("FT300") else "ur5e"
 
 
 def _another_program(address: str) -> None:
@@ -125,24 +200,27 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
     Raises:
         AssertionError: it did not come to a standstill, or nothing was reported.
     """
+    direction = _DIRECTIONS.get(name)
+    if direction is None:
+        fault = EVERY[name]
+        return _provoked(name, robot, cell, lambda link: fault(robot, link), seconds)
+    number = int(cell.robot.address.rsplit(".", 1)[-1])
+    address = f"127.0.0.{number + 60}"
+    with Cable(address, cell.robot.address) as cable:
+        beyond = cell.model_copy(update={"robot": cell.robot.model_copy(update={
+            "address": address})})
+        return _provoked(name, robot, beyond, lambda link: cable.cut(direction), seconds)
+
+
+def _provoked(name: str, robot: VirtualRobot, cell: Cell, fault: Callable[[RobotLink], None],
+              seconds: float) -> Outcome:
     with RobotLink(cell) as link:
         before = set_off(robot, link, straight(robot, (0.0, 0.2, 0.0)))
         began = time.monotonic()
-        FAULTS[name](robot, link)
+        fault(link)
         standstill, way = float("nan"), float("nan")
         if name not in ENDS_ROBOT:
-            while True:
-                state = robot.state
-                now = time.monotonic() - began
-                if np.linalg.norm(state["tool_speed"][:3]) < STILL_M_S:
-                    standstill = now
-                    break
-                assert now < seconds, f"{name}: still moving after {seconds} s"
-                time.sleep(0.002)
-            time.sleep(0.3)
-            after = robot.state
-            assert np.linalg.norm(after["tool_speed"][:3]) < STILL_M_S, f"{name}: moves again"
-            way = float(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))
+            standstill, way = _stood(name, robot, before, began, seconds)
         if name == "keep-alive starved":
             os.kill(link.process.pid, signal.SIGCONT)
         try:
@@ -150,14 +228,32 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
         except LimberError as error:
             report = str(error)
     assert report, f"{name}: nothing was reported"
-    return Outcome(report, standstill, way)
+    return Outcome(report, re.search(_WORDS[name], report) is not None, standstill, way)
+
+
+def _stood(name: str, robot: VirtualRobot, before: dict[str, Any], began: float, seconds: float,
+           ) -> tuple[float, float]:
+    """Wait until the arm stands, and look again; returns when [s], and its way since [m]."""
+    while True:
+        state = robot.state
+        standstill = time.monotonic() - began
+        if np.linalg.norm(state["tool_speed"][:3]) < STILL_M_S:
+            break
+        assert standstill < seconds, f"{name}: still moving after {seconds} s"
+        time.sleep(0.002)
+    time.sleep(0.3)
+    after = robot.state
+    assert np.linalg.norm(after["tool_speed"][:3]) < STILL_M_S, f"{name}: moves again"
+    flanges = arm_named(robot.model).forward(np.array([before["joints"], after["joints"]]))
+    return standstill, float(np.linalg.norm(flanges[1, :3, 3] - flanges[0, :3, 3]))
 
 
 def restored(robot: VirtualRobot) -> None:
     """Restore a robot after a fault, as a person at its pendant would."""
     for action, values in (("silent", False), ("delay", 0.0), ("frozen_sensor", False),
                            ("sensor_nan", False), ("clock_jump", 0.0), ("slider", 1.0),
-                           ("outputs", 0)):
+                           ("outputs", 0), ("joints_nan", False), ("clock_stands", False),
+                           ("ft300_fault", ""), ("payload", 0.0)):
         robot.ask(action, value=values)
     robot.ask("added_wrench", wrench=[0.0] * 6)
     robot.ask("unlock")
