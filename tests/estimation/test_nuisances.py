@@ -7,19 +7,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.paper_branches import measured
+from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.errors import WorkError
 from limber.estimation.fit import fit_pulls
 from limber.estimation.fit_preparation import is_path_observed
 from limber.estimation.fitting.initial_modulus import FALL, led_start, standing_start
-from limber.estimation.fitting.nuisances import eliminated, in_words, unlikely
+from limber.estimation.fitting.nuisances import eliminated, in_words, told, unlikely
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward import quasi_static
 from limber.estimation.forward.observed_path import ObservedPathForward
+from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.path_error import led_by_path, path_error
 from limber.estimation.uncertainty.variance_parts import ADVICE, largest, variance_parts
+from limber.estimation.virtual_cell import marked_points
 from limber.recordings.cell_errors import EXACT, CalibrationEntry
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
 from limber.recordings.synchronisation import frames_of
@@ -113,6 +115,44 @@ def test_a_cell_that_is_off_does_not_move_the_moduli(found):
     assert np.all((low < TRUTH) & (TRUTH < high))
     assert np.all(high / low < 4)
     assert found.fit.converged and found.uncertainty.variance_factor < 1.3
+
+
+def test_a_point_that_is_off_along_the_branch_is_told_as_that(small, small_bench, small_pull):
+    """8 mm off, as where a scan's tip is short: not a shift of the camera to within 0.2 mm."""
+    pull = measured(small_pull, 3, points=5e-4, force=0.01)
+    places = np.array(small_pull.entry.rest_points_m)
+    off = marked_points(small.skeleton, FRACTIONS, np.array([0.0, 0.0, 8e-3, 0.0]))
+    entry = pull.entry.model_copy(update={
+        "calibration": CalibrationEntry(force_bias_sigma_n=0.0, force_drift_sigma_n=0.0),
+        "rest_points_m": tuple(map(tuple, (2 * places - off).tolist()))})
+    objective = objective_of(small_bench, replace(pull, entry=entry))
+    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
+                                    jacobian=True)
+    listed = {each["name"]: each for each in told(
+        objective.cell_errors.nuisances, evaluation.errors, np.zeros((4, 4)))}
+    point = listed["position of point 3 along the branch"]
+    assert point["value"] == pytest.approx(8e-3, abs=1.5e-3) and point["explains_misfit"]
+    low, high = point["interval"]
+    assert low < 8e-3 < high
+    camera = listed["camera position z"]
+    assert not camera["explains_misfit"]
+    assert camera["interval"][1] - camera["interval"][0] > 1e-3
+    # Without such an error the same pull has no place in the model.
+    assert evaluation.mean_square < 1.5
+
+
+def test_directions_bend_with_the_branch(small, small_bench):
+    """At rest along the axis; turned with a rigid rotation of all nodes."""
+    mesh = small_bench.mesh
+    found = PointDirections.at(mesh, small_bench.points)
+    step = 1e-3 / small.length
+    ahead, behind = (np.array([small.skeleton.point_at(each + sign * step)
+                               for each in FRACTIONS]) for sign in (1, -1))
+    axis = (ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True)
+    assert np.sum(found.rest * axis, axis=1) == pytest.approx(np.ones(4), abs=2e-3)
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2])
+    moved = turn.apply(mesh.nodes) - mesh.nodes
+    assert found.bent(moved) == pytest.approx(turn.apply(found.rest), abs=1e-6)
 
 
 @pytest.mark.slow

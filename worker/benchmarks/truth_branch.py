@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from benchmarks.paper_branches import PaperBranch
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.next_pull import PullChoice
-from limber.estimation.virtual_cell import CellErrors
+from limber.estimation.virtual_cell import CellErrors, marked_points
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
@@ -100,8 +100,12 @@ def log_field(form: str, mesh: TetMesh, branch: PaperBranch, rng: np.random.Gene
     return inside(np.clip(along, places[0], places[-1])) + beyond
 
 
-def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0) -> Pull:
-    """One pull without measurement errors; its force is rotated by ``turn``."""
+def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0, *,
+               shifts: np.ndarray | float = 0.0) -> Pull:
+    """One pull without measurement errors; its force is rotated by ``turn``.
+
+    ``shifts``: distances of the observed points along the branch from the control points [m].
+    """
     branch = truth.branch
     skeleton, mesh = branch.skeleton, truth.model.mesh
     point = skeleton.point_at(choice.fraction)
@@ -116,6 +120,7 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0)
         kind="pull", point=point, axis=point - skeleton.nodes[0],
         travel=choice.reach * choice.fraction * branch.length, turn=turn, phase=choice.phase,
         times=states, weight=np.zeros(3)))
+    points = marked_points(skeleton, FRACTIONS, shifts)
     operator = point_operator(mesh, points)
     seen = np.array([points + (operator @ each.ravel()).reshape(-1, 3)
                      for each in made.displacements])

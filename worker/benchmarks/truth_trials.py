@@ -93,14 +93,18 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
     truth = drawn_truth(rng)
     cell = CellErrors.drawn(calibration, rng)
     first = replace(FIRST_PULL, phase=rng.uniform(0, 2 * np.pi))
-    pulls = [recorded(exact_pull(truth, 0, first, FIRST_TURN), cell, rng)]
+
+    def off() -> np.ndarray:
+        return calibration.point_sigma_m * rng.standard_normal(len(FRACTIONS))
+
+    pulls = [recorded(exact_pull(truth, 0, first, FIRST_TURN, shifts=off()), cell, rng)]
     started = time.perf_counter()
     subject = fitting_subject(truth)
     try:
         found = _estimated(pulls, subject, settings)
         while len(pulls) < pull_count:
             choice = _suggested(found, pulls, subject, settings)
-            pulls.append(recorded(exact_pull(truth, len(pulls), choice), cell, rng))
+            pulls.append(recorded(exact_pull(truth, len(pulls), choice, shifts=off()), cell, rng))
             found = _estimated(pulls, subject, settings)
     except Cancelled:
         # Stopped from outside: not a trial.

@@ -127,7 +127,7 @@ class VirtualPullSettings(Settings):
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
         "errors of the cell": ("cell_errors", "pose_sigma", "pose_turn_sigma", "force_gain_sigma",
             "force_bias_sigma", "force_drift_sigma", "torque_bias_sigma", "camera_sigma",
-            "camera_turn_sigma", "clock_sigma"),
+            "camera_turn_sigma", "point_sigma", "clock_sigma"),
     }
     common = ("cell_errors", "seed")
 
@@ -187,7 +187,8 @@ class VirtualPullSettings(Settings):
     cell_errors: Literal["none", "realistic"] = Field(
         "none", description="Errors of the cell that stay during the recording, drawn from the "
         "seed. realistic: those of a cell that was set up with care and not measured since "
-        "(gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, camera 1 mm). The pull "
+        "(gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, camera 1 mm, points 5 mm "
+        "along the branch). The pull "
         "states their standard deviations as its calibration. Each can be set by its own option.")
     pose_sigma: float | None = Field(
         None, ge=0, description="Error of the position of the gripper's frame, each axis [m].")
@@ -204,6 +205,9 @@ class VirtualPullSettings(Settings):
         None, ge=0, description="Error of the position of the observer's frame, each axis [m].")
     camera_turn_sigma: float | None = Field(
         None, ge=0, description="Error of the rotation of the observer's frame, each axis [rad].")
+    point_sigma: float | None = Field(
+        None, ge=0, description="Distance of each observed point along the branch from its control "
+        "point [m].")
     clock_sigma: float | None = Field(
         None, ge=0, description="Offset of the observer's clock from the robot's [s].")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
@@ -220,6 +224,7 @@ class VirtualPullSettings(Settings):
                  "force_drift_sigma_n": self.force_drift_sigma,
                  "torque_bias_sigma_nm": self.torque_bias_sigma,
                  "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
+                 "point_sigma_m": self.point_sigma,
                  "clock_sigma_s": self.clock_sigma}
         return begun.model_copy(update={
             name: value for name, value in given.items() if value is not None})

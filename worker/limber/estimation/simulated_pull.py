@@ -19,7 +19,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.uncertainty.model_error import refined
-from limber.estimation.virtual_cell import CellErrors
+from limber.estimation.virtual_cell import CellErrors, marked_points
 from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
@@ -143,8 +143,9 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
         turn=settings.turn, phase=phase, times=settings.times,
         weight=(settings.weight or 0.0) * np.array(truth.gravity)
         / np.linalg.norm(truth.gravity)), progress=progress)
-    operator = point_operator(truth.mesh, truth.control_points)
-    positions = np.array([truth.control_points + (operator @ displacement.ravel()).reshape(-1, 3)
+    shifts, points = _marked(truth, settings)
+    operator = point_operator(truth.mesh, points)
+    positions = np.array([points + (operator @ displacement.ravel()).reshape(-1, 3)
                           for displacement in made.displacements])
     sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
              for part in (slice(0, 3), slice(3, 6))]
@@ -153,7 +154,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     if settings.calibration != EXACT:
         exact = Pull(name, entry, settings.times, poses, wrenches,
                      Observations(settings.times, positions))
-        entry, poses, wrenches, positions = _misread(exact, settings)
+        entry, poses, wrenches, positions = _misread(exact, shifts, settings)
     wrenches[:, :3] += settings.force_noise * sizes[0] * rng.standard_normal((count, 3))
     positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
     stray = rng.random(positions.shape[:2]) < settings.outliers
@@ -169,7 +170,18 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     return pull, made.displacements
 
 
-def _misread(exact: Pull, settings: VirtualPullSettings,
+def _marked(truth: TrueBranch, settings: VirtualPullSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the observed points along the branch from the control points [m], [K], and where
+    they are [m], [K, 3].
+    """
+    rng = np.random.default_rng([settings.seed, 4])
+    shifts = settings.calibration.point_sigma_m * rng.standard_normal(len(truth.fractions))
+    points = (marked_points(truth.skeleton, truth.fractions, shifts) if shifts.any()
+              else truth.control_points)
+    return shifts, points
+
+
+def _misread(exact: Pull, shifts: np.ndarray, settings: VirtualPullSettings,
              ) -> tuple[PullEntry, np.ndarray, np.ndarray, np.ndarray]:
     """Return entry, poses, wrenches and positions as a cell with errors records them."""
     if settings.camera:
@@ -181,7 +193,8 @@ def _misread(exact: Pull, settings: VirtualPullSettings,
     seen = errors.recorded(exact, rng)
     observed = present(seen.observations, "observed points")
     entry = seen.entry.model_copy(update={
-        "truth": {**(exact.entry.truth or {}), "cell_errors": errors.truth}})
+        "truth": {**(exact.entry.truth or {}), "cell_errors": errors.truth | {
+            "point_shifts_m": shifts.tolist()}}})
     return entry, seen.poses, seen.wrenches, observed.positions
 
 

@@ -1,5 +1,6 @@
 """Simulated errors of a cell: drawn once, then applied to its recordings."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -7,6 +8,8 @@ import numpy as np
 import scipy
 
 from limber.core.numerics.rigid import composed, rotated
+from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull
 
@@ -84,3 +87,17 @@ class CellErrors:
         at = spline(np.clip(times + late, times[0], times[-1]))
         turned = rotated(self.camera_turn, (at - middle).reshape(-1, 3)).reshape(at.shape)
         return middle + turned + self.camera_place
+
+
+def marked_points(skeleton: Skeleton, fractions: Sequence[float],
+                  shifts: np.ndarray | float) -> np.ndarray:
+    """Return where points really are that were meant to be on the control points [m], shape [K, 3].
+
+    Args:
+        skeleton: The true axes.
+        fractions: Positions of the control points on the main path.
+        shifts: Distances along the branch from there [m], shape [K], or of all.
+    """
+    length = skeleton.arc_length[skeleton.main_path()[-1]]
+    return control_points(skeleton, tuple(np.clip(
+        np.array(fractions) + shifts / length, 0.01, 0.99).tolist()))

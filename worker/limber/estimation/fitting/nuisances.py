@@ -1,7 +1,7 @@
 """Errors of cell and sensors as unknowns of a fit, and their effect on the measurements.
 
-Gripper frame, zero and gain of the force, camera frame, clock and slip of the grasp are constant
-during a recording. If they are taken as exact, their errors end up in the moduli (1 mm of the
+Gripper frame, zero and gain of the force, camera frame, clock, slip of the grasp and places of the
+observed points are constant during a recording. If they are taken as exact, their errors end up in the moduli (1 mm of the
 gripper's pose: over 60 %). To first order each changes the predicted measurements linearly. All of
 them are therefore eliminated from the residuals together with their priors (variable projection,
 Golub and Pereyra 1973, with the prior as further rows). The remaining residuals depend on the
@@ -137,6 +137,7 @@ class _Pull:
     frames: Frames
     pivot: np.ndarray
     tangent: np.ndarray | None
+    directions: np.ndarray | None
     positions: np.ndarray
     forces: np.ndarray
 
@@ -194,7 +195,7 @@ class CellErrors:
                  **{kind: np.zeros((len(frames), 3, count))
                     for kind in ("forces", "torques", "grasps")}}
         pull = _Pull(forward.entry, frames, self._pivots[calibration_of(forward.entry)],
-                     forward.grasp_tangent, positions, forces)
+                     forward.grasp_tangent, forward.point_directions, positions, forces)
         for source, used in self._places[index]:
             for kind, slope in source.slopes(pull).items():
                 total[kind][..., used] += slope * np.array(source.sigma)
@@ -214,6 +215,10 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
         add([f"camera position {axis}" for axis in AXES], "m", known.camera_sigma_m, True, _shifted)
         add([f"camera rotation about {axis}" for axis in AXES], "rad", known.camera_sigma_rad, True,
             _turned)
+        # Scan and observation locate a point on the branch each in its own way, in each pull.
+        add([f"position of point {number + 1} along the branch"
+             for number in range(forward.frames.positions.shape[1])], "m", known.point_sigma_m,
+            False, _along)
         if len(forward.frames) > 3:
             add(["camera clock"], "s", known.clock_sigma_s, False, _late)
     if forward.uses_force and not forward.force_is_stated:
@@ -258,6 +263,12 @@ def _shifted(pull: _Pull) -> dict[str, np.ndarray]:
 def _turned(pull: _Pull) -> dict[str, np.ndarray]:
     middle = pull.positions.mean(axis=(0, 1))
     return {"points": _rotations(pull.positions - middle)}
+
+
+def _along(pull: _Pull) -> dict[str, np.ndarray]:
+    """Each point alone moves along the branch, which bends with it."""
+    directions = present(pull.directions, "direction of the branch at the observed points")
+    return {"points": directions[..., None] * np.eye(directions.shape[1])[:, None, :]}
 
 
 def _late(pull: _Pull) -> dict[str, np.ndarray]:

@@ -73,6 +73,7 @@ class CorrectedForward(Forward):
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
         found = self.reduced.simulate(values, extra, sensitivities)
+        self.point_directions = self.reduced.point_directions
         known = self._correction
         if found is None or known is None:
             return found

@@ -53,6 +53,7 @@ class DynamicForward(Forward):
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._model = under_its_weight(model, entry).gripped(self.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
+        self._directions = self._directions_on(model.mesh)
         # Only the nodes that determine the observed points need derivatives.
         self._nodes = np.unique(self._operator.indices // 3)
         columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
@@ -80,6 +81,9 @@ class DynamicForward(Forward):
             return None
         moved = (self._operator @ result.displacement.reshape(len(frames), -1).T).T
         positions = self.rest_points + moved.reshape(len(frames), -1, 3)
+        if self._directions is not None:
+            self.point_directions = np.array([self._directions.bent(each)
+                                              for each in result.displacement])
         forces = result.reaction_force if by_pose else self._forces
         if not sensitivities:
             return Simulated(positions, forces)

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.estimation.forward.input_force import Response
+from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.parameters import Values
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recording import PullEntry
@@ -64,6 +66,8 @@ class Forward(ABC):
         uses_torque: Whether the torque is compared too.
         grasp_tangent: Direction of the branch at the grasp, at all frames of the last simulation,
             shape [f, 3], if the gripper's path is an observation.
+        point_directions: Direction of the branch at the observed points, at all frames of the last
+            simulation, shape [f, m, 3], if these points may be off along the branch.
     """
 
     is_dynamic = False
@@ -76,6 +80,7 @@ class Forward(ABC):
         self.response: Response | None = None
         self.uses_torque = False
         self.grasp_tangent: np.ndarray | None = None
+        self.point_directions: np.ndarray | None = None
 
     @abstractmethod
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
@@ -87,6 +92,15 @@ class Forward(ABC):
             extra: Parameters of the derivatives in addition to Young's modulus.
             sensitivities: Whether to compute derivatives.
         """
+
+    @property
+    def may_be_off_along(self) -> bool:
+        """Whether observed points may be off along the branch."""
+        return len(self.rest_points) > 0 and calibration_of(self.entry).point_sigma_m > 0
+
+    def _directions_on(self, mesh: TetMesh) -> PointDirections | None:
+        """Return the directions of the branch at the observed points, if they are needed."""
+        return PointDirections.at(mesh, self.rest_points) if self.may_be_off_along else None
 
     @property
     def drive(self) -> str:

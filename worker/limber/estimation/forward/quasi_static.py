@@ -99,6 +99,7 @@ class QuasiStaticForward(Forward):
         self._model = under_its_weight(model, entry).gripped(self.grasp)
         self.uses_torque = uses_torque(entry, frames)
         self._operator = point_operator(model.mesh, self.rest_points)
+        self._directions = self._directions_on(model.mesh)
         self._zero = np.zeros(6)
         self.spread = np.empty((len(frames), 0))
         self._memory: list[_Memory | None] = []
@@ -183,6 +184,9 @@ class QuasiStaticForward(Forward):
                 slope = self._enter_slopes(found, key, model, values, extra, result)
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
+        if self._directions is not None:
+            self.point_directions = np.tensordot(self.spread, [
+                self._directions.bent(state.displacement) for state in self.states()], axes=1)
         if is_asked:
             self.response = self._response(compliances)
         grasps, d_grasps = self._held(sensitivities)

@@ -52,6 +52,7 @@ class ReducedForward(Forward):
         self._reduced, self._density = reduced, density
         columns = reduced.basis.columns.reshape(reduced.size, -1)
         self._observe = np.asarray(point_operator(mesh, self.rest_points) @ columns.T)
+        self._directions = self._directions_on(mesh)
         self._poses = [pose_on(reduced.grasp, entry.grasp, pose)
                        for pose in frames.poses[self.keys]]
         self._states: list[ReducedState | None] = [None] * len(self._poses)
@@ -89,6 +90,9 @@ class ReducedForward(Forward):
                     return None
                 d_positions[index, ..., column] = (self._seen(ahead) - self._seen(behind)) / step
                 d_forces[index, :, column] = (_wrench(ahead, arm) - _wrench(behind, arm)) / step
+        if self._directions is not None:
+            self.point_directions = np.tensordot(self.spread, [
+                self._directions.bent(each) for each in self.displacements(self.keys)], axes=1)
         positions, wrenches = (
             np.tensordot(self.spread, value, axes=1) for value in (positions, forces))
         d_positions, d_wrenches = (

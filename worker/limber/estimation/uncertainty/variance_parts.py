@@ -23,6 +23,8 @@ ADVICE = {
     "zero of the force sensor": "tare the sensor before each pull, and state it under "
                                 "[calibration]",
     "camera frame": "register the camera to the branch (fixed markers), or add a second view",
+    "places of the points": "mark the points on the branch before the scan, and give their "
+                            "positions (--nominal of import-pull)",
     "clock": "record all sensors with one clock",
     "slip of the grasp": "grasp without slip, or put a marker at the grasp",
     "modulus between the control points": "add markers along the branch, or pull at another point",
@@ -41,7 +43,7 @@ ADVICE = {
 """Advice to narrow an interval, by cause."""
 
 _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
-           ("grasp position", "gripper frame"), ("slip", "slip of the grasp"),
+           ("grasp position", "gripper frame"), ("position of point", "places of the points"), ("slip", "slip of the grasp"),
            ("force gain", "force gain"), ("force", "zero of the force sensor"),
            ("curvature of the force", "zero of the force sensor"),
            ("torque", "zero of the force sensor"),
