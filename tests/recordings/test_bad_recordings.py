@@ -159,7 +159,7 @@ def estimated(branch_folder, capsys, *options, code=0):
 @pytest.mark.slow
 def test_a_pull_of_another_branch(branch_folder, capsys):
     """Markers 3 cm from where this branch has them, moving otherwise: the rest, then the loss say
-    so.
+    so, and nothing is written.
     """
     def change(source):
         def stretched(times, values):
@@ -168,8 +168,11 @@ def test_a_pull_of_another_branch(branch_folder, capsys):
             return times, points.reshape(values.shape)
         changed(source / "markers.csv", stretched)
     pull_with(branch_folder, "stranger", change)
-    line = estimated(branch_folder, capsys, "--pull", "stranger")
+    before = (branch_folder / "mesh.vtu").read_bytes()
+    line = estimated(branch_folder, capsys, "--pull", "stranger", code=3)
     assert warned(line, "at rest", "another branch") and warned(line, "fit is poor")
+    assert "does not move as the observed one" in line["error"]
+    assert (branch_folder / "mesh.vtu").read_bytes() == before
 
 
 @pytest.mark.slow

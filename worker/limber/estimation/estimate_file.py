@@ -45,6 +45,13 @@ class _Deviation(_Told):
     total: list[_Maybe] | None = None
 
 
+class _Action(_Told):
+    action: str
+    how: str
+    young_interval_pa: list[tuple[_Maybe, _Maybe]]
+    width_share: float
+
+
 class _Evaluation(_Told):
     parameters: list[_Maybe] = []
     loss_m2: _Maybe = None
@@ -101,6 +108,7 @@ class _Estimate(_Told):
     field_form: list[float] | None = None
     field_form_deviations: list[_Positive] | None = None
     causes: list[_Cause] | None = None
+    next_actions: list[_Action] | None = None
     held_out: dict[str, _Score] | None = None
     warnings: list[str] = []
     control_points_m: list[_Vector]

@@ -31,6 +31,7 @@ from limber.estimation.uncertainty.model_error import (
     observer,
     steady_loads,
 )
+from limber.estimation.uncertainty.next_actions import NextAction, Prospects
 from limber.estimation.uncertainty.path_error import led_by_path, path_error
 from limber.estimation.uncertainty.shape_error import hung_error, shape_error
 from limber.estimation.uncertainty.variance_parts import largest, variance_parts
@@ -44,6 +45,11 @@ the one whose axis ran into a twig and back reached 13, with moduli off by a fac
 """
 UNEXPLAINED_FACTOR = 1.5
 """The same, above which something acts that is not in the model."""
+UNLIKE = 0.2
+"""RMS distance of simulated from observed points over that of their motion, above which a poor fit
+is no result: the simulated branch moves otherwise. Below it the stated noise may just be too small.
+Chosen.
+"""
 WIDE = 0.15
 """Standard deviation of a log E above which advice on narrowing it is given."""
 
@@ -127,6 +133,12 @@ class Estimate:
         return parts
 
     @property
+    def next_actions(self) -> list[NextAction]:
+        """The actions that narrow the intervals most, each with the interval to expect."""
+        return Prospects(self.fit.evaluation, self.objective, self.uncertainty, self.model_error,
+                         self.values.young).best()
+
+    @property
     def is_bad(self) -> str | None:
         """Reason why the fit gives no valid result; None if it does."""
         space = self.objective.space
@@ -144,7 +156,23 @@ class Estimate:
                     f"within a factor of {np.exp(min(2 * scale, 20)):.2g}.")
         if not self.fit.converged:
             return f"The optimiser did not converge: {self.fit.reason}"
+        if self.uncertainty.variance_factor > MISFIT_FACTOR and self.unexplained > UNLIKE:
+            return (
+                "The simulated branch does not move as the observed one: the distance of the "
+                f"points is {100 * self.unexplained:.0f} % of their motion, and the residuals are "
+                f"{self.uncertainty.variance_factor**0.5:.1f} times the stated noise. The pull may "
+                "be of another branch, or the positions of its points on the branch may be wrong.")
         return None
+
+    @property
+    def unexplained(self) -> float:
+        """RMS distance of simulated from observed points over that of the observed motion."""
+        off, motion = 0.0, 0.0
+        for forward, pull in zip(self.objective.forwards, self.fit.evaluation.pulls, strict=True):
+            seen = forward.frames.positions
+            off += float(np.nansum((pull.positions - seen)**2))
+            motion += float(np.nansum((seen - forward.rest_points)**2))
+        return (off / motion)**0.5 if motion > 0 else np.inf
 
 
 def judge_fit(found: Estimate, progress: Progress) -> None:

@@ -1,12 +1,12 @@
 """Errors of cell and sensors as unknowns of a fit, and their effect on the measurements.
 
 Gripper frame, zero and gain of the force, camera frame, clock, slip of the grasp and places of the
-observed points are constant during a recording. If they are taken as exact, their errors end up in the moduli (1 mm of the
-gripper's pose: over 60 %). To first order each changes the predicted measurements linearly. All of
-them are therefore eliminated from the residuals together with their priors (variable projection,
-Golub and Pereyra 1973, with the prior as further rows). The remaining residuals depend on the
-moduli alone. The covariance of the moduli includes the errors, and the errors have their own
-covariance.
+observed points are constant during a recording. If they are taken as exact, their errors end up in
+the moduli (1 mm of the gripper's pose: over 60 %). To first order each changes the predicted
+measurements linearly. All of them are therefore eliminated from the residuals together with their
+priors (variable projection, Golub and Pereyra 1973, with the prior as further rows). The remaining
+residuals depend on the moduli alone. The covariance of the moduli includes the errors, and the
+errors have their own covariance.
 """
 
 from collections.abc import Callable, Sequence

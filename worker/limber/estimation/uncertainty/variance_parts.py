@@ -12,6 +12,7 @@ from typing import TypedDict
 import numpy as np
 
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.uncertainty.covariance import inverse_information
 
 ADVICE = {
     "noise of the points": "use more frames, more pulls, or more visible markers",
@@ -43,7 +44,8 @@ ADVICE = {
 """Advice to narrow an interval, by cause."""
 
 _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
-           ("grasp position", "gripper frame"), ("position of point", "places of the points"), ("slip", "slip of the grasp"),
+           ("grasp position", "gripper frame"), ("position of point", "places of the points"),
+           ("slip", "slip of the grasp"),
            ("force gain", "force gain"), ("force", "zero of the force sensor"),
            ("curvature of the force", "zero of the force sensor"),
            ("torque", "zero of the force sensor"),
@@ -52,9 +54,20 @@ _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "g
 
 
 @dataclass(frozen=True)
-class _Rows:
+class InformationRows:
+    """Rows of the information on all unknowns, with one origin.
+
+    Attributes:
+        cause: Cause of uncertainty.
+        rows: Over the free vector, the errors, and the unknowns of each pull's force.
+        name: Unknown of which they are the prior; empty: measurements, or a link.
+        pull: Number of the pull that they were measured in; None: a prior, or a link.
+    """
+
     cause: str
     rows: np.ndarray
+    name: str = ""
+    pull: int | None = None
 
 
 def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 1.0,
@@ -66,11 +79,8 @@ def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 
         objective: The minimised objective.
         scale: Variance of the measurements over the stated one.
     """
-    rows = _information(evaluation, objective, scale)
-    everything = np.vstack([each.rows for each in rows])
-    _, values, axes = np.linalg.svd(everything, full_matrices=False)
-    spread = axes.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
-    covariance = spread @ spread.T
+    rows = information_rows(evaluation, objective, scale)
+    covariance = inverse_information(np.vstack([each.rows for each in rows]))
     wanted = covariance[list(objective.space.groups)]
     parts: dict[str, np.ndarray] = {}
     for each in rows:
@@ -108,15 +118,18 @@ def cause_of(name: str) -> str:
     return next(cause for start, cause in _GROUPS if name.startswith(start))
 
 
-def _information(evaluation: Evaluation, objective: Objective, scale: float,
-                 ) -> list[_Rows]:
-    """Rows of all unknowns together: free vector, errors, and each pull's course of the force."""
+def information_rows(evaluation: Evaluation, objective: Objective, scale: float,
+                     ) -> list[InformationRows]:
+    """Return rows of all unknowns: free vector, errors, and each pull's course of the force.
+
+    Arguments as for :func:`variance_parts`.
+    """
     space, count = objective.space, objective.cell_errors.count
     pieces = objective.raw_slopes(evaluation)
     unknowns = [0 if piece.response is None else piece.response.shape[1] for piece in pieces]
     width = space.size + count + sum(unknowns)
     rows, start = [], space.size + count
-    for piece, unknown in zip(pieces, unknowns, strict=True):
+    for number, (piece, unknown) in enumerate(zip(pieces, unknowns, strict=True)):
         block = np.zeros((len(piece.free), width))
         block[:, :space.size] = piece.free
         block[:, space.size:space.size + count] = piece.errors
@@ -125,14 +138,15 @@ def _information(evaluation: Evaluation, objective: Objective, scale: float,
         start += unknown
         block /= np.sqrt(scale)
         kinds = np.array(piece.kinds)
-        rows += [_Rows(kind, block[kinds == kind]) for kind in dict.fromkeys(piece.kinds)]
+        rows += [InformationRows(kind, block[kinds == kind], pull=number)
+                 for kind in dict.fromkeys(piece.kinds)]
     for number, nuisance in enumerate(objective.cell_errors.nuisances):
         row = np.zeros((1, width))
         row[0, space.size + number] = 1.0
-        rows.append(_Rows(cause_of(nuisance.name), row))
+        rows.append(InformationRows(cause_of(nuisance.name), row, nuisance.name))
     own, _ = space.own_rows()
-    causes = [cause_of(name) for name, _, _ in space.priors]
-    causes += ["moduli that the pulls do not determine"] * len(space.links)
-    for cause, row in zip(causes, own, strict=True):
-        rows.append(_Rows(cause, np.r_[row, np.zeros(width - space.size)][None]))
+    names = [name for name, _, _ in space.priors] + [""] * len(space.links)
+    for name, row in zip(names, own, strict=True):
+        cause = cause_of(name) if name else "moduli that the pulls do not determine"
+        rows.append(InformationRows(cause, np.r_[row, np.zeros(width - space.size)][None], name))
     return rows

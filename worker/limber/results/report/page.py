@@ -28,6 +28,7 @@ from limber.results.motion_files import read_frames_file
 from limber.results.report import figures, loads_section, swing_section
 from limber.results.report.path_sections import energy_section, execution_section, plan_section
 from limber.results.report.report_tables import (
+    action_rows,
     cause_rows,
     deviation_rows,
     held_out_rows,
@@ -127,11 +128,12 @@ def _held_back(branch: Branch) -> list[Section]:
     rows = cause_rows(estimate)
     if not rows:
         return []
+    actions = action_rows(estimate)
     total = max((estimate.get("young_deviation") or {}).get("total") or [float("nan")])
     return [Section("What limits the estimate", text=[
         f"The largest standard deviation of Young's modulus along the branch is {100 * total:.1f} "
         "%. Its main causes follow, largest first."],
-        tables=[("", rows)])]
+        tables=[("", rows), *([("What to do next, best first", actions)] if actions else [])])]
 
 
 def _summary(branch: Branch) -> Section:

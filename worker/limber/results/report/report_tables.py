@@ -141,6 +141,22 @@ def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
                    for each in causes]
 
 
+def action_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return what to do next, best first, and the interval of E to expect after each.
+
+    Args:
+        estimate: ``next_actions``, as of
+            :meth:`limber.estimation.uncertainty.next_actions.Prospects.best`.
+    """
+    actions = estimate.get("next_actions") or []
+    if not actions:
+        return []
+    rows = [["action", "how", "intervals shrink by", "E then known to [MPa]"]]
+    return rows + [[each["action"], each["how"], f"{100 * (1 - each['width_share']):.0f} %",
+                    "; ".join(f"{low / 1e6:.4g} to {high / 1e6:.4g}"
+                              for low, high in each["young_interval_pa"])] for each in actions]
+
+
 def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     """Return how well a fit without a pull predicts that pull.
 

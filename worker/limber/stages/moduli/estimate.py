@@ -257,11 +257,18 @@ def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: Estim
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.report_tables import cause_rows, held_out_rows, modulus_rows
+    from limber.results.report.report_tables import (
+        action_rows,
+        cause_rows,
+        held_out_rows,
+        modulus_rows,
+    )
 
     tables = [("Young's modulus", modulus_rows(result, None))]
     if causes := cause_rows(result):
         tables.append(("Sources of uncertainty, largest first", causes))
+    if actions := action_rows(result):
+        tables.append(("What to do next, best first", actions))
     if held_out := held_out_rows(result):
         tables.append(("Pulls predicted by a fit without them: RMS errors", held_out))
     return tables
@@ -279,5 +286,6 @@ STAGE = StageDescription(
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
     tables=_tables, found=(
         _moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "
-        "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}."),
+        "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}.",
+        "Next: {next_actions[0][action]}, {next_actions[0][how]}."),
     then="limber energy {branch_folder}", step="estimate", label="Estimate")

@@ -68,7 +68,8 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
         ``best`` and ``others``, each with ``grasp_fraction``, ``grasp_point_m``, ``end_m``,
         ``travel_m``, ``peak_strain``, ``peak_force_n``, ``bits``, ``bits_per_percent_strain`` and
         ``young_deviation`` (of log E at the control points, expected after the pull);
-        ``most_telling``, the most informative of them; ``young_deviation_now``; ``too_much_count``
+        ``most_telling``, the most informative of them; ``instead``, other actions that narrow the
+        intervals, as of the estimate; ``young_deviation_now``; ``too_much_count``
         and ``failed_count``; ``plan`` with ``worth`` and ``why`` if one is named.
 
     Raises:
@@ -95,7 +96,7 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
         found = suggest(subject, values, known, cell, settings.fractions, max_force=most,
                         max_strain=settings.max_strain, workers=workers,
                         progress=progress.part(0.0, 0.8))
-        stage.result.update(_told(found, known))
+        stage.result.update(_told(found, known) | {"instead": _instead(branch)})
         if plan is not None:
             progress(0.8, "the plan under other moduli")
             stage.result["plan"] = {"name": plan} | _for_plan(
@@ -125,6 +126,17 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
         poisson=found["poisson"], density=found.get("density") or subject.start.density,
         form=tuple(found.get("field_form") or ()))
     return subject, values, Known.estimated(found)
+
+
+def _instead(branch: Branch) -> list[dict[str, Any]]:
+    """Return what else would narrow the intervals, according to the estimate."""
+    from limber.estimation.estimate_file import read_estimate
+    from limber.estimation.uncertainty.next_actions import ANOTHER_PULL
+
+    if not branch.has("estimate.json"):
+        return []
+    found = read_estimate(branch.path("estimate.json"))
+    return [each for each in found.get("next_actions") or [] if each["action"] != ANOTHER_PULL]
 
 
 def _cell(branch: Branch) -> Cell:
@@ -217,6 +229,8 @@ def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    from limber.results.report.report_tables import action_rows
+
     rows = [["held at", "to [m]", "travel", "strain", "force", "tells", "per % of strain",
              "E then known within"]]
     for pull in [result["best"], *result["others"]][:8]:
@@ -227,6 +241,8 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
             f"{pull['bits']:.1f} bit", f"{pull['bits_per_percent_strain']:.1f} bit",
             " ".join(f"{100 * share:.0f} %" for share in pull["young_deviation"])])
     tables = [("Suggested pulls, best first", rows)]
+    if instead := action_rows({"next_actions": result.get("instead")}):
+        tables.append(("Instead of a pull, best first", instead))
     if plan := result.get("plan"):
         worth = "yes" if plan["worth"] else "no"
         tables.append((f"Worthwhile for the plan {plan['name']}?", [[worth], [plan["why"]]]))

@@ -1,0 +1,75 @@
+"""What to do next: the interval that an action promises is the one that it then gives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.estimation.test_nuisances import TRUTH, objective_of
+
+from benchmarks.paper_branches import measured
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.parameters import Values
+from limber.estimation.uncertainty.covariance import uncertainty
+from limber.estimation.uncertainty.model_error import ModelError
+from limber.estimation.uncertainty.next_actions import ANOTHER_PULL, Prospects
+from limber.recordings.cell_errors import CalibrationEntry
+
+CELL = CalibrationEntry(force_bias_sigma_n=0.5, force_drift_sigma_n=0.5, repeat_sigma=0.03)
+UNIT = {"variance_factor": 1.0, "repetition": 1.0}
+
+
+def prospects(bench, pulls, error=None):
+    """At the true moduli, with the noise as stated."""
+    parts = [objective_of(bench, pull) for pull in pulls]
+    objective = Objective([part.forwards[0] for part in parts], parts[0].space,
+                          force_sigma=[part.force_sigma[0] for part in parts])
+    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
+                                    jacobian=True)
+    sure = replace(uncertainty(evaluation, objective), recording_spread=0.03, **UNIT)
+    return Prospects(evaluation, objective, sure, error or ModelError(), TRUTH)
+
+
+@pytest.fixture(scope="module")
+def noisy(small_pull):
+    pull = measured(small_pull, 3, points=5e-4, force=0.01)
+    return replace(pull, entry=pull.entry.model_copy(update={"calibration": CELL}))
+
+
+@pytest.fixture(scope="module")
+def today(small_bench, noisy):
+    return prospects(small_bench, [noisy])
+
+
+def width(found, name):
+    """Half widths of log E after an action."""
+    chosen = next(each for each in found.best(9) if each["action"] == name)
+    return np.diff(np.log(chosen["young_interval_pa"]), axis=1)[:, 0] / (2 * 1.96), chosen
+
+
+def test_a_repeated_pull_gives_what_was_promised(today, small_bench, noisy):
+    """Its own errors and force are unknown anew; those of the cell are the same."""
+    promised = today.after_another_pull()
+    got = prospects(small_bench, [noisy, replace(noisy, name="again")])
+    assert promised == pytest.approx(got._now, rel=5e-3)
+    share = promised / today._now
+    assert np.all(share < 1.0) and share.min() > 2**-0.5 - 1e-6
+    assert width(today, ANOTHER_PULL)[1]["width_share"] == pytest.approx(share.mean())
+
+
+@pytest.mark.parametrize(("action", "stated"), [
+    ("tare the force sensor", {"force_bias_sigma_n": 0.05, "force_drift_sigma_n": 0.1}),
+    ("calibrate the gripper", {"pose_sigma_m": 2e-4, "pose_sigma_rad": 3.5e-3})])
+def test_a_calibration_gives_what_was_promised(today, small_bench, noisy, action, stated):
+    entry = noisy.entry.model_copy(update={"calibration": CELL.model_copy(update=stated)})
+    got = prospects(small_bench, [replace(noisy, entry=entry)])
+    share = next(each for each in today.best(9) if each["action"] == action)["width_share"]
+    assert share == pytest.approx(float((got._now / today._now).mean()), rel=0.02)
+
+
+def test_the_best_come_first_and_the_idle_do_not_come(today, small_bench, noisy):
+    shares = [each["width_share"] for each in today.best(9)]
+    assert shares == sorted(shares) and shares[-1] < 0.98
+    assert "scan again" not in {each["action"] for each in today.best(9)}
+    rough = prospects(small_bench, [noisy], ModelError(geometry=np.full(4, 0.5)))
+    best = rough.best(1)[0]
+    assert best["action"] == "scan again" and best["width_share"] == pytest.approx(0.5, abs=0.1)
