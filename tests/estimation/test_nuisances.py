@@ -9,8 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.errors import WorkError
-from limber.estimation.fit import fit_pulls
-from limber.estimation.fit_preparation import is_path_observed
+from limber.core.numerics.rigid import rotated
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit import fit_branch, fit_pulls
+from limber.estimation.fit_preparation import forwards_of, is_path_observed
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.free_frame import fitted_frame, put_right
 from limber.estimation.fitting.initial_modulus import FALL, led_start, standing_start
 from limber.estimation.fitting.nuisances import eliminated, in_words, told, unlikely
 from limber.estimation.fitting.objective import Objective
@@ -22,7 +26,7 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.path_error import led_by_path, path_error
 from limber.estimation.uncertainty.variance_parts import ADVICE, largest, variance_parts
 from limber.estimation.virtual_cell import marked_points
-from limber.recordings.cell_errors import EXACT, CalibrationEntry
+from limber.recordings.cell_errors import EXACT, CalibrationEntry, calibration_of
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
 from limber.recordings.synchronisation import frames_of
 
@@ -48,6 +52,12 @@ def bad_cell(small_pull):
     return replace(pull, poses=poses, wrenches=wrenches,
                    entry=pull.entry.model_copy(update={"calibration": calibration}),
                    observations=Observations(seen.times, seen.positions + [1e-3, 0.0, -1e-3]))
+
+
+def subject_of(bench, branch):
+    """The branch of a bench, weightless."""
+    return Subject(bench.mesh, branch.skeleton, bench.points, bench.weights, bench.model,
+                   Values(np.full(4, 1e7), 0.36, 900.0))
 
 
 def objective_of(bench, pull, poisson=0.36):
@@ -141,15 +151,68 @@ def test_a_point_that_is_off_along_the_branch_is_told_as_that(small, small_bench
     assert evaluation.mean_square < 1.5
 
 
+def test_a_frame_is_put_right_by_its_fitted_turn(small_pull):
+    """About the middle of the points, as it was fitted."""
+    turn, shift = np.array([0.2, -0.1, 0.15]), np.array([0.03, -0.02, 0.01])
+    seen = small_pull.observations.positions
+    middle = seen.mean(axis=(0, 1))
+    wrong = middle + shift + rotated(turn, (seen - middle).reshape(-1, 3)).reshape(seen.shape)
+    off = replace(small_pull, observations=replace(small_pull.observations, positions=wrong))
+    errors = [{"name": f"camera {what} {axis}", "value": float(value)}
+              for what, values in (("position", shift), ("rotation about", turn))
+              for axis, value in zip("xyz", values, strict=True)]
+    right = put_right(off, *fitted_frame(errors)).observations.positions
+    assert right == pytest.approx(seen, abs=1e-9)
+
+
+def test_an_untared_zero_is_free(small_bench, small, small_pull):
+    """Stated as not tared, a zero of twice the force is found; otherwise it is an odd error."""
+    peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())
+    wrenches = small_pull.wrenches.copy()
+    wrenches[:, 0] += 2 * peak
+    calibration = CalibrationEntry(force_bias_sigma_n=0.01 * peak, force_drift_sigma_n=0.0)
+    sigmas = []
+    for is_tared in (True, False):
+        entry = small_pull.entry.model_copy(update={
+            "calibration": calibration,
+            "sensor": small_pull.entry.sensor.model_copy(update={"tared": is_tared})})
+        forward = forwards_of([replace(small_pull, entry=entry, wrenches=wrenches)],
+                              subject_of(small_bench, small), SETTINGS)[0]
+        sigmas.append(calibration_of(forward.entry).force_bias_sigma_n)
+    assert sigmas[0] == 0.01 * peak and sigmas[1] >= 2 * peak
+
+
+@pytest.mark.slow
+def test_a_free_frame_is_put_right_though_it_is_turned_far(small_bench, small, small_pull):
+    """12 degrees and 5 cm off: with a frame that counts as known the same is no result."""
+    turn, shift = np.radians([8.0, -7.0, 5.0]), np.array([0.05, -0.02, 0.01])
+    seen = small_pull.observations.positions
+    middle = seen.mean(axis=(0, 1))
+    wrong = middle + shift + rotated(turn, (seen - middle).reshape(-1, 3)).reshape(seen.shape)
+    entry = small_pull.entry.model_copy(update={"calibration": EXACT.model_copy(
+        update={"camera_sigma_m": 1e-3, "camera_sigma_rad": 1e-3})})
+    pull = replace(small_pull, entry=entry,
+                   observations=replace(small_pull.observations, positions=wrong))
+    settings = SETTINGS.model_copy(update={
+        "free_frame": True, "field": "inverse_distance", "poisson_sigma": 0.0, "key_frames": 4})
+    found = fit_branch([pull], subject_of(small_bench, small), settings,
+                       log=EvaluationLog(None, ""))
+    assert found.is_bad is None
+    assert found.values.young == pytest.approx(TRUTH, rel=0.1)
+    assert 0.0 <= found.prospects.cost_of_the_frame() < 1.0
+
+
 def test_directions_bend_with_the_branch(small, small_bench):
     """At rest along the axis; turned with a rigid rotation of all nodes."""
     mesh = small_bench.mesh
+    coarse = small.mesh(slice_length=3.0, sides=8)
     found = PointDirections.at(mesh, small_bench.points)
     step = 1e-3 / small.length
     ahead, behind = (np.array([small.skeleton.point_at(each + sign * step)
                                for each in FRACTIONS]) for sign in (1, -1))
     axis = (ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True)
-    assert np.sum(found.rest * axis, axis=1) == pytest.approx(np.ones(4), abs=2e-3)
+    for each in (found, PointDirections.at(coarse, small_bench.points)):
+        assert np.degrees(np.arccos(np.sum(each.rest * axis, axis=1).clip(-1, 1))).max() < 0.5
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2])
     moved = turn.apply(mesh.nodes) - mesh.nodes
     assert found.bent(moved) == pytest.approx(turn.apply(found.rest), abs=1e-6)

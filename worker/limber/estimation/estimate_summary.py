@@ -27,7 +27,7 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
         "recording_spread": sure.recording_spread,
         "field_form": values.form, "cell_errors": found.cell_errors,
         "causes": [] if found.stopped else largest(found.causes),
-        "next_actions": [] if found.stopped else found.next_actions,
+        "next_actions": [] if found.stopped else found.prospects.best(),
         "led_by": {forward.name: "force; the gripper's path is observed" if forward.watches_pose
                    else forward.drive for forward in found.objective.forwards},
         "density": values.density, "loss_m2": found.fit.evaluation.loss,

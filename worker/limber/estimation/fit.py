@@ -20,6 +20,7 @@ from limber.estimation.fit_preparation import (
     require_scale_in_principle,
 )
 from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.free_frame import ROUNDS, SMALL_RAD, fitted_frame, put_right
 from limber.estimation.fitting.initial_modulus import led_start, scaled_start, standing_start
 from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
@@ -63,6 +64,13 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
 
     def once(branch: Subject, chosen: EstimateSettings, log: EvaluationLog) -> Estimate:
+        if not chosen.free_frame:
+            return in_frame(pulls, branch, chosen, log)
+        return _in_free_frame(pulls, lambda seen: in_frame(
+            seen, branch, chosen, log if seen is pulls else EvaluationLog(None, "")))
+
+    def in_frame(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
+                 log: EvaluationLog) -> Estimate:
         forwards = forwards_of(pulls, branch, chosen, progress)
         objective = Objective(forwards, parameter_space(branch, forwards, chosen),
                               log=log, force_sigma=[pull.entry.sensor.force_sigma_n
@@ -86,6 +94,18 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     hangs = subject.hangs and any(under_its_weight(subject.model, pull.entry).prestress is not None
                                   for pull in pulls)
     return _as_it_hangs(subject, fitted, progress) if hangs else fitted(subject)
+
+
+def _in_free_frame(pulls: list[Pull], fitted: Callable[[list[Pull]], Estimate]) -> Estimate:
+    """Return the fit after the observer's frame has been put right; its turn may be large."""
+    seen, found = pulls, fitted(pulls)
+    for _ in range(ROUNDS - 1):
+        shift, turn = fitted_frame(found.cell_errors)
+        if found.stopped or np.linalg.norm(turn) < SMALL_RAD:
+            break
+        seen = [put_right(pull, shift, turn) for pull in seen]
+        found = fitted(seen)
+    return found
 
 
 def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],

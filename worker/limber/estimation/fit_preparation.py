@@ -11,9 +11,12 @@ from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings
-from limber.recordings.cell_errors import calibration_of
+from limber.recordings.cell_errors import CalibrationEntry, calibration_of
 from limber.recordings.recording import Pull, PullEntry
 from limber.recordings.synchronisation import Frames, frames_of
+
+FREE_FRAME_M, FREE_FRAME_RAD = 0.1, 0.3
+"""Standard deviations of the observer's frame if it is fitted freely (--free-frame)."""
 
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
@@ -26,8 +29,8 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
     """
     forwards = []
     for pull in pulls:
-        entry = _with_overrides(pull.entry, settings)
         frames = frames_of(pull)
+        entry = _with_overrides(pull.entry, frames, settings)
         for message in frames.warnings:
             progress.warn(message)
         rest = subject.control_points if entry.rest_points_m is None else np.array(
@@ -127,9 +130,24 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: Estimat
                           priors=tuple(priors))
 
 
-def _with_overrides(entry: PullEntry, settings: EstimateSettings) -> PullEntry:
-    given = {"drive": settings.drive, "motion": settings.motion}
+def _with_overrides(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> PullEntry:
+    given = {"drive": settings.drive, "motion": settings.motion,
+             "calibration": _with_free_errors(entry, frames, settings)}
     return entry.model_copy(update={k: v for k, v in given.items() if v is not None})
+
+
+def _with_free_errors(entry: PullEntry, frames: Frames, settings: EstimateSettings,
+                      ) -> CalibrationEntry | None:
+    """Return the pull's calibration; of what is not calibrated at all, nothing is known."""
+    known = calibration_of(entry)
+    free: dict[str, float] = {}
+    if settings.free_frame:
+        free |= {"camera_sigma_m": max(known.camera_sigma_m, FREE_FRAME_M),
+                 "camera_sigma_rad": max(known.camera_sigma_rad, FREE_FRAME_RAD)}
+    force = np.linalg.norm(frames.wrenches[:, :3], axis=1)
+    if not entry.sensor.tared and np.isfinite(force).any():
+        free |= {"force_bias_sigma_n": max(known.force_bias_sigma_n, float(np.nanmax(force)))}
+    return known.model_copy(update=free) if free else None
 
 
 def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress) -> None:

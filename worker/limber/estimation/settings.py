@@ -23,7 +23,7 @@ class EstimateSettings(Settings):
     """Options for estimating Young's modulus from pulls."""
 
     groups: ClassVar[Groups] = {
-        "input": ("pull", "drive", "motion", "fractions"),
+        "input": ("pull", "drive", "motion", "fractions", "free_frame"),
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping"),
         "solver": ("method", "forward", "key_frames", "evaluations", "delta_m2", "robust"),
@@ -47,6 +47,9 @@ class EstimateSettings(Settings):
     fractions: tuple[float, ...] = Field(
         (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
             "main path.")
+    free_frame: bool = Field(
+        False, description="Fit the frame of the observed points freely, to 10 cm and 17 degrees, "
+        "instead of within the pull's [calibration]. The result states what that costs.")
     young: float | None = Field(
         None, gt=0, description="Initial Young's modulus [Pa]. Default: from the measured force.")
     poisson: float | None = Field(

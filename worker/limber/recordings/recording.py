@@ -47,7 +47,9 @@ class SensorEntry(BaseModel):
     force_sigma_n: float = Field(0.1, gt=0)
     torque_sigma_nm: float | None = Field(None, gt=0)
     force_range_n: float | None = Field(None, gt=0)
-    tared: bool = True
+    tared: bool = Field(
+        True, description="Whether the zero of the force was set before the pull. false: an "
+        "estimate fits it freely.")
 
 
 class SwingEntry(BaseModel):
