@@ -1,5 +1,7 @@
 """Time-stamped tables and what is wrong with them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from limber.core.errors import InputError
 from limber.recordings.time_series import (
     Stream,
     gaps,
+    in_order,
     inside_gap,
     read_stream,
     saturated,
@@ -106,3 +109,12 @@ def test_saturation_is_a_run_at_the_extreme():
     assert np.flatnonzero(saturated(force)).tolist() == [2, 3, 4, 5]
     assert not saturated(np.array([[1.0], [2.0], [5.0], [4.0], [3.0], [1.0]])).any()
     assert not saturated(np.zeros((10, 3))).any()
+
+
+@pytest.mark.parametrize("step", [1e-300, 1e-10, 1e12])
+def test_stamps_of_no_recorder(step):
+    """Hardly any time between them, or ages: a spectrum would have no finite frequency."""
+    count = np.arange(9.0)
+    with pytest.raises(InputError, match="apart"):
+        in_order(Path("a.csv"), step * count, np.zeros((9, 1)), [])
+    assert len(in_order(Path("a.csv"), count, np.zeros((9, 1)), [])[0]) == 9

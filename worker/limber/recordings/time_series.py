@@ -13,6 +13,8 @@ from limber.core.files.reading import read_text
 
 MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal variable."""
+_SHORTEST_STEP, _LONGEST_STEP = 1e-8, 1e8
+"""Between two samples of a recorder, whatever it records [s]."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,8 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
     Each repair adds a sentence to ``warnings``.
 
     Raises:
-        InputError: a tenth or more of the stamps run backwards.
+        InputError: a tenth or more of the stamps run backwards, or they are closer together, or
+            farther apart, than those of any recorder.
     """
     finite = np.isfinite(times)
     if not finite.all():
@@ -197,6 +200,11 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
         warnings.append(f"{path.name}: {backward} time stamps are out of order. The rows were "
                         "sorted.")
     times, first = np.unique(times, return_index=True)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    if not _SHORTEST_STEP <= step <= _LONGEST_STEP:
+        raise InputError(f"{path}: the time stamps are {step:.3g} s apart.",
+                         f"Recorders take {_SHORTEST_STEP:g} s to {_LONGEST_STEP:g} s.",
+                         "Check the column used as time, and its unit.")
     doubled = len(values) - len(first)
     if doubled:
         warnings.append(f"{path.name}: there are {doubled} duplicate time stamps. The first row "
