@@ -7,7 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
+from limber.geometry.cloud.gathering import gathered
 from limber.geometry.io.clouds import read_points
+from limber.geometry.io.scanners import e57 as e57_module
 from limber.geometry.io.scanners.e57 import checksums
 
 RNG = np.random.default_rng(5)
@@ -90,7 +92,7 @@ def e57(path, columns, extra=("", ()), pose=""):
                                ).tobytes())
 
 
-def testchecksums_are_those_of_the_standard():
+def test_checksums_are_those_of_the_standard():
     """CRC-32C of the digits 1 to 9, from RFC 3720's kin."""
     assert checksums(np.frombuffer(b"123456789", np.uint8)[None])[0] == 0xE3069283
 
@@ -119,6 +121,34 @@ def test_e57_without_what_was_not_seen(tmp_path):
     cloud = read_points(tmp_path / "a.e57")
     np.testing.assert_array_equal(cloud.points, POINTS[~state])
     assert cloud.not_finite == 10
+
+
+@pytest.mark.parametrize("columns", [FLOATS, SCALED, WIDE])
+def test_e57_in_pieces(tmp_path, monkeypatch, columns):
+    """Pieces end between packets, and in the middle of bytes; a part of the points is kept."""
+    colours = ("".join(f'<color{c} type="Integer" minimum="0" maximum="7"/>'
+                       for c in ("Red", "Green", "Blue")), [packed(np.arange(50) % 7, 3)] * 3)
+    e57(tmp_path / "a.e57", columns, colours)
+    whole = read_points(tmp_path / "a.e57")
+    monkeypatch.setattr(e57_module, "PIECE_POINTS", 5)
+    monkeypatch.setattr(e57_module, "gathered", lambda pieces: gathered(pieces, 50))
+    pieces = read_points(tmp_path / "a.e57")
+    np.testing.assert_array_equal(pieces.points, whole.points)
+    np.testing.assert_array_equal(pieces.attributes["color"][:, 0], np.arange(50) % 7)
+    monkeypatch.setattr(e57_module, "gathered", lambda pieces: gathered(pieces, 20))
+    some = read_points(tmp_path / "a.e57")
+    assert len(some) <= 20 and some.left_out == 50 - len(some)
+
+
+def test_e57_that_nobody_saw(tmp_path):
+    """Every point is invalid, or a number has more bits than there are."""
+    state = '<cartesianInvalidState type="Integer" minimum="0" maximum="2"/>'
+    e57(tmp_path / "a.e57", FLOATS, (state, [packed([2] * 50, 2)]))
+    with pytest.raises(InputError, match="seen by the scanner"):
+        read_points(tmp_path / "a.e57")
+    e57(tmp_path / "b.e57", FLOATS, (state.replace('"2"', f'"{2**70}"'), [bytes(450)]))
+    with pytest.raises(InputError, match="64 bits"):
+        read_points(tmp_path / "b.e57")
 
 
 @pytest.mark.parametrize("at", [9, 100, 700, 1500])

@@ -4,9 +4,11 @@ A file consists of pages of 1,024 bytes, of which the last four are a checksum. 
 header, an XML text that lists the scans, and for each scan packets of numbers of a few bits each.
 """
 
+import itertools
 import struct
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.files.reading import require_size
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
 
 _NAMES = {"intensity": "intensity", "rowIndex": "row", "columnIndex": "column",
           "returnIndex": "return", "timeStamp": "time"}
@@ -21,6 +24,8 @@ _COLOURS = ("colorRed", "colorGreen", "colorBlue")
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _DATA_PACKET = 1
+_MOST_BITS = 64
+_BLOCK = 1 << 24  # bytes whose checksums are compared at once
 
 
 @dataclass(frozen=True)
@@ -38,13 +43,17 @@ class _Field:
 def read_e57(path: Path) -> Cloud:
     """Return the points of all scans [m] in their common frame, with colour and scalars.
 
+    Of more than :data:`~limber.geometry.cloud.gathering.MOST_POINTS`, one in each cell of a grid is
+    kept.
+
     Raises:
         InputError: the file is damaged, is compressed in a way that the standard leaves open, or
             has no scan with points.
     """
-    content, page = _content(path)
-    start, length = struct.unpack_from("<QQ", content, 24)
-    text = content[_logical(start, page):_logical(start, page) + length]
+    pages = _Pages(path)
+    pages.check()
+    start, length = struct.unpack("<QQ", pages.read(24, 16))
+    text = pages.read(pages.logical(start), length)
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise _damaged(path, "its XML defines entities")
     try:
@@ -54,32 +63,70 @@ def read_e57(path: Path) -> Cloud:
         raise _damaged(path, f"its XML is invalid ({error})") from error
     for each in root.iter():
         each.tag = each.tag.rpartition("}")[2]
-    scans = [_scan(path, content, page, each) for each in root.findall("./data3D/vectorChild")]
-    scans = [scan for scan in scans if len(scan)]
+    scans = [_Scan(pages, each) for each in root.findall("./data3D/vectorChild")]
+    scans = [scan for scan in scans if scan.count]
     if not scans:
         raise InputError(f"{path} has no scan with points.", "A point cloud was expected.",
                          "Export it again.")
-    shared = set.intersection(*(set(scan.attributes) for scan in scans))
-    return Cloud(np.concatenate([scan.points for scan in scans]),
-                 {name: np.concatenate([scan.attributes[name] for scan in scans])
-                  for name in scans[0].attributes if name in shared},
-                 sum(scan.not_finite for scan in scans), unit="m")
+    shared = set.intersection(*(scan.attributes for scan in scans))
+    cloud = gathered(piece for scan in scans for piece in scan.pieces(shared))
+    if not len(cloud):
+        raise InputError(f"None of the points in {path} was seen by the scanner.",
+                         "All of them are marked as invalid.", "Export it again.")
+    return replace(cloud, unit="m")
 
 
-def _content(path: Path) -> tuple[bytes, int]:
-    """The file without the checksums of its pages, and the length of a page."""
-    raw = np.frombuffer(path.read_bytes(), np.uint8)
-    if len(raw) < 48 or raw[:8].tobytes() != b"ASTM-E57":
-        raise _damaged(path, "it does not begin as E57 files do")
-    _, _, _, _, page = struct.unpack_from("<QQQQQ", raw.tobytes()[:48], 8)
-    if not 64 <= page <= 1 << 20 or page & (page - 1) or len(raw) % page:
-        raise _damaged(path, "its size is not a whole number of pages")
-    pages = raw.reshape(-1, page)
-    wrong = checksums(pages[:, :-4]) != pages[:, -4:].copy().view(">u4").ravel()
-    if wrong.any():
-        raise _damaged(path, f"{int(wrong.sum())} of its {len(pages)} pages do not match their "
-                       "checksums")
-    return pages[:, :-4].tobytes(), int(page)
+class _Pages:
+    """The content of a file without the checksums of its pages.
+
+    Attributes:
+        path: The file.
+        size: Its length without checksums [bytes].
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        size = path.stat().st_size
+        with open(path, "rb") as stream:
+            head = stream.read(48)
+        if len(head) < 48 or head[:8] != b"ASTM-E57":
+            raise _damaged(path, "it does not begin as E57 files do")
+        _, _, _, _, self._page = struct.unpack_from("<QQQQQ", head, 8)
+        if not 64 <= self._page <= 1 << 20 or self._page & (self._page - 1) or size % self._page:
+            raise _damaged(path, "its size is not a whole number of pages")
+        self._count = size // self._page
+        self.size = self._count * (self._page - 4)
+
+    def check(self) -> None:
+        """Compare the pages with their checksums."""
+        wrong, at_once = 0, max(_BLOCK // self._page, 1)
+        for first in range(0, self._count, at_once):
+            pages = self._pages(first, first + at_once)
+            wrong += int((checksums(pages[:, :-4]) != pages[:, -4:].copy().view(">u4").ravel()
+                          ).sum())
+        if wrong:
+            raise _damaged(self.path, f"{wrong} of its {self._count} pages do not match their "
+                           "checksums")
+
+    def logical(self, physical: int) -> int:
+        """Return the place without checksums of a place in the file."""
+        return physical // self._page * (self._page - 4) + physical % self._page
+
+    def read(self, start: int, length: int) -> bytes:
+        """Return some bytes from ``start``, a place without checksums; fewer at the end."""
+        inner = self._page - 4
+        end = min(start + length, self.size)
+        if not 0 <= start < end:
+            return b""
+        first = start // inner
+        pages = self._pages(first, -(-end // inner))
+        return pages[:, :-4].tobytes()[start - first * inner:end - first * inner]
+
+    def _pages(self, first: int, end: int) -> np.ndarray:
+        with open(self.path, "rb") as stream:
+            stream.seek(first * self._page)
+            return np.frombuffer(stream.read((end - first) * self._page), np.uint8).reshape(
+                -1, self._page)
 
 
 def checksums(pages: np.ndarray) -> np.ndarray:
@@ -93,25 +140,58 @@ def checksums(pages: np.ndarray) -> np.ndarray:
     return ~found
 
 
-def _logical(physical: int, page: int) -> int:
-    return physical // page * (page - 4) + physical % page
+class _Scan:
+    """One scan of a file.
 
+    Attributes:
+        count: Number of its points.
+        attributes: Names of their colour and scalars.
+    """
 
-def _scan(path: Path, content: bytes, page: int, scan: ElementTree.Element) -> Cloud:
-    points = scan.find("points")
-    count = int(points.get("recordCount", 0)) if points is not None else 0
-    if points is None or count == 0:
-        return Cloud(np.empty((0, 3)))
-    if len(points.findall("./codecs/vectorChild")):
-        raise InputError(f"{path} has points of a codec of its own.", "Only the standard's plain "
-                         "numbers are read.", "Export it as PLY or LAS with CloudCompare.")
-    fields = [_field(each) for each in points.findall("./prototype/*")]
-    bits = sum(field.bits for field in fields)
-    require_size(path, count * max(bits, 1) / 8, len(content), f"{count} points")
-    streams = _streams(path, content, page, int(points.get("fileOffset", 0)), len(fields))
-    columns = {field.name: _values(path, field, stream, count)
-               for field, stream in zip(fields, streams, strict=True)}
-    return _cloud(path, columns, scan)
+    def __init__(self, pages: _Pages, scan: ElementTree.Element):
+        self._pages, self._scan = pages, scan
+        points = scan.find("points")
+        self.count = int(points.get("recordCount", 0)) if points is not None else 0
+        self.attributes: set[str] = set()
+        if points is None or self.count == 0:
+            return
+        if len(points.findall("./codecs/vectorChild")):
+            raise InputError(f"{pages.path} has points of a codec of its own.", "Only the "
+                             "standard's plain numbers are read.",
+                             "Export it as PLY or LAS with CloudCompare.")
+        self._fields = [_field(each) for each in points.findall("./prototype/*")]
+        self._offset = int(points.get("fileOffset", 0))
+        bits = sum(field.bits for field in self._fields)
+        if any(field.bits > _MOST_BITS for field in self._fields):
+            raise _damaged(pages.path, "it has integers of more than 64 bits")
+        require_size(pages.path, self.count * max(bits, 1) / 8, pages.size, f"{self.count} points")
+        names = {field.name for field in self._fields}
+        self.attributes = {_NAMES[name] for name in names if name in _NAMES} | (
+            {"color"} if set(_COLOURS) <= names else set())
+
+    def pieces(self, attributes: set[str]) -> Iterator[Cloud]:
+        """Yield some points after the other [m] in the common frame, with some attributes."""
+        held = [bytearray() for _ in self._fields]
+        left = self.count
+        for packet in _packets(self._pages, self._offset, len(held)):
+            for stream, part in zip(held, packet, strict=True):
+                stream += part
+            ready = min((8 * len(stream) // field.bits for field, stream in zip(
+                self._fields, held, strict=True) if field.bits), default=0)
+            if PIECE_POINTS <= ready < left:
+                # A multiple of eight values of any number of bits ends with a whole byte.
+                count = ready - ready % 8
+                yield self._taken(held, count, attributes)
+                left -= count
+        yield self._taken(held, left, attributes)
+
+    def _taken(self, held: list[bytearray], count: int, attributes: set[str]) -> Cloud:
+        columns = {}
+        for field, stream in zip(self._fields, held, strict=True):
+            size = -(-count * field.bits // 8)
+            columns[field.name] = _values(self._pages.path, field, bytes(stream[:size]), count)
+            del stream[:size]
+        return _cloud(self._pages.path, columns, self._scan, attributes)
 
 
 def _field(each: ElementTree.Element) -> _Field:
@@ -123,29 +203,27 @@ def _field(each: ElementTree.Element) -> _Field:
                   float(each.get("scale", 1.0)), float(each.get("offset", 0.0)))
 
 
-def _streams(path: Path, content: bytes, page: int, offset: int, count: int) -> list[bytes]:
-    """The bytes of each column, out of the packets of a section."""
-    section = _logical(offset, page)
-    kind, length, begin = struct.unpack_from("<BxxxxxxxQQ", content, section)
-    at, end = _logical(begin, page), min(section + length, len(content))
+def _packets(pages: _Pages, offset: int, count: int) -> Iterator[list[bytes]]:
+    """Yield the bytes of each column in each packet of a section."""
+    path, section = pages.path, pages.logical(offset)
+    kind, length, begin = struct.unpack("<BxxxxxxxQQ", pages.read(section, 24))
+    at, end = pages.logical(begin), min(section + length, pages.size)
     if kind != 1 or not section < at <= end:
         raise _damaged(path, "a section of points is none")
-    parts: list[list[bytes]] = [[] for _ in range(count)]
     while at + 4 <= end:
-        packet, _, size = struct.unpack_from("<BBH", content, at)
+        packet, _, size = struct.unpack("<BBH", pages.read(at, 4))
         if size < 3:
             raise _damaged(path, "a packet of points is shorter than its header")
         if packet == _DATA_PACKET:
-            found, = struct.unpack_from("<H", content, at + 4)
-            sizes = struct.unpack_from(f"<{found}H", content, at + 6)
-            place = at + 6 + 2 * found
-            if found != count or place + sum(sizes) > at + size + 1:
+            content = pages.read(at, size + 1)
+            found, = struct.unpack_from("<H", content, 4)
+            sizes = struct.unpack_from(f"<{found}H", content, 6)
+            place = 6 + 2 * found
+            if found != count or place + sum(sizes) > len(content):
                 raise _damaged(path, "a packet of points is longer than it says")
-            for part, width in zip(parts, sizes, strict=True):
-                part.append(content[place:place + width])
-                place += width
+            ends = place + np.cumsum((0, *sizes))
+            yield [content[a:b] for a, b in itertools.pairwise(ends)]
         at += size + 1
-    return [b"".join(part) for part in parts]
 
 
 def _values(path: Path, field: _Field, stream: bytes, count: int) -> np.ndarray:
@@ -170,7 +248,8 @@ def _values(path: Path, field: _Field, stream: bytes, count: int) -> np.ndarray:
     return whole * field.scale + field.offset if field.kind == "ScaledInteger" else whole
 
 
-def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element) -> Cloud:
+def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element,
+           wanted: set[str]) -> Cloud:
     from scipy.spatial.transform import Rotation
 
     if set(_CARTESIAN) <= columns.keys():
@@ -188,8 +267,9 @@ def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element
     seen = np.isfinite(points).all(axis=1) if state is None else state == 0
     turn = [float(scan.findtext(f"./pose/rotation/{axis}") or axis == "w") for axis in "xyzw"]
     shift = [float(scan.findtext(f"./pose/translation/{axis}") or 0) for axis in "xyz"]
-    attributes = {_NAMES[name]: values[seen] for name, values in columns.items() if name in _NAMES}
-    if set(_COLOURS) <= columns.keys():
+    attributes = {_NAMES[name]: values[seen] for name, values in columns.items()
+                  if _NAMES.get(name) in wanted}
+    if "color" in wanted:
         attributes["color"] = np.stack([columns[name] for name in _COLOURS], axis=1)[seen]
     return Cloud(Rotation.from_quat(turn).apply(points[seen]) + shift, attributes,
                  not_finite=int((~seen).sum()))
