@@ -247,7 +247,7 @@ def _array_changed(content: bytes, rng: np.random.Generator) -> bytes:
     elif way == 2:
         arrays[name] = array[:0] if array.ndim else np.zeros(0)
     elif way == 3:
-        arrays[name] = array.astype("U8") if array.dtype.kind != "U" else np.array(3)
+        arrays[name] = array.astype(str) if array.dtype.kind != "U" else np.array(3)
     elif way == 4 and array.dtype.kind == "f" and array.size:
         values = array.copy().reshape(-1)
         values[rng.integers(len(values))] = (np.nan, np.inf, 1e300, -1.0)[rng.integers(4)]
