@@ -1,13 +1,16 @@
 """Scans of more points than are kept, read piece by piece."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from limber.core.files import text_columns
 from limber.geometry.cloud import gathering
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.gathering import gathered
 from limber.geometry.cloud.preparation import prepare
-from limber.geometry.io import las, ply
+from limber.geometry.io import clouds, las, ply
 from limber.geometry.io.clouds import read_points
 
 
@@ -66,13 +69,16 @@ def test_points_that_are_not_finite_make_no_cells():
     assert some.not_finite == 900 and some.left_out + len(some) == 8100
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".las"])
+@pytest.mark.parametrize("suffix", [".ply", ".las", ".txt"])
 def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
     """As a whole, and thinned, with their attributes; the user is told."""
     points, path = _tube(5000), tmp_path / f"a{suffix}"
     intensity = np.arange(5000, dtype=np.uint16)
     if suffix == ".ply":
         Cloud(points, {"intensity": intensity}).write_ply(path)
+    elif suffix == ".txt":
+        np.savetxt(path, np.column_stack([intensity, points]), "%.8g", header="Intensity Z X Y")
+        points = points[:, [1, 2, 0]]
     else:
         laspy = pytest.importorskip("laspy")
         header = laspy.LasHeader(point_format=3, version="1.2")
@@ -83,15 +89,38 @@ def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
         content.write(path)
     for module in (ply, las):
         monkeypatch.setattr(module, "PIECE_POINTS", 700)
+    monkeypatch.setattr(text_columns, "_LINES", 700)
     whole = read_points(path)
     np.testing.assert_allclose(whole.points, points, atol=1e-6)
     np.testing.assert_array_equal(whole.attributes["intensity"], intensity)
-    for module in (ply, las):
+    for module in (ply, las, clouds):
         monkeypatch.setattr(module, "gathered", lambda pieces: gathered(pieces, 1000))
     some = read_points(path)
     assert len(some) <= 1000 and some.left_out == 5000 - len(some)
-    np.testing.assert_array_equal(some.points, whole.points[some.attributes["intensity"]])
+    chosen = some.attributes["intensity"].astype(int)
+    np.testing.assert_array_equal(some.points, whole.points[chosen])
     prepared = prepare(some, 1.0)
     assert prepared.counts["read"] == 5000
     assert prepared.counts["thinned_on_reading"] == some.left_out
     assert any("5000 points" in text for text in prepared.warnings)
+
+
+def test_a_text_is_held_in_parts(tmp_path, monkeypatch):
+    """Rows with a missing value, a count before each scan and comments may come in any part."""
+    monkeypatch.setattr(text_columns, "_LINES", 1000)
+    monkeypatch.setattr(text_columns, "_BLOCK", 10_000)
+    path, rows = tmp_path / "a.txt", [f"{k} {k / 7:.6f} {-k} 5" for k in range(30_000)]
+    rows[15_000] = "15000 NA -15000 5"
+    path.write_text("x y z n\n15000\n" + "\n".join(rows[:15_000]) + "\n15000\n# two\n"
+                    + "\n".join(rows[15_000:]) + "\n")
+    table = text_columns.Table(path)
+    tracemalloc.start()
+    total = sum(np.nansum(piece, axis=0) for piece in table.pieces())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert total[[0, 3]].tolist() == [sum(range(30_000)), 150_000]
+    assert total[1] == pytest.approx((total[0] - 15_000) / 7, rel=1e-6)
+    whole = text_columns.read_columns(path)
+    assert whole.values.shape == (30_000, 4) and whole.names == ["x", "y", "z", "n"]
+    assert np.flatnonzero(np.isnan(whole.values[:, 1])).tolist() == [15_000]
+    assert peak < 1e6  # bytes; the lines as Python's texts take 2e6

@@ -5,8 +5,10 @@ alike. ``scripts/make_addon_schema`` makes the copy; a test compares the two.
 """
 
 import codecs
+import contextlib
+import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +20,12 @@ from .column_titles import LENGTHS, OTHER_LENGTHS, plain, split_title, stated_un
 _COUNTERS = ("id", "index", "idx", "nr", "no", "number", "row", "point", "pointid", "pointnumber")
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 _COLMAP, _HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
+_COLMAP_TITLES = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _LINES = 20_000
 """Lines read at a time: numpy holds the interpreter lock meanwhile."""
+_BLOCK = 1 << 20
+"""Characters read at a time."""
 _MOST_HEAD = 60
 """Most lines above the numbers that are examined."""
 
@@ -55,98 +60,197 @@ class Columns:
 def decoded(raw: bytes) -> str:
     """Return the text of a file in UTF-8, UTF-16 or, as spreadsheets write it, a Windows code page.
     """
-    for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
-                         (codecs.BOM_UTF16_BE, "utf-16")):
-        if raw.startswith(mark):
-            return raw.decode(coding, errors="replace")
-    try:
-        return raw.decode("utf-8")
-    except UnicodeDecodeError:
-        return raw.decode("cp1252", errors="replace")
+    return raw.decode(_coding_of([raw]), errors="replace")
+
+
+def _coding_of(blocks: Iterable[bytes]) -> str:
+    """The coding of a text in pieces, the first of at least four bytes if there are more."""
+    reader = codecs.getincrementaldecoder("utf-8")()
+    for number, block in enumerate(blocks):
+        if number == 0:
+            for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+                                 (codecs.BOM_UTF16_BE, "utf-16")):
+                if block.startswith(mark):
+                    return coding
+        try:
+            reader.decode(block)
+        except UnicodeDecodeError:
+            return "cp1252"
+    return "cp1252" if reader.getstate()[0] else "utf-8"
 
 
 def read_columns(path: Path) -> Columns:
-    """Read the columns of a text file.
+    """Read the columns of a text file, as :class:`Table` does, all at once."""
+    table = Table(path)
+    return table.columns(np.concatenate(list(table.pieces())))
+
+
+class Table:
+    """The columns of a text file, read in pieces.
 
     Numbers are separated by blanks, tabs, commas or semicolons. Lines above them may name the
     columns and state a unit. The number of points may precede the points of each scan. Decimals may
     be commas if commas are not separators.
 
+    Attributes:
+        axes: Which columns of a piece are the coordinates.
+
     Raises:
         ColumnsError: there are no numbers, too few columns, coordinates of several or unknown
-            units, or a line that does not fit; the message names it.
+            units, or a line that does not fit; the message names it. Also while pieces are read.
     """
-    text = decoded(path.read_bytes()).replace('"', "")
-    if _COLMAP in text[:_HEAD] or _has_tracks(text):
-        return _colmap(path, text)
-    every = [line for line in text.splitlines() if line.strip()]
-    lines = [line for line in every if not _is_comment(line)]
-    if not lines:
-        raise ColumnsError(f"{path} has no lines with numbers.", "A point cloud was expected.",
-                           "Export it again.")
-    comments = [line.lstrip(" #/") for line in every[:_MOST_HEAD] if _is_comment(line)]
-    lines = _without_counts(lines)
-    # The lines above do not show how numbers are written.
-    separator = _separator(lines[len(lines) // 2])
-    first = _first_row(lines, separator)
-    head, lines = lines[:first], lines[first:]
-    if not lines:
-        raise ColumnsError(f"{path} has a header but no points.", "A point cloud was expected.",
-                           "Export it again.")
-    titles = _titles(path, head, lines, separator)
-    used, values, notes = _numbers(path, lines, separator, text, titles)
-    if values.shape[1] < 3:
-        raise ColumnsError(f"{path} has {values.shape[1]} columns.",
-                           "Coordinates need three columns.", "Export it again.")
-    if (len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0])) or (
-            0 not in used and len(titles) == max(used)):
+
+    def __init__(self, path: Path):
+        self._path = path
+        with open(path, "rb") as stream:
+            self._coding = _coding_of(iter(lambda: stream.read(_BLOCK), b""))
+        start = "\n".join(itertools.islice(self._lines(), _HEAD))[:_HEAD]
+        self._is_colmap = _COLMAP in start or _has_tracks(start)
+        sample = list(itertools.islice(self._rows(), _HEAD))
+        if not sample:
+            raise ColumnsError(f"{path} has no lines with numbers.", "A point cloud was expected.",
+                               "Export it again.")
+        # The lines above do not show how numbers are written.
+        self._separator = None if self._is_colmap else _separator(sample[len(sample) // 2])
+        self._first = _first_row(sample, self._separator)
+        self._head, rows = sample[:self._first], sample[self._first:]
+        if not rows:
+            raise ColumnsError(f"{path} has a header but no points.", "A point cloud was expected.",
+                               "Export it again.")
+        self._ending = self._separator is not None and rows[0].rstrip().endswith(self._separator)
+        self._titles = _COLMAP_TITLES if self._is_colmap else _titles(
+            path, self._head, rows, self._separator)
+        self._width = 0
+        self._words: list[int] = []
+        self._name(rows)
+
+    def pieces(self) -> Iterator[np.ndarray]:
+        """Yield the numbers of some lines after the other, shape [n, columns] each."""
+        rows = itertools.islice(self._rows(), self._first, None)
+        while piece := list(itertools.islice(rows, _LINES)):
+            yield self._numbers(piece)
+
+    def columns(self, values: np.ndarray) -> Columns:
+        """Return the table with ``values``, which are all pieces [n, columns], or a part of them.
+        """
+        titles = self._titles or ["x", "y", "z", *_guessed(
+            values[:, 3:], self._path.suffix.lower() == ".pts")]
+        names, unit = _named(self._path, titles)
+        return Columns(names, titles, values, unit or self._stated, self._notes)
+
+    def _lines(self) -> Iterator[str]:
+        with open(self._path, encoding=self._coding, errors="replace", newline="") as stream:
+            while block := stream.readlines(_BLOCK):
+                yield from "".join(block).replace('"', "").splitlines()
+
+    def _rows(self) -> Iterator[str]:
+        """Lines without comments and counts of points; COLMAP's without the images of a point,
+        whose number varies.
+        """
+        rows = (line for line in self._lines() if line.strip() and not _is_comment(line))
+        if self._is_colmap:
+            return (" ".join(line.split()[:len(_COLMAP_TITLES)]) for line in rows)
+        return _without_counts(rows)
+
+    def _name(self, rows: list[str]) -> None:
+        """Find out what the columns are, from the first lines of numbers."""
+        comments = [] if self._is_colmap else [line.lstrip(" #/") for line in itertools.islice(
+            filter(str.strip, self._lines()), _MOST_HEAD) if _is_comment(line)]
+        values, titles = self._numbers(rows), self._titles
+        if self._is_colmap and values.shape[1] < len(titles):
+            raise ColumnsError(f"{self._path}, line {self._place(rows[0])} has {values.shape[1]} "
+                               f"values.", "A point of COLMAP has at least "
+                               f"{len(titles)}: {', '.join(titles)}.", "Export it again.")
+        if values.shape[1] < 3:
+            raise ColumnsError(f"{self._path} has {values.shape[1]} columns.",
+                               "Coordinates need three columns.", "Export it again.")
+        used = [k for k in range(self._width) if k not in self._words]
+        if len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0]):
+            titles = ["", *titles]  # see _columns_of_words
+        self._notes = tuple(f"Column {titles[k]!r} holds words and was not read."
+                            for k in self._words)
+        titles = [titles[k] for k in used] if len(titles) > max(used) else []
+        titles = titles or _commented(comments, self._separator, values)
+        self._titles = titles if len(titles) == values.shape[1] else []
+        self._stated = stated_unit("\n".join([*comments, *self._head]))
+        names = _named(self._path, self._titles)[0] if self._titles else ["x", "y", "z"]
+        self.axes = [names.index(axis) for axis in "xyz"]
+
+    def _numbers(self, rows: list[str]) -> np.ndarray:
+        """The numbers of some lines, without columns of words."""
+        commas = self._separator != ","
+        clean = (row.replace(",", ".") for row in rows) if commas else iter(rows)
+        if self._ending:
+            clean = (row.rstrip().removesuffix(self._separator or "") for row in clean)
+        if not self._words:
+            with contextlib.suppress(ValueError):
+                values = np.loadtxt(clean, delimiter=self._separator, ndmin=2)
+                self._width = self._width or values.shape[1]
+                if values.shape[1] == self._width:
+                    return values
+        return self._with_words(rows)
+
+    def _with_words(self, lines: list[str]) -> np.ndarray:
+        """The numbers of lines with missing values, or with columns of words beside named ones."""
+        rows = [[_number(part, self._separator != ",") for part in _parts(line, self._separator)]
+                for line in lines]
+        if not self._width:
+            self._width = len(rows[0])
+            self._words = self._columns_of_words(rows)
+        width, words = self._width, self._words
+        for line, row in zip(lines, rows, strict=True):
+            if len(row) != width:
+                raise ColumnsError(f"{self._path}, line {self._place(line)} has {len(row)} values, "
+                                   f"but the first line has {width}.", "The file may be truncated.",
+                                   "Export it again, or correct that line.")
+            bad = next((k for k in range(width) if k not in words and row[k] is None), None)
+            if bad is not None:
+                word = _parts(line, self._separator)[bad].strip()[:30]
+                raise ColumnsError(f"{self._path}, line {self._place(line)}: {word!r} is not a "
+                                   "number.", "Each line of a cloud holds the numbers of one "
+                                   "point.", "Correct that line.")
+        used = [k for k in range(width) if k not in words]
+        return np.array([[row[k] for k in used] for row in rows], float)
+
+    def _columns_of_words(self, rows: list[list[float | None]]) -> list[int]:
         # R's write.table writes no title for its row names.
-        titles = ["", *titles]
-    titles = [titles[k] for k in used] if len(titles) > max(used) else []
-    titles = titles or _commented(comments, separator, values)
-    if len(titles) != values.shape[1]:
-        titles = ["x", "y", "z", *_guessed(values[:, 3:], path.suffix.lower() == ".pts")]
-    names, unit = _named(path, titles)
-    return Columns(names, titles, values, unit or stated_unit("\n".join([*comments, *head])),
-                   notes)
+        titles = ["", *self._titles] if len(self._titles) == self._width - 1 else self._titles
+        sample = [row for row in rows[:_MOST_HEAD] if len(row) == self._width]
+        axes = three_of("position", _bare(titles)) if len(titles) == self._width else None
+        words = [k for k in range(self._width) if axes is not None and k not in axes
+                 and all(row[k] is None for row in sample)]
+        if words:
+            self._titles = titles
+        return words
 
-
-def _colmap(path: Path, text: str) -> Columns:
-    """COLMAP's points3D.txt without the images of each point; their number varies."""
-    names = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
-    cut = [" ".join(line.split()[:len(names)]) for line in text.splitlines()]
-    lines = [line for line in cut if line and not _is_comment(line)]
-    if not lines:
-        raise ColumnsError(f"{path} has no points.", "A COLMAP reconstruction was expected.",
-                           "Export it again.")
-    values = _numbers(path, lines, None, "\n".join(cut), names)[1]
-    if values.shape[1] < len(names):
-        raise ColumnsError(f"{path}, line {_place(text, lines[0])} has {values.shape[1]} values.",
-                           f"A point of COLMAP has at least {len(names)}: {', '.join(names)}.",
-                           "Export it again.")
-    return Columns(names, names, values)
+    def _place(self, line: str) -> int:
+        wanted = " ".join(line.split())
+        return next((k for k, other in enumerate(self._lines(), start=1)
+                     if " ".join(other.split()).startswith(wanted)), 1)
 
 
 def _has_tracks(text: str) -> bool:
     """Whether these are COLMAP's points without its comments: rows end with pairs of numbers."""
-    rows = [line.split() for line in text[:_HEAD].splitlines()[:-1]]
+    rows = [line.split() for line in text.splitlines()[:-1]]
     widths = {len(row) for row in rows}
     return len(widths) > 1 and min(widths) >= 8 and not any(width % 2 for width in widths) and all(
         row[0].isdigit() and all(part.isdigit() and int(part) < 256 for part in row[4:7])
         for row in rows)
 
 
-def _without_counts(lines: list[str]) -> list[str]:
+def _without_counts(rows: Iterator[str]) -> Iterator[str]:
     """Lines without counts of the points that follow: first, below titles, at each scan."""
-    start = next((k for k, line in enumerate(lines[:2]) if line.strip().isdigit()), None)
-    if start is None or start + 1 == len(lines):
-        return lines
-    kept = lines[:start]
-    while start < len(lines) and lines[start].strip().isdigit():
-        stop = start + 1 + int(lines[start])
-        kept += lines[start + 1:stop]
-        start = stop
-    return kept + lines[start:]
+    first = list(itertools.islice(rows, 3))
+    start = next((k for k, line in enumerate(first[:2]) if line.strip().isdecimal()), None)
+    rows = itertools.chain(first, rows)
+    if start is not None and start + 1 < len(first):
+        yield from itertools.islice(rows, start)
+        for line in rows:
+            if not line.strip().isdecimal():
+                yield line
+                break
+            yield from itertools.islice(rows, int(line.strip()[:18]))
+    yield from rows
 
 
 def _counts_up(column: np.ndarray) -> bool:
@@ -260,61 +364,6 @@ def _named(path: Path, titles: list[str]) -> tuple[list[str], str | None]:
                            "They must have one unit, out of m, cm, mm, um and in.",
                            "Convert the columns, or correct their titles.")
     return names, found.pop()
-
-
-def _numbers(path: Path, lines: list[str], separator: str | None, text: str,
-             titles: Sequence[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
-    """Which columns are numeric, their values, and what the others are."""
-    commas = separator != ","
-    ending = separator is not None and lines[0].rstrip().endswith(separator)
-    parts = []
-    try:
-        # In chunks: a copy of all would take several times the file's size.
-        for start in range(0, len(lines), _LINES):
-            rows = lines[start:start + _LINES]
-            clean = (line.replace(",", ".") for line in rows) if commas else iter(rows)
-            if ending:
-                clean = (line.rstrip().removesuffix(separator or "") for line in clean)
-            parts.append(np.loadtxt(clean, delimiter=separator, ndmin=2))
-        values = np.concatenate(parts)
-        return list(range(values.shape[1])), values, ()
-    except ValueError:
-        pass
-    return _with_words(path, lines, separator, text, titles)
-
-
-def _with_words(path: Path, lines: list[str], separator: str | None, text: str,
-                titles: Sequence[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
-    """The numbers of a table with missing values, or with columns of words beside named ones."""
-    width = len(_parts(lines[0], separator))
-    rows = [[_number(part, separator != ",") for part in _parts(line, separator)]
-            for line in lines]
-    if len(titles) == width - 1:
-        titles = ["", *titles]
-    sample = [row for row in rows[:_MOST_HEAD] if len(row) == width]
-    axes = three_of("position", _bare(titles)) if len(titles) == width else None
-    words = [k for k in range(width) if axes is not None and k not in axes
-             and all(row[k] is None for row in sample)]
-    for line, row in zip(lines, rows, strict=True):
-        parts = _parts(line, separator)
-        if len(row) != width:
-            raise ColumnsError(f"{path}, line {_place(text, line)} has {len(row)} values, but the "
-                               f"first line has {width}.", "The file may be truncated.",
-                               "Export it again, or correct that line.")
-        bad = next((k for k in range(width) if k not in words and row[k] is None), None)
-        if bad is not None:
-            raise ColumnsError(f"{path}, line {_place(text, line)}: {parts[bad].strip()[:30]!r} is "
-                               "not a number.",
-                               "Each line of a cloud holds the numbers of one point.",
-                               "Correct that line.")
-    used = [k for k in range(width) if k not in words]
-    notes = tuple(f"Column {titles[k]!r} holds words and was not read." for k in words)
-    return used, np.array([[row[k] for k in used] for row in rows], float), notes
-
-
-def _place(text: str, line: str) -> int:
-    return next((k for k, other in enumerate(text.splitlines(), start=1)
-                 if other.startswith(line)), 1)
 
 
 def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:

@@ -14,9 +14,10 @@ from limber.core.errors import InputError
 from limber.core.files.column_titles import stated_unit
 from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
 from limber.core.files.reading import read_arrays
-from limber.core.files.text_columns import ColumnsError, read_columns
+from limber.core.files.text_columns import ColumnsError, Table
 from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
 from limber.geometry.cloud.columns import property_names
+from limber.geometry.cloud.gathering import gathered
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.las import is_packed, las_columns
 from limber.geometry.io.mesh_as_cloud import mesh_notes
@@ -93,14 +94,17 @@ def unit_of(cloud: Cloud, given: str | None) -> tuple[str, list[str]]:
 def _read_text(path: Path) -> Cloud:
     """XYZ, TXT, CSV; see :mod:`limber.core.files.text_columns`."""
     try:
-        read = read_columns(path)
+        table = Table(path)
+        held = gathered(Cloud(piece[:, table.axes], {"row": piece}) for piece in table.pieces())
+        read = table.columns(held.attributes["row"])
     except ColumnsError as error:
         raise InputError(error.seen, error.why, error.fix) from error
     # A column with the name of an earlier one would replace it.
     names = property_names(read.names)
     cloud = Cloud.from_columns(dict(zip(names, read.values.T, strict=True)),
                                dict(zip(names, read.titles, strict=True)))
-    return replace(cloud, unit=read.unit, notes=read.notes)
+    return replace(cloud, unit=read.unit, notes=read.notes, not_finite=held.not_finite,
+                   left_out=held.left_out)
 
 
 def _read_vertices(path: Path) -> Cloud:
