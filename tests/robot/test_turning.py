@@ -7,6 +7,7 @@ from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors, turn_between
 from limber.planning.plan_file import PlanTurning
 from limber.robot.cell.cell import Cell
+from limber.robot.motion import turning
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.motion.turning import TurnCost, turned, turned_motion
 from limber.stages.paths.execute import _offsets_along
@@ -18,6 +19,12 @@ PLACES = np.array([0.0, 0.0, 0.5]) + SHARE * [0.03, 0.01, -0.01]
 NATURAL = SHARE * [0.0, 0.0, 0.6]  # the branch turns by as much
 STIFFNESS = np.diag([2.0, 3.0, 0.5])  # [N m/rad]
 AXIS, GRIP = np.array([0, 0, 1.0]), np.array([0.0, -np.pi / 2, 0.0])
+
+
+@pytest.fixture(autouse=True)
+def few_axes(monkeypatch):
+    """Six of the 26: each that is tried takes a motion of the arm."""
+    monkeypatch.setattr(turning, "_AXES", np.vstack([np.eye(3), -np.eye(3)]))
 
 
 def cost_of(along):
@@ -61,6 +68,13 @@ def test_what_the_slack_or_the_torque_does_not_allow_is_refused(slack, limits):
     """With the reason of the motion without it, and how far was looked."""
     with pytest.raises(NoPathError, match=r"Turned too far.* No rotation of the gripper within"):
         asked(slack, 0.4, limits)
+
+
+def test_an_arm_that_does_not_come_to_the_branch_is_refused_at_once(monkeypatch):
+    """Turning the gripper later cannot help: no offset is tried."""
+    monkeypatch.setattr(turning, "_offsets", lambda *_: pytest.fail("an offset was tried"))
+    with pytest.raises(NoPathError, match="Turned too far"):
+        asked(0.5, -1.0)
 
 
 def test_an_executed_plan_turns_as_planned():

@@ -24,7 +24,7 @@ from limber.robot.motion.expected_wrench import Predicted
 _SIZES = (1 / 3, 2 / 3, 1.0)  # of the slack
 _GRIPS = 3  # directions of the gripper about the branch, those that come farthest
 _HALVINGS = 4  # of the size of the offset that is taken
-_SHARES = (1.0, 0.75, 0.5, 0.25)  # of the path that are tried at the natural rotations
+_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the path that are tried at the natural rotations
 _SOONEST = 0.15  # of the path, in which an offset grows
 _AXES = np.array([axis for axis in product((-1.0, 0.0, 1.0), repeat=3) if any(axis)])
 _AXES = _AXES / np.linalg.norm(_AXES, axis=1)[:, None]
@@ -137,6 +137,9 @@ def _farthest(cell: Cell, predicted: Predicted, axis: np.ndarray, asked: dict[st
               ) -> tuple[list[tuple[np.ndarray, float]], NoPathError]:
     """Return the gripper's rotations with which the arm follows the natural path farthest, each
     with the share of the path where it ends; and the error of the farthest.
+
+    Raises:
+        NoPathError: with none the arm even comes to the branch.
     """
     given = asked.get("rotation")
     ends: list[tuple[np.ndarray, float, NoPathError]] = []
@@ -149,9 +152,10 @@ def _farthest(cell: Cell, predicted: Predicted, axis: np.ndarray, asked: dict[st
                 break
             except NoPathError as error:
                 refusals.append(error)
-        if refusals:
-            followed = _SHARES[len(refusals)] if len(refusals) < len(_SHARES) else 0.0
-            ends.append((grip, followed, refusals[-1]))
+        if 0 < len(refusals) < len(_SHARES):
+            ends.append((grip, _SHARES[len(refusals)], refusals[-1]))
+    if not ends:
+        raise refusals[-1]  # no gripper even comes to the branch: turning it later is no help
     ends.sort(key=lambda one: -one[1])
     return [(grip, share) for grip, share, _ in ends[:_GRIPS]], ends[0][2]
 
