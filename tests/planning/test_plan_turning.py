@@ -1,5 +1,7 @@
 """The torque of a gripper that turns the branch: second order, and on the full model."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,11 @@ from limber.core.errors import InputError, NoPathError
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.settings import PlanSettings
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.turning import Turned
+from limber.stages.paths import plan_turning
 from limber.stages.paths.plan import plan
-from limber.stages.paths.plan_turning import Clamped
+from limber.stages.paths.plan_turning import Clamped, turned_by
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +39,24 @@ def test_the_torque_is_second_order_in_the_offset(clamped):
     assert slope == pytest.approx(work, rel=0.02, abs=1e-9)
     with pytest.raises(NoPathError, match=r"torque .* on the full model"):
         clamped.checked(offsets, Limits(torque=0.5 * found["peak_torque_nm"]))
+
+
+def test_an_offset_never_needs_the_torque_at_which_the_guard_stops(clamped, monkeypatch):
+    """Where no limit of torque is given either."""
+    monkeypatch.setattr(plan_turning.Clamped, "of", lambda *_: clamped)
+    allowed = []
+
+    def motion(_cell, _predicted, _axis, cost, _slack, most, **_asked):
+        allowed.append(most)
+        none = np.zeros((len(cost.along), 3))
+        return Turned(None, none, none[:, 0], none[:, 0])
+    monkeypatch.setattr(plan_turning, "turned_motion", motion)
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)},
+                limits={"hard_torque_nm": 2.0})
+    states = SimpleNamespace(poses=np.repeat(clamped.poses, 2, axis=0))
+    model = SimpleNamespace(reach=SimpleNamespace(axis=None))
+    turned_by(cell, None, model, states, 0.3, Limits(force=1e3))
+    assert allowed == [(1e3, 1.6)]
 
 
 def test_a_slack_without_an_arm_is_refused(planned_branch):

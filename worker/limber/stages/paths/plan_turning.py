@@ -1,6 +1,6 @@
 """The gripper's rotation of a plan where the arm cannot follow the branch's own, and its torque."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.motion.turning import TurnCost, Turned, turned, turned_motion
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 
+_OF_HARD = 0.8  # of the torque at which the guard stops the arm, that an offset may need
 _STATES = 6  # along the path, of which the stiffness is computed, and the turned ones solved
 
 
@@ -96,11 +97,13 @@ def _solved(firm: BranchModel, grasp: Grasp, pose: np.ndarray, begin: np.ndarray
 def turned_by(cell: Cell, predicted: Predicted, grasp_model: GraspModel, states: SolvedPoses,
               slack: float, limits: Limits, **asked: Any) -> tuple[Turned, dict[str, Any]]:
     """Return the robot's motion with the gripper turned by at most ``slack`` [rad] beyond the
-    branch's own rotation, checked on the full model; and a plan's entry about it.
+    branch's own rotation, checked on the full model; and a plan's entry about it. Its torque stays
+    below the one at which the guard would stop the arm.
 
     Raises:
         NoPathError: no such rotation helps, or it breaks a limit.
     """
+    limits = replace(limits, torque=min(limits.torque, _OF_HARD * cell.limits.hard_torque_nm))
     clamped = Clamped.of(grasp_model, states)
     along = arc_lengths(states.poses[:, :3])
     found = turned_motion(cell, predicted, grasp_model.reach.axis, clamped.cost.at(along), slack,
