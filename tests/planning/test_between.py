@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.mechanics.solve_status import Status
 from limber.planning.field import disagreeing_neighbours
 from limber.planning.field.chart import Chart
 from limber.planning.field.disagreeing_neighbours import ask_between, disagreeing, jump
@@ -32,11 +31,8 @@ class Bow:
             return 1.0 if place[0] >= 0.0 else -1.0
         return before
 
-    def follow(self, places, start, guess=None, *, snap, near=False):
-        """Where a guess is near what stays on its side, the branch is there at once; a blend of
-        both sides is near neither."""
-        if near and abs(guess.displacement[0, 0]) <= 0.5:
-            return [SimpleNamespace(converged=False, status=Status.stalled)]
+    def follow(self, places, start, guess=None, *, snap):
+        """Where a guess is near what stays on its side, the branch is there at once."""
         if guess is not None and abs(guess.displacement[0, 0]) > 0.5:
             start = np.array([[np.sign(guess.displacement[0, 0]), *places[0]]])
         side, here = start[0, 0], start[0, 1:]

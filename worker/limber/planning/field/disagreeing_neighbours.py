@@ -16,7 +16,7 @@ from scipy.spatial import Delaunay
 
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart
-from limber.planning.field.grasp_model import GraspModel, Guess, refusal
+from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.guess import foretold_by, half_way
 from limber.planning.field.solved import Solved, taken
 from limber.planning.field.solver_pool import SolverPool
@@ -156,47 +156,26 @@ def _ask(grasp_model: GraspModel, places: list[tuple[Pair, np.ndarray]],
 
 def _half_way(grasp_model: GraspModel, first: Solved, second: Solved, middle: np.ndarray,
               ) -> Solved | None:
-    """Return the state at ``middle`` [1, 3] that both neighbours reach, None if there is none.
-
-    Where they disagree, the blend of both is often far from any equilibrium, and the tangents of
-    one of them near it: each is tried with a few of Newton's steps before a path is followed.
-    """
-    apart = jump(first, second)
-
-    def surely(one: Solved | None) -> bool:
-        return one is not None and max(jump(first, one), jump(one, second)) < _NEARER * apart
-
-    found = _arrived(grasp_model, middle, first, half_way(grasp_model, first, second, middle[0]))
-    if surely(found):
-        return found
-    back = _come_from(grasp_model, middle, second)
-    if back is None or surely(back):
-        return back
+    """Return the state at ``middle`` [1, 3] that both neighbours reach, None if there is none."""
+    found, apart = None, jump(first, second)
+    if (guess := half_way(grasp_model, first, second, middle[0])) is not None:
+        there = grasp_model.follow(middle, first.displacement, guess, snap=False)[0]
+        if not refusal(there):
+            found = taken(grasp_model, there)
+            if max(jump(first, found), jump(found, second)) < _NEARER * apart:
+                return found
+    back = grasp_model.follow(middle, second.displacement,
+                              foretold_by(grasp_model, second, middle[0]), snap=False)[0]
+    if refusal(back):
+        return None
+    back = taken(grasp_model, back)
     if found is not None and _are_one(found, back, grasp_model):
         return found
-    there = _come_from(grasp_model, middle, first)
-    return back if there is not None and _are_one(there, back, grasp_model) else None
-
-
-def _come_from(grasp_model: GraspModel, middle: np.ndarray, one: Solved) -> Solved | None:
-    """Return the state at ``middle`` [1, 3] that the branch comes to from a neighbour, without a
-    snap; None if there is none.
-    """
-    guess = foretold_by(grasp_model, one, middle[0])
-    near = _arrived(grasp_model, middle, one, guess)
-    if near is not None:
-        return near
-    result = grasp_model.follow(middle, one.displacement, snap=False)[0]
-    return None if refusal(result) else taken(grasp_model, result)
-
-
-def _arrived(grasp_model: GraspModel, middle: np.ndarray, one: Solved, guess: Guess | None,
-             ) -> Solved | None:
-    """Return the state at ``middle`` [1, 3] near a guess; None if there is none."""
-    if guess is None:
+    there = grasp_model.follow(middle, first.displacement,
+                               foretold_by(grasp_model, first, middle[0]), snap=False)[0]
+    if refusal(there) or not _are_one(taken(grasp_model, there), back, grasp_model):
         return None
-    result = grasp_model.follow(middle, one.displacement, guess, snap=False, near=True)[0]
-    return None if refusal(result) else taken(grasp_model, result)
+    return back
 
 
 def _are_one(first: Solved, second: Solved, grasp_model: GraspModel) -> bool:

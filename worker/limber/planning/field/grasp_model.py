@@ -33,7 +33,6 @@ from limber.mechanics.strain import peak_load
 # A pose that needs finer steps than this is beyond a snap. It is rejected early.
 _SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False, keeps_factor=True)
 _STEADY = replace(_SETTINGS, snap=False)
-_NEAR = replace(_STEADY, max_iterations=6, total_iterations=0)  # from a guess, or not at all
 _DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differentiated
 
 
@@ -125,19 +124,17 @@ class GraspModel:
         return self.pose(self.rest.displacement)[:3]
 
     def follow(self, positions: np.ndarray, start: np.ndarray, guess: Guess | None = None,
-               *, snap: bool = True, near: bool = False) -> list[StaticResult]:
+               *, snap: bool = True) -> list[StaticResult]:
         """Take the grasp through ``positions`` [m, 3] slowly, from displacement ``start``.
 
         Args:
             guess: Guess of the branch's shape at the first of them.
             snap: Whether the branch may snap on the path; else the path ends there.
-            near: Whether to find only what a few of Newton's steps reach from the guess.
         """
         poses = np.hstack([positions, np.zeros_like(positions)])
         guess = guess or Guess()
-        settings = _NEAR if near else _SETTINGS if snap else _STEADY
         return follow_poses(self.model, self.grasp, poses, start=start, guess=guess.displacement,
-                            guess_strain=guess.strain, settings=settings)
+                            guess_strain=guess.strain, settings=_SETTINGS if snap else _STEADY)
 
     def pulled(self, force: np.ndarray, start: np.ndarray) -> StaticResult:
         """Return the state under a force [3] on the grasp, from displacement ``start``, held."""

@@ -68,7 +68,7 @@ class LearntGraspModel(GraspModel):
         return cls(grasp_model.branch, grasp, grasp_model.reach, known.reduced)
 
     def follow(self, positions: np.ndarray, start: np.ndarray, guess: Guess | None = None,
-               *, snap: bool = True, near: bool = False) -> list[StaticResult]:
+               *, snap: bool = True) -> list[StaticResult]:
         """As for the full model; only that needs ``guess``."""
         results, at = [], start
         for place in positions:
@@ -76,7 +76,7 @@ class LearntGraspModel(GraspModel):
             result = self._corrected(self.reduced.followed(self._coordinates(at), pose,
                                                            _SETTINGS))
             if result is None:
-                result = super().follow(place[None], at, guess, snap=snap, near=near)[0]
+                result = super().follow(place[None], at, guess, snap=snap)[0]
             results.append(result)
             at, guess = result.displacement if result.converged else at, None
         return results
