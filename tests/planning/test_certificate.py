@@ -314,6 +314,20 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
         assert limits.push(path) > 0.1
 
 
+def test_a_bound_is_for_all_of_the_goal_where_paths_end_deeper_in_it(well_field, monkeypatch):
+    """A plan that keeps off the goal's border, for the field's error, is held against paths that end
+    on it: the bound is the one of the goal that was requested."""
+    monkeypatch.setattr(lower_bound, "_LEVELS", 2)
+    whole = TargetGoal(Ball((0.15, 0.09, 0.33), 0.02))
+    inner = replace(whole, inset=0.01)
+    asked, drawn_in, mixed = (problem_on(well_field, goal=goal) for goal in (whole, inner, inner))
+    mixed = replace(mixed, asked_goal=whole, weights=asked.weights)
+    drawn_in = replace(drawn_in, weights=asked.weights)
+    lower = [certify(one, lambda _: np.inf).lower for one in (asked, mixed, drawn_in)]
+    assert lower[1] == pytest.approx(lower[0], rel=0.02)
+    assert lower[2] > 1.03 * lower[1] > 0.0
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_costs_of_two_seeds_compare(ridge_field):

@@ -178,8 +178,8 @@ class _Rounds:
         """
         try:
             return plan_within(self.field, self.start, self.aim, self.settings,
-                               self.planned_limits, asked=self.limits, before=self.pair,
-                               progress=ahead.part(0.0, 0.3))
+                               self.planned_limits, asked=self.limits, asked_goal=self.goal,
+                               before=self.pair, progress=ahead.part(0.0, 0.3))
         except NoWayError as none:
             found = None if is_last else asked_in_doubt(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,

@@ -48,7 +48,9 @@ class GentleProblem:
 
     ``weights`` are the cost of an edge. For a lower bound, ``field_error`` [J] is subtracted from
     the energy, so that the bound holds for every branch whose energy is within it. No path may be
-    longer than ``longest`` [m]; bounds ignore that limit, and also hold with it.
+    longer than ``longest`` [m]; bounds ignore that limit, and also hold with it. Paths may end in a
+    part of the requested goal only; the bound is for all of it, ``asked_goal`` (by default the
+    same).
 
     ``beyond`` are limits that the field exceeds only where the branch exceeds the requested ones
     (:meth:`~limber.planning.constraints.limits.Limits.beyond`). Bounds and proofs use them alone;
@@ -65,6 +67,12 @@ class GentleProblem:
     longest: float = np.inf
     beyond: FieldArrays | None = None
     errors: Mapping[str, LocalError] = field(default_factory=dict)
+    asked_goal: Goal | None = None
+
+    @property
+    def bounded_goal(self) -> Goal:
+        """The goal to which no path costs less than the bound."""
+        return self.asked_goal or self.goal
 
     def spare(self, name: str, points: np.ndarray) -> np.ndarray:
         """Return by how much the limit ``beyond`` may be less at ``points`` [n, 3], shape [n]."""

@@ -69,12 +69,13 @@ class PathPair:
 
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-                limits: Limits, *, asked: Limits | None = None, before: PathPair | None = None,
-                progress: Progress = SILENT) -> PathPair:
+                limits: Limits, *, asked: Limits | None = None, asked_goal: Goal | None = None,
+                before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
     """Plan both paths within ``limits``, tightened by the field's possible error where feasible.
 
     ``asked`` are the limits before they were tightened for the field's error, ``limits`` if not
-    given: a proof that no path exists refers to those. ``before`` has the results before the field
+    given: a proof that no path exists refers to those. ``asked_goal`` is the goal before it was
+    drawn in, for the bound. ``before`` has the results before the field
     learnt: its trees are not grown again if their paths still hold.
 
     If no path keeps the margins, one that keeps the limits on the field alone is planned. If none
@@ -98,8 +99,8 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
         part = {name: shares[0] * value for name, value in margins.items()}
         try:
             found = plan_pair(field, start, goal, settings, limits.within(field, shares[0]),
-                              beyond=surely, errors=errors, before=before,
-                              progress=progress.part(0.0, 0.5))
+                              beyond=surely, errors=errors, asked_goal=asked_goal,
+                              before=before, progress=progress.part(0.0, 0.5))
             return replace(found, margins=part)
         except NoPathError as error:
             if isinstance(error, NoWayError) and error.is_proven:
@@ -109,10 +110,11 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                           "model decides whether it is allowed.")
     try:
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
-                          errors=errors, before=before, progress=progress.part(0.5, 1.0))
+                          errors=errors, asked_goal=asked_goal, before=before,
+                          progress=progress.part(0.5, 1.0))
     except NoWayError as error:
-        found = _in_doubt(error, field, start, goal, settings, limits, surely,
-                          errors=errors, before=before, progress=progress.part(0.5, 1.0))
+        found = _in_doubt(error, field, start, goal, settings, limits, surely, errors=errors,
+                          asked_goal=asked_goal, before=before, progress=progress.part(0.5, 1.0))
     return replace(found, margins=none)
 
 
@@ -167,12 +169,12 @@ def _told(margins: dict[str, float]) -> str:
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
               limits: FieldArrays | None = None, *, beyond: FieldArrays | None = None,
-              errors: Mapping[str, LocalError] | None = None,
+              errors: Mapping[str, LocalError] | None = None, asked_goal: Goal | None = None,
               before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits, and bound the cost of any path from below.
 
-    ``limits`` are those of the settings if not given; ``beyond`` and ``errors`` are used by the
-    bound (:class:`~.path_problem.GentleProblem`).
+    ``limits`` are those of the settings if not given; ``beyond``, ``errors`` and ``asked_goal`` are
+    used by the bound (:class:`~.path_problem.GentleProblem`).
 
     Raises:
         InputError: the start is not allowed.
@@ -194,7 +196,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond,
-                            errors=errors or {})
+                            errors=errors or {}, asked_goal=asked_goal)
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
                    progress.part(0.0, 0.5)) if nobody is None else {}
     known = [path.points for path in trees.values()]

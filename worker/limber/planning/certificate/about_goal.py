@@ -42,8 +42,9 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     nothing = np.zeros(shape, bool)
     if len(cells) == 0:
         return AboutGoal(nothing, np.zeros(shape), nothing, 0.0, False, nothing)
-    away = (problem.goal.distance(problem.energy_field, grid.points(cells + 0.5))
-            - problem.goal.tolerance)
+    goal = problem.bounded_goal
+    away = (goal.distance(problem.energy_field, grid.points(cells + 0.5))
+            - goal.tolerance)
     # In the bounding box of these cells only, with a margin layer of unknown values.
     low, high = np.maximum(cells.min(axis=0) - 1, 0), cells.max(axis=0) + 2
     box = tuple(map(slice, low, high))
@@ -54,7 +55,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     corners = tuple(map(slice, low, high + 1))
     rate = np.where(ground.level[box], ground.floor,
                     corner_values(ground.rate[corners]).mean(axis=0))
-    cost = _way_left(distance / growth, problem.goal.tolerance / growth, rate, h)
+    cost = _way_left(distance / growth, goal.tolerance / growth, rate, h)
     curved = CURVATURE_FACTOR / 8.0 * sum(
         scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * h * np.sqrt(3.0)

@@ -235,7 +235,7 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     goal = about_goal(problem, grid, ground)
     if not goal.meets:
         centres = grid.points(np.argwhere(open_cells) + 0.5)
-        if (problem.goal.uncertainty(problem.energy_field, centres) > 0.0).any():
+        if (problem.bounded_goal.uncertainty(problem.energy_field, centres) > 0.0).any():
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
                             "of reach, but by less than the error of the energy field.")
         wall = over & scipy.ndimage.binary_dilation(open_cells, _NEAR)
