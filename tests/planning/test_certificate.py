@@ -315,8 +315,8 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
 
 
 def test_a_bound_is_for_all_of_the_goal_where_paths_end_deeper_in_it(well_field, monkeypatch):
-    """A plan that keeps off the goal's border, for the field's error, is held against paths that end
-    on it: the bound is the one of the goal that was requested."""
+    """A plan that keeps off the goal's border is held against paths that end on it: the bound is
+    the one of the goal that was requested."""
     monkeypatch.setattr(lower_bound, "_LEVELS", 2)
     whole = TargetGoal(Ball((0.15, 0.09, 0.33), 0.02))
     inner = replace(whole, inset=0.01)
