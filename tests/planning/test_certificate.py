@@ -314,6 +314,15 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
         assert limits.push(path) > 0.1
 
 
+def test_a_path_that_shrinks_to_nothing_is_refined(ridge_field):
+    """A start a nanometre before the goal: the path has fewer corners with each round."""
+    goal = GraspGoal((0.1, 0.06, 0.02), 0.01)
+    start = np.array(goal.position) - [goal.tolerance + 1e-9, 0.0, 0.0]
+    problem = problem_on(ridge_field, start=start, goal=goal, max_energy=2.0)
+    path, cost = refine(start + np.linspace(0.0, 1.0, 20)[:, None] * [0.005, 0.0, 0.0], problem)
+    assert np.isfinite(cost) and np.linalg.norm(path[-1] - path[0]) < 1e-3
+
+
 def test_a_bound_is_for_all_of_the_goal_where_paths_end_deeper_in_it(well_field, monkeypatch):
     """A plan that keeps off the goal's border is held against paths that end on it: the bound is
     the one of the goal that was requested."""

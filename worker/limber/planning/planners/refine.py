@@ -189,8 +189,13 @@ class Limited:
 
     def _with_multipliers(self, points: np.ndarray) -> Iterator[tuple[_Excess, np.ndarray]]:
         for number, excess in enumerate(self._excesses(points)):
-            yield excess, (self.multipliers[number] if self.multipliers
-                           else np.zeros(len(excess.values)))
+            count = len(excess.values)
+            known = self.multipliers[number] if self.multipliers else np.zeros(count)
+            if len(known) != count:
+                # A path that has shrunk to next to nothing has fewer corners than before.
+                known = np.interp(np.linspace(0.0, 1.0, count),
+                                  np.linspace(0.0, 1.0, len(known)), known)
+            yield excess, known
 
     def _excesses(self, points: np.ndarray) -> Iterator[_Excess]:
         problem, scale = self.problem, self.scale
