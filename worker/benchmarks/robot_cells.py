@@ -60,6 +60,8 @@ def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
     options = ["--branch", path, "--seed", seed]
     if cell.sensor.kind == "ft300":
         options.append("--ft300")
+    if cell.tool.gripper == "robotiq":
+        options.append("--robotiq")
     return VirtualRobot(cell.robot.model, cell.robot.address, options)
 
 

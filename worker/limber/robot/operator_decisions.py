@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from limber.core.errors import InputError, LimberError
+from limber.core.errors import InputError, LimberError, SafetyStop
 from limber.robot.driver.link import COLUMNS, RobotLink
+from limber.robot.grippers import drive_gripper, holds, is_driven
 from limber.robot.observed import show_before_motion
-from limber.robot.ur.digital_output import switch_output
 
 if TYPE_CHECKING:
     from limber.core.progress import Progress
@@ -94,10 +94,10 @@ def _gone_back(cell: Cell, link: RobotLink, progress: Progress) -> dict[str, Any
 
 def _opened_without_driver(cell: Cell) -> tuple[bool, str]:
     """Open the gripper by its output alone; returns whether it opened, and a description."""
-    if cell.tool.gripper != "digital_output":
+    if not is_driven(cell):
         return False, f"Free the branch by hand (tool.gripper is {cell.tool.gripper})"
     try:
-        switch_output(cell.robot.address, cell.tool.close_output, False)
+        drive_gripper(cell, False)
     except LimberError as error:
         return False, (f"The gripper did not open ({str(error).rstrip('.')}): free the branch by "
                        "hand")
@@ -145,10 +145,18 @@ def _left(force: float | None) -> str:
 
 
 def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> None:
-    """Close or open the gripper; without a wire, the person at the terminal does it."""
-    if cell.tool.gripper == "digital_output":
+    """Close or open the gripper; without a wire, the person at the terminal does it.
+
+    Raises:
+        SafetyStop: it closed on nothing, as far as it tells.
+    """
+    if is_driven(cell):
         link.gripper(close)
         time.sleep(cell.tool.grip_seconds)
+        if close and holds(cell) is False:
+            raise SafetyStop("The gripper closed on nothing.", "A pull or a path without the "
+                             "branch would be wrong from its first row.",
+                             "Move the gripper onto the branch, and open it before.")
     elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
         input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
     elif cell.tool.gripper == "by_hand":

@@ -51,6 +51,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
             model, joints=np.array(joints) if joints else None, seed=seed, load=load,
             mass=(tool.mass_kg or 0.0) if tool else 0.0,
             centre=tool.centre_of_mass_m if tool else (0.0, 0.0, 0.0),
+            robotiq=tool is not None and tool.gripper == "robotiq",
             ft300=cell.sensor.kind == "ft300" if cell else not arm_named(model).measures_force)
         controller.gripper_output = tool.close_output if tool else 0
         real_time = claim_real_time(VIRTUAL_ROBOT_PRIORITY)

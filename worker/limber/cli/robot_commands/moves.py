@@ -145,20 +145,21 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
     """
     from limber.core.errors import InputError
     from limber.robot.cell.cell import read_cell
+    from limber.robot.grippers import drive_gripper, is_driven
     from limber.robot.motion.way_file import WayFile
-    from limber.robot.ur.digital_output import switch_output
 
     cell = read_cell(cell_file)
-    if cell.tool.gripper != "digital_output":
+    if not is_driven(cell):
         raise InputError("Limber does not drive the cell's gripper.",
                          f"tool.gripper is {cell.tool.gripper}.", "Open it by hand.")
-    result = {"armed": armed, "output": cell.tool.close_output}
+    result = {"armed": armed, "gripper": cell.tool.gripper,
+              "output": cell.tool.close_output if cell.tool.gripper == "digital_output" else None}
     if not armed:
         return result
     if confirm != "open":
         raise InputError("Nobody confirmed that the gripper may open.",
                          "A bent branch springs back.", "Give --confirm open.")
-    switch_output(cell.robot.address, cell.tool.close_output, False)
+    drive_gripper(cell, False)
     time.sleep(cell.tool.grip_seconds)
     kept = WayFile(cell)
     kept.gripped(False)

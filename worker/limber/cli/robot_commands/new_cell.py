@@ -11,7 +11,7 @@ from limber.cli.main import Run, stage_command
 _ASKED = {"model": ("Model of the robot (ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e)", "ur5e"),
           "address": ("Address of its controller", "127.0.0.1"),
           "mass_kg": ("Mass of the gripper [kg]", "0.9"),
-          "gripper": ("Gripper (none, digital_output, by_hand)", "by_hand")}
+          "gripper": ("Gripper (none, digital_output, robotiq, by_hand)", "by_hand")}
 
 
 @stage_command("new-cell")
@@ -19,7 +19,7 @@ _ASKED = {"model": ("Model of the robot (ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16
 @click.option("--model", help="Model of the robot, or the URDF file of another arm.")
 @click.option("--address", help="Address of its controller.")
 @click.option("--mass-kg", "mass_kg", type=float, help="Mass of the gripper [kg].")
-@click.option("--gripper", type=click.Choice(["none", "digital_output", "by_hand"]),
+@click.option("--gripper", type=click.Choice(["none", "digital_output", "robotiq", "by_hand"]),
               help="How the gripper is moved.")
 def new_cell(run: Run, cell_file: Path, **given: Any) -> dict[str, Any]:
     """Write a commented cell file with every section, to be filled in.

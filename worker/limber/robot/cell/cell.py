@@ -95,7 +95,11 @@ class ToolEntry(_Entry):
     parts: tuple[CapsuleEntry, ...] = ()
     compliance_m_per_n: float = Field(
         5e-5, ge=0, le=1e-2, description="Compliance of arm, fingers and bark [m/N].")
-    gripper: Literal["none", "digital_output", "by_hand"] = "by_hand"
+    gripper: Literal["none", "digital_output", "robotiq", "by_hand"] = Field(
+        "by_hand", description="How it is driven. digital_output: by close_output. robotiq: by the "
+        "socket of Robotiq's URCap.")
+    grip_force: float = Field(0.2, ge=0, le=1, description="Share of a Robotiq gripper's greatest "
+                                                           "force.")
     grip_seconds: float = Field(
         1.0, gt=0, le=30, description="Time for the gripper to close or open [s].")
     close_output: int = Field(0, ge=0, le=7, description="Digital output that closes it.")

@@ -9,6 +9,7 @@ from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.robot.cell.cell import Cell
 from limber.robot.cell.controller_settings import plays
 from limber.robot.interface import Sample
+from limber.robot.ur.robotiq import RobotiqGripper
 from limber.robot.ur.samples import Dashboard, SampleStream
 
 _WATCHDOG_HZ = 10.0
@@ -37,6 +38,7 @@ class UrControl(SampleStream):
         self._dashboard = Dashboard(cell.robot.address)
         self._control: Any = None
         self._outputs: Any = None
+        self._gripper: RobotiqGripper | None = None
         self.facts = self._identified()
         self._first = _first_sample(self)
         self.facts |= {"pose": self._first.pose.tolist(), "joints": self._first.joints.tolist(),
@@ -96,6 +98,9 @@ class UrControl(SampleStream):
         self._before["tool"] = self._control.getTCPOffset()
         if self._first.payload is not None and self._first.payload_centre is not None:
             self._before["payload"] = (self._first.payload, self._first.payload_centre.tolist())
+        if tool.gripper == "robotiq":
+            # It answers within the time that the watchdog waits, or the motion ends.
+            self._gripper = RobotiqGripper(self.address, 0.5 / _WATCHDOG_HZ)
         if tool.gripper == "digital_output":
             from rtde_io import RTDEIOInterface
 
@@ -145,6 +150,9 @@ class UrControl(SampleStream):
             InputError: its gripper is not driven from here. WorkError: the robot does not do it.
         """
         tool = self._cell.tool
+        if self._gripper is not None:
+            self._gripper.drive(close, tool.grip_force)
+            return
         if self._outputs is None:
             raise InputError("Limber does not drive the cell's gripper.",
                              f"tool.gripper is {tool.gripper}.", "Close and open it by hand.")
@@ -173,6 +181,8 @@ class UrControl(SampleStream):
         for interface in (self._outputs, self._control):
             if interface is not None:
                 interface.disconnect()
+        if self._gripper is not None:
+            self._gripper.close()
         super().close()
         self._dashboard.close()
 

@@ -22,6 +22,7 @@ def main() -> int:
     parser.add_argument("--mass", type=float, default=0.0, help="kg at the flange")
     parser.add_argument("--centre", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="m")
     parser.add_argument("--ft300", action="store_true")
+    parser.add_argument("--robotiq", action="store_true", help="serve a gripper on port 63352")
     parser.add_argument("--off-nominal", type=float, default=0.0,
                         help="m, of each length of the arm")
     parser.add_argument("--seed", type=int, default=0)
@@ -34,7 +35,8 @@ def main() -> int:
             load = HeldBranch(BranchSetting(**{**known, "mesh": Path(known["mesh"])}))
         controller = Controller(options.model, joints=options.joints, mass=options.mass,
                                 centre=tuple(options.centre), seed=options.seed,
-                                ft300=options.ft300, load=load, off_nominal=options.off_nominal)
+                                ft300=options.ft300, robotiq=options.robotiq, load=load,
+                                off_nominal=options.off_nominal)
         claim_real_time(VIRTUAL_ROBOT_PRIORITY)
         serve(controller, options.address, control=True)
     except LimberError as error:

@@ -20,7 +20,7 @@ from limber.robot.ur.arms import UrArm
 from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
 from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
 from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
-from limber.robot.virtual.payload import Load, Nothing
+from limber.robot.virtual.payload import Load, Nothing, RobotiqRegisters
 from limber.robot.virtual.program import ControlProgram
 from limber.robot.virtual.step_kernels import tool_state
 
@@ -85,7 +85,8 @@ class Controller:
 
     def __init__(self, model: str, *, joints: np.ndarray | None = None, mass: float = 0.0,
                  centre: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0,
-                 load: Load | None = None, ft300: bool = False, off_nominal: float = 0.0):
+                 load: Load | None = None, ft300: bool = False, robotiq: bool = False,
+                 off_nominal: float = 0.0):
         self.arm: Arm = arm_named(model)
         self.calibration: FactoryCalibration | None = None
         """The arm's own dimensions, if it is one of Universal Robots."""
@@ -107,6 +108,8 @@ class Controller:
         self.tracker_off = _TRACKER_SIGMA_M * rng.standard_normal(3)
         """Offset of the simulated tracker's frame from the base's [m], shape [3]."""
         self.load: Load = load or Nothing()
+        self.robotiq = RobotiqRegisters(
+            self._drive_gripper, lambda: self.load.report().get("branch", "")) if robotiq else None
         self.fault = SensorFault()
         self.step_count, self.clock_offset = 0, 0.0
         self.clock_stands_at: float | None = None

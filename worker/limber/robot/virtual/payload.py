@@ -1,8 +1,16 @@
-"""The virtual gripper's load, as its controller knows it; and an empty gripper."""
+"""The virtual gripper: its load as the controller knows it, an empty one, Robotiq's registers."""
 
+import re
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
+
+from limber.robot.ur.robotiq import ACTIVATED, CLOSED, HELD_CLOSING, MOVING
+
+_AT_POSITION, _HELD_AT = 3, 200  # of 255: where an object stops the fingers
+_SETTING = re.compile(r"([A-Z]{3}) (\d+)")
+
 
 
 class Load(Protocol):
@@ -81,3 +89,46 @@ class Nothing:
 
     def close(self) -> None:
         """There is nothing to close."""
+
+
+class RobotiqRegisters:
+    """The registers of a Robotiq gripper, as its URCap answers for them.
+
+    Args:
+        drive: Closes (True) or opens the jaws.
+        load_state: Returns the state of what is between them, as :class:`.HeldBranch` names it.
+
+    Attributes:
+        values: The registers by name.
+    """
+
+    def __init__(self, drive: Callable[[bool], None], load_state: Callable[[], str]):
+        self._drive, self._load_state = drive, load_state
+        self.values = {"ACT": 1, "GTO": 0, "POS": 0, "SPE": 0, "FOR": 0, "STA": ACTIVATED,
+                       "FLT": 0}
+        self._is_closed = False
+
+    def answer(self, line: str) -> bytes:
+        """Return the reply to a line; an unknown one gets a question mark, as of the URCap."""
+        verb, _, rest = line.strip().partition(" ")
+        if verb == "GET" and (rest == "OBJ" or rest in self.values):
+            return f"{rest} {self._value(rest)}\n".encode()
+        settings = dict(_SETTING.findall(rest))
+        if verb != "SET" or not settings or not settings.keys() <= self.values.keys():
+            return b"?"
+        self.values |= {name: int(value) for name, value in settings.items()}
+        if self.values["GTO"] and self.values["STA"] == ACTIVATED and "POS" in settings:
+            close = self.values["POS"] > CLOSED // 2
+            if close != self._is_closed:
+                self._is_closed = close
+                self._drive(close)
+        return b"ack"
+
+    def _value(self, name: str) -> int:
+        if name == "OBJ":
+            if not self._is_closed:
+                return _AT_POSITION
+            return {"held": HELD_CLOSING, "closing": MOVING}.get(self._load_state(), _AT_POSITION)
+        if name == "POS" and self._is_closed and self._load_state() == "held":
+            return _HELD_AT
+        return self.values[name]

@@ -20,6 +20,7 @@ from limber.core.errors import InputError, WorkError
 from limber.geometry.cloud.camera import Camera
 from limber.robot.ur import rtde
 from limber.robot.ur.factory_calibration import PRIMARY_PORT, kinematics_message
+from limber.robot.ur.robotiq import ROBOTIQ_PORT
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import GREETING, answer
 
@@ -75,6 +76,8 @@ class Server:
             SCRIPT_PORT: self._serve_scripts}
         if self.controller.calibration is not None:
             ports[PRIMARY_PORT] = self._serve_primary
+        if self.controller.robotiq is not None:
+            ports[ROBOTIQ_PORT] = self._serve_robotiq
         if self.controller.ft300 is not None:
             ports[FT300_PORT] = self._serve_ft300
         if self.controller.load.seen():
@@ -183,6 +186,12 @@ class Server:
         assert self.controller.calibration is not None
         self.send(writer, kinematics_message(self.controller.calibration))
         await self._serve_scripts(reader, writer)
+
+    async def _serve_robotiq(self, reader: asyncio.StreamReader,
+                             writer: asyncio.StreamWriter) -> None:
+        assert self.controller.robotiq is not None
+        while line := await reader.readline():
+            self.send(writer, self.controller.robotiq.answer(line.decode("ascii", "replace")))
 
     async def _serve_ft300(self, _reader: asyncio.StreamReader,
                            writer: asyncio.StreamWriter) -> None:

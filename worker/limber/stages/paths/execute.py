@@ -508,13 +508,14 @@ def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:
     empty. Only at the path's start, as elsewhere it may hold something.
     """
     from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+    from limber.robot.grippers import is_driven
     from limber.robot.motion.start_check import require_start
 
     row = link.wait_for_samples()
     pose = pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ matrices(row[1:7]))
     require_start(pose, row[19:25], motion.approach.poses[0], motion.joints.joints[0],
                   cell.arm.joint_names)
-    if cell.tool.gripper == "digital_output":
+    if is_driven(cell):
         link.gripper(close=False)
         time.sleep(cell.tool.grip_seconds)
 

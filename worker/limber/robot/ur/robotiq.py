@@ -1,0 +1,121 @@
+"""A Robotiq gripper by the socket of its URCap: lines of text on port 63352 of the controller.
+
+``SET POS 255 SPE 255 FOR 0 GTO 1`` is answered by ``ack``, ``GET POS`` by ``POS 3``. Registers are
+those of the gripper: ACT (activate), GTO (go), POS (0 open, 255 closed), SPE, FOR (0 to 255), STA
+(3: activated), OBJ (0 moving, 1 and 2 stopped by an object while opening or closing, 3 at the
+requested position), FLT (fault, 0 none). Sources: Robotiq, "2F-85 and 2F-140 instruction manual",
+register mapping; the client of the same socket in ur_rtde (robotiq_gripper.cpp, SDU Robotics). It
+works while the arm is stopped: no program is needed.
+
+An activation opens and closes the gripper by itself. It is never done from here: with a branch in
+the jaws that would let it go, or crush it.
+"""
+
+import re
+import socket
+import time
+
+from limber.core.errors import WorkError
+
+ROBOTIQ_PORT = 63352
+CLOSED = 255
+ACTIVATED, MOVING, HELD_CLOSING = 3, 0, 2
+
+_SECONDS = 0.5
+_POLL_SECONDS = 0.02
+_VALUE = re.compile(rb"([A-Z]{3}) (\d+)")
+
+
+class RobotiqGripper:
+    """A connection to the gripper; a context manager.
+
+    Args:
+        address: Address of the controller.
+        seconds: Longest wait for an answer [s].
+
+    Raises:
+        WorkError: nothing answers, or the gripper is not activated or reports a fault.
+    """
+
+    def __init__(self, address: str, seconds: float = _SECONDS):
+        self.address = address
+        try:
+            self._socket = socket.create_connection((address, ROBOTIQ_PORT), seconds)
+        except OSError as error:
+            raise WorkError(f"No Robotiq gripper answers at {address} port {ROBOTIQ_PORT} "
+                            f"({error}).", "The cell file names it as the gripper.",
+                            "Check that its URCap is installed, or correct tool.gripper.",
+                            ) from error
+        self._socket.settimeout(seconds)
+        try:
+            self._require_ready()
+        except WorkError:
+            self._socket.close()
+            raise
+
+    def __enter__(self) -> "RobotiqGripper":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def _require_ready(self) -> None:
+        if fault := self._get("FLT"):
+            raise WorkError(f"The Robotiq gripper reports fault {fault}.", "It may not move.",
+                            "See its manual, and activate it on the pendant.")
+        if self._get("STA") != ACTIVATED:
+            raise WorkError("The Robotiq gripper is not activated.", "Its activation opens and "
+                            "closes it, so Limber does not do that.",
+                            "Activate it on the pendant, with nothing in the jaws.")
+
+    def drive(self, close: bool, force: float) -> None:
+        """Begin to close or open, without waiting.
+
+        Args:
+            force: Share of its greatest force, 0 to 1.
+
+        Raises:
+            WorkError: no acknowledgement.
+        """
+        wanted = f"SET POS {CLOSED if close else 0} SPE 255 FOR {round(255 * force)} GTO 1"
+        if self._asked(wanted).strip() != b"ack":
+            raise WorkError("The Robotiq gripper did not acknowledge its command.", "",
+                            "See its status on the pendant.")
+
+    def stopped(self, seconds: float) -> int:
+        """Return why it stopped (``OBJ``), waiting at most ``seconds`` [s] until it has.
+
+        Raises:
+            WorkError: it moves still.
+        """
+        end = time.monotonic() + seconds
+        while (why := self._get("OBJ")) == MOVING:
+            if time.monotonic() > end:
+                raise WorkError(f"The Robotiq gripper still moves after {seconds:g} s.", "",
+                                "Raise tool.grip_seconds in the cell file.")
+            time.sleep(_POLL_SECONDS)
+        return why
+
+    def _get(self, name: str) -> int:
+        answer = self._asked(f"GET {name}")
+        found = _VALUE.match(answer)
+        if found is None or found[1].decode() != name:
+            raise WorkError(f"The Robotiq gripper answered {answer!r} instead of {name}.", "",
+                            "Check which program listens on this port.")
+        return int(found[2])
+
+    def _asked(self, command: str) -> bytes:
+        try:
+            self._socket.sendall(f"{command}\n".encode())
+            answer = self._socket.recv(1024)
+        except OSError as error:
+            raise WorkError(f"The Robotiq gripper does not answer ({error}).", "",
+                            "Check the controller and its URCap.") from error
+        if not answer:
+            raise WorkError("The Robotiq gripper closed the connection.", "",
+                            "Check the controller and its URCap.")
+        return answer
+
+    def close(self) -> None:
+        """Close the connection; the gripper stays as it is."""
+        self._socket.close()
