@@ -4,6 +4,7 @@ import click
 
 from limber.cli.robot_commands.calibrate import calibrate
 from limber.cli.robot_commands.check import check
+from limber.cli.robot_commands.draw import draw
 from limber.cli.robot_commands.moves import goto_start, home, open_gripper, release, retreat
 from limber.cli.robot_commands.new_cell import new_cell
 from limber.cli.robot_commands.scan import scan
@@ -15,6 +16,6 @@ def command() -> None:
     """Check a robot, calibrate where it stands, and move it by itself."""
 
 
-for each in (new_cell, check, weigh, calibrate, scan, home, goto_start, retreat, release,
+for each in (new_cell, draw, check, weigh, calibrate, scan, home, goto_start, retreat, release,
              open_gripper):
     command.add_command(each)
