@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.robot_cells import cell_file
+from benchmarks.robot_cells import cell_file, standing_at
 from benchmarks.robot_faults import cell_for, set_off, straight
 from limber.cli.commands.robot import command
 from limber.core.errors import NoPathError
@@ -19,6 +19,7 @@ from limber.robot.motion.joint_planner import joint_way
 from limber.robot.motion.trajectory import along_bounded
 from limber.stages.paths.arm_moves import to_joints
 from limber.stages.paths.arm_surroundings import ArmSurroundings
+from limber.store import Branch
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0),
@@ -125,6 +126,36 @@ def test_home_and_retreat_move_only_when_armed(e_series, tmp_path, capfd):
     code, told = run(["home", path, "--arm", "--confirm", "home"], capfd)
     assert code == 0 and told["reached"]
     assert e_series.state["joints"] == pytest.approx(cell.arm.home, abs=1e-4)
+
+
+def test_release_opens_the_gripper_and_goes_away_from_the_branch(e_series, tmp_path, capfd):
+    cell = cell_for(e_series.address)
+    cell = cell.model_copy(update={
+        "tool": cell.tool.model_copy(update={"mass_kg": 0.0, "gripper": "digital_output",
+                                             "grip_seconds": 0.1}),
+        "approach": cell.approach.model_copy(update={"distance_m": 0.02})})
+    path = str(cell_file(cell, tmp_path))
+    e_series.ask("outputs", value=1)
+    begin = matrices(np.array(e_series.state["pose"]))
+    code, told = run(["release", path], capfd)
+    assert code == 0 and not told["armed"] and e_series.state["outputs"] == 1
+    code, told = run(["release", path, "--arm", "--confirm", "release"], capfd)
+    assert code == 0 and told["reached"] and e_series.state["outputs"] == 0
+    moved = np.array(e_series.state["pose"][:3]) - begin[:3, 3]
+    assert moved == pytest.approx(-0.02 * begin[:3, 2], abs=2e-4)
+
+
+def test_goto_start_ends_where_execute_begins(e_series, planned_folder, tmp_path, capfd):
+    cell = standing_at(Branch.open(planned_folder), e_series.address, grip_seconds=0.1)
+    path = str(cell_file(cell, tmp_path))
+    code, told = run(["goto-start", path, str(planned_folder)], capfd)
+    assert code == 0 and not told["armed"], told
+    goal = np.array(told["end_joints_rad"])
+    e_series.ask("stand", joints=list(goal + [0.03, 0, 0, 0, 0, 0.05]))
+    code, told = run(["goto-start", path, str(planned_folder), "--arm", "--confirm",
+                      "goto-start"], capfd)
+    assert code == 0 and told["reached"], told
+    assert e_series.state["joints"] == pytest.approx(goal, abs=1e-4)
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from tests.robot.stepped import Run, Wall
 
+from benchmarks.robot_stepped import Run, Wall
 from limber.core.errors import InputError
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import contact_speed, speed_within

@@ -27,6 +27,7 @@ from benchmarks.robot_faults import (
     straight,
 )
 from benchmarks.robot_loop import LOOP_ROWS, closed_loops
+from benchmarks.robot_retreats import RETREAT_ROW, retreats
 from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
 from benchmarks.table import Asked, Part, Row, Setting
 from limber.core.errors import LimberError
@@ -281,6 +282,7 @@ PARTS = {
     "path": Part(_watched(_path), 20, (_PATH,)),
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
+    "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
     "lost": Part(_watched(partial(lost_branches, address=_ADDRESS)), 100, (LOST_ROW,), grows=True),

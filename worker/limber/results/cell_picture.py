@@ -131,7 +131,8 @@ def _obstacle(axes: Axes, seen: list[int], obstacle: Obstacle, label: str | None
     flat = points[:, seen]
     outline = flat[ConvexHull(flat).vertices]
     axes.fill(*outline.T, color=_OBSTACLE, alpha=0.35, linewidth=0, label=label)
-    axes.annotate(obstacle.name, tuple(outline.mean(axis=0)), ha="center", fontsize=8, color="#444444")
+    axes.annotate(obstacle.name, tuple(outline.mean(axis=0)), ha="center", fontsize=8,
+                  color="#444444")
 
 
 def _branch(axes: Axes, seen: list[int], skeleton: Skeleton) -> None:
