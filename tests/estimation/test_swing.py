@@ -6,6 +6,7 @@ from tests.subjects.meshes import box_mesh
 
 from limber.core.errors import InputError
 from limber.estimation.vibration.free_swing import SwingSeen, first_guess, fit_swing
+from limber.estimation.vibration.modal_swing import Ends, ModalSwing
 from limber.mechanics import (
     BranchModel,
     EnergyMomentumSettings,
@@ -77,6 +78,36 @@ def test_a_virtual_swing_gives_modulus_damping_and_release(start):
     within = found.damping_ratio_interval
     assert within[0] < ratio < within[1]
     assert found.relative_residual < 0.02
+
+
+def test_modes_move_as_the_full_model_in_small_vibrations():
+    """Begin, vibration, damping and rest, and the derivatives to modulus and density."""
+    mesh, end = beam((1, 1, 10))
+    model = BranchModel(mesh, young=YOUNG, poisson=0.4, density=DENSITY,
+                        gravity=(-0.1, 0.0, 0.0), damping=DAMPING)
+    model = model.with_point_masses([
+        PointMass(tuple(mesh.nodes[node]), 1e-3 / len(end.nodes)) for node in end.nodes])
+    times, operator = 0.002 * np.arange(120), point_operator(mesh, MARKERS)
+
+    def simulated(branch):
+        run = simulate_dynamics(branch, times=times, start="rest",
+                                settings=EnergyMomentumSettings(max_step=0.002)).require()
+        return (operator @ run.displacement.reshape(len(times), -1).T).T.reshape(-1, 3, 3)
+
+    def ends(branch):
+        found = solve_static(branch).require().displacement
+        return Ends(np.zeros_like(found), found)
+
+    modes = ModalSwing(model, ends(model), ends(ModalSwing.denser(model)), operator)
+    damping = (DAMPING.mass, DAMPING.stiffness)
+    exact, ours = simulated(model), modes.moved(times, 0.0, damping, 0.0)
+    size = np.abs(exact).max()
+    assert np.abs(ours - exact).max() < 0.02 * size
+    slopes = modes.slopes(times, 0.0, damping, 0.0)
+    for column, branch in ((0, model.with_parameters(young=1.02 * YOUNG)),
+                           (3, model.with_parameters(density=1.02 * DENSITY))):
+        change = (simulated(branch) - exact) / np.log(1.02)
+        assert np.abs(slopes[..., column] - change).max() < 0.05 * np.abs(change).max()
 
 
 def test_what_is_no_swing_is_refused():

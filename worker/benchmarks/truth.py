@@ -4,7 +4,14 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks import truth_beam, truth_branch, truth_scans, truth_states, truth_trials
+from benchmarks import (
+    truth_beam,
+    truth_branch,
+    truth_scans,
+    truth_starts,
+    truth_states,
+    truth_trials,
+)
 from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Part, Row, Setting, share_met
 from benchmarks.truth_recordings import BAD_RECORDINGS, bad_recordings_row
@@ -106,6 +113,9 @@ PARTS = {
     "one-pull": Part(_one_pull, 60, _ONE_PULL, grows=True),
     "scans": Part(truth_scans.scan_row, 60, truth_scans.ROWS, grows=True),
     "three-pulls": Part(_three_pulls, 150, _THREE_PULLS, grows=True),
+    "starts": Part(truth_starts.start_row, 20, (truth_starts.START_ROW,), grows=True),
+    "advice": Part(truth_starts.advice_row, 30, (truth_starts.ADVICE_ROW,), grows=True),
+    "paper": Part(truth_starts.paper_row, 60, (truth_starts.PAPER_ROW,)),
     "bad-recordings": Part(bad_recordings_row, 80, (BAD_RECORDINGS,), grows=True),
     "beam": Part(truth_beam.beam_rows, 60, truth_beam.BEAM_ROWS),
     "real-beam": Part(truth_beam.real_row, 60, (truth_beam.REAL_ROW,)),
