@@ -41,8 +41,8 @@ _GONE = 0.3
 _FULL_RUNS = 4
 """Most simulations by the full model."""
 _SETTLED = 0.5
-"""Change of the motion by a correction, in standard deviations, after which there is no other. Nearly
-all of it is then exchange between the two damping parameters: of the virtual beams the modulus
+"""Change of the motion by a correction, in standard deviations, after which there is no other.
+Nearly all of it is then an exchange between the two damping parameters: of the virtual beams the modulus
 changed by 0.03 %, a fiftieth of its deviation.
 """
 _MARGIN = 0.1
