@@ -42,8 +42,8 @@ _FULL_RUNS = 4
 """Most simulations by the full model."""
 _SETTLED = 0.5
 """Change of the motion by a correction, in standard deviations, after which there is no other.
-Nearly all of it is then an exchange between the two damping parameters: of the virtual beams the modulus
-changed by 0.03 %, a fiftieth of its deviation.
+Nearly all of it is then an exchange between the two damping parameters: of the virtual beams the
+modulus changed by 0.03 %, a fiftieth of its deviation.
 """
 _MARGIN = 0.1
 """Deviation of a marker's gain if the registration is not known."""
