@@ -2,11 +2,15 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from limber.core.progress import Progress
 from limber.estimation.online import follow
+from limber.estimation.online.filter import OnlineState
+from limber.recordings.cell_errors import EXACT, CalibrationEntry
 from limber.recordings.recording import write_pull
 
 
@@ -49,6 +53,19 @@ def test_a_replay_keeps_its_pace(tmp_path, plain_pull):
             break
     assert len(frames) == 60
     assert 0.17 < time.monotonic() - started < 3.0
+
+
+@pytest.mark.parametrize(("calibration", "tells"), [(EXACT, True), (CalibrationEntry(), False)])
+def test_it_says_enough_only_where_noise_alone_limits(plain_pull, calibration, tells):
+    """A gripper frame a millimetre off is not in the live intervals: 2 % would be no truth."""
+    pull = replace(plain_pull, entry=plain_pull.entry.model_copy(
+        update={"calibration": calibration}))
+    said: list[str] = []
+    told = follow.begun_sentences(pull, Progress(on_warning=said.append))
+    assert bool(said) is not tells
+    state = OnlineState(1.0, np.array([1e7]), np.array([[0.99e7, 1.01e7]]), 1.0, True, True, False)
+    follow._report("p", state, 0.5, told, Progress(on_warning=said.append))
+    assert any("known to 2 %" in each for each in said) is tells
 
 
 def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):

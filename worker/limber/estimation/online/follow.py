@@ -22,6 +22,7 @@ from limber.estimation.online.information import OnlineFrame
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval
+from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import Observations, Pull, read_pull
 from limber.recordings.sensor_checks import clean
@@ -75,7 +76,8 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
         # It is being recorded now: missed frames are caught up.
         pace = np.inf
     states: list[OnlineState] = []
-    told: set[str] = set()
+    told = begun_sentences(first, progress)
+    is_exact = not told
     slowest, stopped = 0.0, False
     with Beside(begun.branch) as beside:
         estimator = begun.estimator(beside)
@@ -102,8 +104,26 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
              f"rebuilt {estimator.refresh_count} times during the pull.")
     result = _result(name, states, slowest) | _with_radii(axes, subject, states[-1]) | {
         "frame_count": estimator.frame_count, "stopped": stopped,
+        "enough": states[-1].enough and is_exact, "cell_errors_included": is_exact,
         "model_error": estimator.model_error, "refresh_count": estimator.refresh_count}
     return result, _history(states)
+
+
+def begun_sentences(pull: Pull, progress: Progress) -> set[str]:
+    """Say what live intervals leave out; return the sentences that are then not to be said.
+
+    Where a cell has constant errors, noise alone does not say when enough is known.
+    """
+    known = calibration_of(pull.entry)
+    if not any((known.pose_sigma_m, known.pose_sigma_rad, known.force_gain_sigma,
+                known.force_bias_sigma_n, known.force_drift_sigma_n, known.camera_sigma_m,
+                known.camera_sigma_rad, known.point_sigma_m)):
+        return set()
+    progress.warn(
+        f"{pull.name}: live intervals include the noise of the sensors alone. Constant errors of "
+        "the cell ([calibration]: gripper frame, zero and gain of the force, camera) may be "
+        "larger. `limber estimate` includes them.")
+    return {"enough"}
 
 
 def _report(name: str, state: OnlineState, share: float, told: set[str],
