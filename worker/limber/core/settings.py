@@ -10,6 +10,7 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -55,6 +56,17 @@ def possible_density(given: Any) -> Any:
             raise ValueError("it is in kg/m^3, and that of a branch is between 50 and 3000"
                              + likely)
     return given
+
+
+def possible_time(value: str | None) -> str | None:
+    """Accept a date, or a date with a time of day (ISO 8601)."""
+    if value is not None:
+        try:
+            datetime.fromisoformat(value)
+        except ValueError as error:
+            raise ValueError(f"{value!r} is no date such as 2026-05-01 or 2026-05-01T14:00"
+                             ) from error
+    return value
 
 
 def possible_force(given: Any) -> Any:

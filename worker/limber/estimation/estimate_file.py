@@ -52,6 +52,18 @@ class _Action(_Told):
     width_share: float
 
 
+class _PullModulus(_Told):
+    pull: str
+    recorded: str | None = None
+    factor: float
+    interval: tuple[float, float]
+
+
+class _Drift(_Told):
+    per_day: float
+    interval: tuple[float, float]
+
+
 class _Evaluation(_Told):
     parameters: list[_Maybe] = []
     loss_m2: _Maybe = None
@@ -110,6 +122,8 @@ class _Estimate(_Told):
     causes: list[_Cause] | None = None
     next_actions: list[_Action] | None = None
     held_out: dict[str, _Score] | None = None
+    pull_moduli: list[_PullModulus] | None = None
+    drift: _Drift | None = None
     warnings: list[str] = []
     control_points_m: list[_Vector]
     fractions: list[_Share]

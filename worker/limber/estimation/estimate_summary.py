@@ -9,6 +9,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.judgement import Estimate
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import outliers
+from limber.estimation.uncertainty.drift import drift, pull_moduli, scale_steps
 from limber.estimation.uncertainty.model_error import bending_interval, total_interval
 from limber.estimation.uncertainty.variance_parts import largest
 from limber.recordings.recording import Pull
@@ -34,7 +35,7 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "is_weightless": found.is_weightless, "held_out": found.held_out,
         "variance_factor": sure.variance_factor, "warnings": found.warnings,
-        "forward": settings.forward} | _bending(found) | _reduced_error(found)
+        "forward": settings.forward} | _bending(found) | _reduced_error(found) | _by_pull(found)
 
 
 def _bending(found: Estimate) -> dict[str, Any]:
@@ -45,6 +46,17 @@ def _bending(found: Estimate) -> dict[str, Any]:
                                 found.model_error)
     return {"bending_stiffness_nm2": found.young * found.second_moment,
             "bending_stiffness_interval_nm2": interval * found.second_moment[:, None]}
+
+
+def _by_pull(found: Estimate) -> dict[str, Any]:
+    """Each pull's modulus beside the joint one, and the change per day; of one pull nothing."""
+    sure, objective = found.uncertainty, found.objective
+    if len(objective.forwards) < 2 or found.stopped:
+        return {}
+    steps = scale_steps(found.fit.evaluation, objective, sure.variance_factor * sure.repetition)
+    recorded = [objective.forwards[each.pull].entry.recorded for each in steps]
+    return {"pull_moduli": pull_moduli(steps, objective),
+            "drift": drift(steps, recorded, sure.recording_spread)}
 
 
 def _reduced_error(found: Estimate) -> dict[str, Any]:

@@ -11,11 +11,12 @@ from typing import Any, Literal
 
 import numpy as np
 import tomlkit
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml, toml_content
 from limber.core.json_values import plain, validated
+from limber.core.settings import possible_time
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.time_series import Stream, read_stream, write_stream
 
@@ -90,8 +91,13 @@ class PullEntry(BaseModel):
         "cell that was set up with care and not measured since.")
     rest_points_m: tuple[Vector, ...] | None = Field(
         None, description="Positions of the observed points at rest. Absent: the control points.")
+    recorded: str | None = Field(
+        None, description="When it was recorded, such as 2026-05-01 or 2026-05-01T14:00. With "
+        "pulls of several days an estimate states the change of the modulus per day.")
     source: str = ""
     truth: dict[str, Any] | None = None
+
+    _recorded = field_validator("recorded")(possible_time)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,14 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from limber.core.settings import GraspMode, Groups, OneOf, Settings, possible_force
+from limber.core.settings import (
+    GraspMode,
+    Groups,
+    OneOf,
+    Settings,
+    possible_force,
+    possible_time,
+)
 from limber.recordings.importing.recording_formats import kind_names
 
 
@@ -13,7 +20,7 @@ class ImportSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "coordinates",
-            "time_offset", "yolo_weights", "yolo_prompt", "yolo_class"),
+            "time_offset", "recorded", "yolo_weights", "yolo_prompt", "yolo_class"),
         "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
             "points_topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "weight", "load",
@@ -68,6 +75,9 @@ class ImportSettings(Settings):
         "act. loaded: bent by the load until it is removed.")
     time_offset: float | None = Field(
         None, description="Added to SOURCE's time stamps [s]. Default: estimated.")
+    recorded: str | None = Field(
+        None, description="When it was recorded: 2026-05-01 or 2026-05-01T14:00. With pulls of "
+        "several days, the estimate states the change of the modulus per day.")
     position_sigma: float | None = Field(
         None, gt=0, description="Noise of positions [m]. Default: 1 mm; under a steady load, the "
         "noise measured in the recording.")
@@ -98,3 +108,4 @@ class ImportSettings(Settings):
     yolo_class: str | None = Field(None, description="Name of the class that is the branch.")
 
     _force = field_validator("weight", "load")(possible_force)
+    _recorded = field_validator("recorded")(possible_time)

@@ -7,6 +7,7 @@ import numpy as np
 import scipy
 
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.cell_errors import calibration_of
 
 OUTLIER = 4.5
@@ -122,20 +123,8 @@ def recording_spread(evaluation: Evaluation, objective: Objective, scale: float)
     count = len(objective.forwards)
     if count < 2 or stated == 0.0:
         return stated
-    steps, variances = [], []
-    group_count = objective.space.group_count
-    for piece in objective.raw_slopes(evaluation):
-        others = [piece.errors] + ([] if piece.response is None else [piece.response])
-        taken = np.vstack([np.hstack(others), np.eye(piece.errors.shape[1], sum(
-            each.shape[1] for each in others))])
-        basis = np.linalg.qr(taken)[0]
-        along, off = (np.concatenate([each, np.zeros(piece.errors.shape[1])]) for each in (
-            piece.free[:, :group_count].sum(axis=1), piece.residual))
-        along, off = (each - basis @ (basis.T @ each) for each in (along, off))
-        information = float(along @ along)
-        if information > 0:
-            steps.append(-float(along @ off) / information)
-            variances.append(scale / information)
+    found = scale_steps(evaluation, objective, scale)
+    steps, variances = [each.step for each in found], [each.variance for each in found]
     if len(steps) < 2:
         return stated
     weights = 1 / np.array(variances)

@@ -111,6 +111,7 @@ class ImportRequest:
             grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=mode),
             sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma,
                                torque_sigma_nm=settings.torque_sigma),
+            recorded=settings.recorded,
             rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))
 
 

@@ -1,6 +1,7 @@
 """Figures of an estimate: E along the branch, loss over evaluations, simulated over observed."""
 
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,10 @@ def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
         if pull["measured_force_n"] and _numbers(pull["measured_force_n"]).size:
             yield (force_over_time(pull),
                    f"Pull {pull['name']}: force of the gripper on the branch.")
+    if estimate.get("drift"):
+        yield (modulus_over_days(estimate),
+               "Modulus of each pull over the joint one, with 95 % intervals, and its change per "
+               "day.")
     if estimate.get("held_out"):
         yield (held_out_scores(estimate),
                "Pulls predicted by a fit without them: error relative to the pull's travel and "
@@ -120,6 +125,21 @@ def residuals_over_time(pull: dict[str, Any]) -> Any:
     axes.axhline(OUTLIER, color=TRUE, lw=0.8)
     axes.set_ylim(bottom=0)
     figure.legend(frameon=False, ncol=5, fontsize=8, loc="outside upper left")
+    return figure
+
+
+def modulus_over_days(estimate: dict[str, Any]) -> Any:
+    """Each pull's modulus over the joint one against the day of its recording."""
+    figure, axes = chart(5.2, 3.2, "days", "E of the pull over the joint E")
+    known = [each for each in estimate["pull_moduli"] if each["recorded"]]
+    times = np.array([datetime.fromisoformat(each["recorded"]).timestamp() for each in known])
+    days = (times - times.min()) / 86400.0
+    factor = np.array([each["factor"] for each in known])
+    low, high = np.array([each["interval"] for each in known]).T
+    axes.errorbar(days, factor, [factor - low, high - factor], fmt="o", color=SIMULATED)
+    rate = np.log1p(estimate["drift"]["per_day"])
+    middle = np.exp(np.mean(np.log(factor)) + rate * (np.sort(days) - days.mean()))
+    axes.plot(np.sort(days), middle, color=SIMULATED, lw=1)
     return figure
 
 

@@ -157,6 +157,26 @@ def action_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
                               for low, high in each["young_interval_pa"])] for each in actions]
 
 
+def pull_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return each pull's modulus over the joint one, and the change per day if there is one.
+
+    Args:
+        estimate: ``pull_moduli`` and ``drift``
+            (:mod:`limber.estimation.uncertainty.drift`).
+    """
+    moduli = estimate.get("pull_moduli") or []
+    if not moduli:
+        return []
+    rows = [["pull", "recorded", "E over the joint E", "95 % interval"]]
+    rows += [[each["pull"], each["recorded"] or "-", f"{each['factor']:.3g}",
+              "{:.3g} to {:.3g}".format(*each["interval"])] for each in moduli]
+    if change := estimate.get("drift"):
+        low, high = change["interval"]
+        rows.append(["change per day", "", f"{100 * change['per_day']:+.2g} %",
+                     f"{100 * low:+.2g} to {100 * high:+.2g} %"])
+    return rows
+
+
 def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     """Return how well a fit without a pull predicts that pull.
 

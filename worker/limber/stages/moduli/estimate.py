@@ -262,6 +262,7 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         cause_rows,
         held_out_rows,
         modulus_rows,
+        pull_rows,
     )
 
     tables = [("Young's modulus", modulus_rows(result, None))]
@@ -269,6 +270,8 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         tables.append(("Sources of uncertainty, largest first", causes))
     if actions := action_rows(result):
         tables.append(("What to do next, best first", actions))
+    if by_pull := pull_rows(result):
+        tables.append(("Modulus by pull", by_pull))
     if held_out := held_out_rows(result):
         tables.append(("Pulls predicted by a fit without them: RMS errors", held_out))
     return tables

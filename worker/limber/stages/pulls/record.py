@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -339,7 +340,7 @@ def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, 
             point_m=tuple(map(float, point)), radius_m=GRASP_RADIUS_M),
         sensor=known_noise(cell, noise),
         calibration=known_errors(cell, seconds, tare_sigma=tared["sigma"]),
-        rest_points_m=rest,
+        rest_points_m=rest, recorded=datetime.now().astimezone().isoformat(timespec="seconds"),
         source=f"limber record, {cell.arm.name}, {cell.sensor.kind}; tare within "
         f"{max(tared['sigma'][:3]):.2g} N")
     for line in entry_text(entry).splitlines():

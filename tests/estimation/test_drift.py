@@ -1,0 +1,70 @@
+"""Pulls of several days: how the modulus of each differs, and how it changes from day to day."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.estimation.test_nuisances import TRUTH, objective_of
+
+from benchmarks.paper_branches import measured
+from limber.core.errors import InputError
+from limber.estimation.fitting.objective import Objective
+from limber.estimation.parameters import Values
+from limber.estimation.uncertainty.drift import ScaleStep, drift, pull_moduli, scale_steps
+from limber.recordings.recording import entry_of_text, entry_text
+from limber.results.report.estimate_figures import modulus_over_days
+from limber.results.report.report_tables import pull_rows
+
+DAYS = ("2026-05-01", "2026-05-03T12:00", "2026-05-06")
+
+
+def test_a_branch_that_dries_stiffens_by_what_it_did():
+    """Two percent a day over five days, each pull known to half a percent."""
+    days = np.array([0.0, 2.5, 5.0])
+    steps = [ScaleStep(k, float(np.log(1.02) * day) - 0.05, 0.005**2)
+             for k, day in enumerate(days)]
+    found = drift(steps, DAYS, 0.0)
+    assert found["per_day"] == pytest.approx(0.02, abs=1e-6)
+    low, high = found["interval"]
+    assert low < 0.02 < high and high - low == pytest.approx(2 * 1.96 * 1.02 * 0.005 / np.sqrt(
+        np.sum((days - days.mean())**2)), rel=0.01)
+    wider = drift(steps, DAYS, 0.02)["interval"]
+    assert wider[1] - wider[0] > 3 * (high - low)
+
+
+def test_one_day_tells_no_change():
+    steps = [ScaleStep(k, 0.1 * k, 1e-4) for k in range(3)]
+    assert drift(steps, ["2026-05-01", None, "2026-05-01"], 0.0) is None
+    found = drift(steps, ["2026-05-01", None, "2026-05-03"], 0.0)
+    assert found["per_day"] == pytest.approx(np.expm1(0.1))
+
+
+def test_a_pull_of_a_stiffer_day_says_so(small_bench, small_pull):
+    """Its force is a tenth larger on the same path: its modulus lies that far above the other's."""
+    first, second = (measured(replace(small_pull, name=name), seed, points=2e-4, force=0.002)
+                     for seed, name in enumerate(("pull-1", "pull-2")))
+    second = replace(second, wrenches=1.1 * second.wrenches)
+    pulls = [replace(pull, entry=pull.entry.model_copy(update={"recorded": day}))
+             for pull, day in ((first, DAYS[0]), (second, DAYS[2]))]
+    parts = [objective_of(small_bench, pull) for pull in pulls]
+    objective = Objective([part.forwards[0] for part in parts], parts[0].space,
+                          force_sigma=[part.force_sigma[0] for part in parts])
+    evaluation = objective.evaluate(
+        objective.space.pack(Values(1.05 * TRUTH, 0.36, 900.0)), jacobian=True)
+    steps = scale_steps(evaluation, objective, 1.0)
+    moduli = pull_moduli(steps, objective)
+    apart = moduli[1]["factor"] / moduli[0]["factor"]
+    assert apart == pytest.approx(1.1, abs=0.03)
+    told = {"pull_moduli": moduli, "drift": drift(steps, DAYS[::2], 0.0)}
+    assert told["drift"]["per_day"] == pytest.approx(np.log(1.1) / 5, abs=0.006)
+    rows = pull_rows(told)
+    assert [row[0] for row in rows] == ["pull", "pull-1", "pull-2", "change per day"]
+    assert len(modulus_over_days(told).axes[0].lines) >= 2
+
+
+def test_a_time_survives_the_file_and_another_is_refused(small_pull):
+    entry = small_pull.entry.model_copy(update={"recorded": DAYS[1]})
+    text = entry_text(entry)
+    assert entry_of_text(text, "here").recorded == DAYS[1]
+    with pytest.raises(InputError, match="yesterday"):
+        entry_of_text(text.replace(DAYS[1], "yesterday"), "here")
