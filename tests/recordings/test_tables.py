@@ -130,3 +130,24 @@ def test_titles():
     assert split_title("tip1_x_mm").unit == "mm" and split_title("tip1_x").unit is None
     assert same_label("Tip - 1", "tip1") and same_label("beam:tip1", "Tip 1")
     assert not same_label("tip1", "tip2")
+
+
+@pytest.mark.parametrize(("above", "row", "titles"), [
+    ((), "{a:.3f}", ["reading_1"]),
+    (("12:00:00.000 -> Ready.", "11:59:59.990 -> 3"), "{a:.3f},{b:.2f}",
+     ["reading_1", "reading_2"]),
+    (("12:00:00.000 -> force_N\tangle_deg",), "{a:.3f}\t{b:.2f}", ["force_N", "angle_deg"]),
+    (("12:00:00.000 -> ok",), "force:{a:.3f} angle:{b:.2f}", ["force", "angle"]),
+    (("12:00:00.000 -> ok",), "F = {a:.3f}", ["F"])])
+def test_the_log_of_a_serial_monitor(tmp_path, above, row, titles):
+    """Stamps of the computer's clock before an arrow; readings bare, named, or below titles."""
+    path, a = tmp_path / "a.txt", np.sin(np.arange(40) / 3)
+    lines = [f"12:00:0{1 + k // 100}.{10 * k % 1000:03d} -> {row.format(a=a[k], b=90 + k)}"
+             for k in range(40)]
+    path.write_text("\n".join([*above, *lines]) + "\n")
+    stream = time_stream(read_table(path))
+    assert list(stream.columns) == titles
+    np.testing.assert_allclose(stream.times - stream.times[0], 0.01 * np.arange(40), atol=1e-9)
+    np.testing.assert_allclose(stream.values[:, 0], a, atol=6e-4)
+    if len(titles) == 2:
+        np.testing.assert_array_equal(stream.values[:, 1], 90 + np.arange(40))

@@ -33,6 +33,7 @@ from limber.recordings.table_parts.rows import (
     text_of,
     words_in,
 )
+from limber.recordings.table_parts.serial_log import without_arrows
 from limber.recordings.time_series import Stream, in_order
 
 LENGTH_UNITS_M = {spelt: UNIT_METRES[unit] for spelt, unit in LENGTHS.items()}
@@ -94,7 +95,7 @@ def read_table(path: str | Path) -> Table:
     """
     path = Path(path)
     text = text_of(path)
-    lines = section_of(text.splitlines())
+    lines = without_arrows(section_of(text.splitlines()))
     bare = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
     comments = [line.lstrip()[1:].strip() for line in lines if line not in bare]
     separator = separator_of(bare)
