@@ -213,6 +213,14 @@ def test_rgbd_faults(bare_folder, tables, capsys):
         return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
 
     assert "intrinsics" in run(2)["error"]
+    open3d = {"width": 8, "height": 6, "intrinsic_matrix": [525.0, 0, 0, 0, 525.0, 0, 4.0, 3.0, 1]}
+    for wrong in ({"width": True}, {"intrinsic_matrix": [525.0] * 3}, {"depth_scale": "much"},
+                  {"intrinsic_matrix": [True] * 9}):
+        (folder / "intrinsic.json").write_text(json.dumps(open3d | wrong))
+        assert "Open3D" in run(2)["error"]
+    (folder / "intrinsic.json").write_text(json.dumps(open3d))
+    assert run(0)["warnings"] == []
+    (folder / "intrinsic.json").unlink()
     (folder / "calibration.txt").write_text("525.0 525.0 319.5 239.5\n")
     assert run(0)["warnings"] == []
     (folder / "groundtruth.txt").write_text("0.0 0 0 0 0 0 0 1\n1.0 0.1 0 0 0 0 0 1\n")

@@ -11,6 +11,7 @@ from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as, read_json, read_text
 from limber.core.files.safe_names import inside
+from limber.core.json_values import number_array, validated
 from limber.core.numerics.rigid import composed, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
@@ -221,11 +222,12 @@ def _four_numbers(path: Path) -> list[float]:
 def _open3d_camera(path: Path) -> Camera:
     try:
         content = read_json(path, "a file of Open3D camera intrinsics")
-        matrix = [float(value) for value in content["intrinsic_matrix"]]
+        matrix = number_array(content["intrinsic_matrix"])
         # Column by column.
-        return Camera(width=int(content["width"]), height=int(content["height"]), fx=matrix[0],
-                      fy=matrix[4], cx=matrix[6], cy=matrix[7],
-                      depth_scale=float(content.get("depth_scale", 1000.0)))
+        return validated(Camera, {
+            "width": content["width"], "height": content["height"], "fx": matrix[0],
+            "fy": matrix[4], "cx": matrix[6], "cy": matrix[7],
+            "depth_scale": content.get("depth_scale", 1000.0)})
     except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
         raise InputError(f"{path} is not a file of Open3D camera intrinsics ({error!r}).",
                          "width, height and intrinsic_matrix (9 numbers) were expected.",
