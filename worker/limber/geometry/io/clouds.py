@@ -20,6 +20,7 @@ from limber.geometry.cloud.columns import property_names
 from limber.geometry.cloud.gathering import gathered
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.las import is_packed, las_columns
+from limber.geometry.io.las_units import METRES, in_metres
 from limber.geometry.io.mesh_as_cloud import mesh_notes
 from limber.geometry.io.pcd import read_pcd
 from limber.geometry.io.ply import read_ply
@@ -147,11 +148,11 @@ def _read_arrays(path: Path) -> Cloud:
     return Cloud(points[:, :3], {renamed.get(k, k): v for k, v in arrays.items()})
 
 
-def _of_columns(_path: Path, columns: dict[str, np.ndarray]) -> Cloud:
+def _of_columns(path: Path, columns: dict[str, np.ndarray]) -> Cloud:
     points = columns.pop(POINTS, None)
-    left_out = int(columns.pop(LEFT_OUT, 0))
+    left_out, metres = int(columns.pop(LEFT_OUT, 0)), columns.pop(METRES, np.full(2, np.nan))
     cloud = Cloud.from_columns(columns) if points is None else Cloud(points, columns)
-    return replace(cloud, left_out=left_out)
+    return in_metres(path, replace(cloud, left_out=left_out), metres)
 
 
 CLOUDS = Registry("point cloud", "limber.clouds", [

@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
 from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
+from limber.geometry.io.las_units import METRES, stated_metres
 
 
 def is_packed(path: Path) -> bool:
@@ -16,14 +17,19 @@ def is_packed(path: Path) -> bool:
 
 
 def las_columns(path: Path) -> dict[str, np.ndarray]:
-    """Return coordinates, ``color`` and the other dimensions of a LAS or LAZ file."""
+    """Return coordinates, ``color``, the other dimensions, and units of a LAS or LAZ file."""
+    import laspy
+
     cloud = gathered(_pieces(path))
+    with laspy.open(path) as reader:
+        metres = stated_metres([*reader.header.vlrs, *(reader.evlrs or ())])
     attributes = {name: values for name, values in cloud.attributes.items()
                   if name == "color" or values.any()}
     if "color" in attributes and attributes["color"].max(initial=0) > 255:
         # 16 bits per channel by the standard, though many programs write 8.
         attributes["color"] = attributes["color"] // 257
-    return {**attributes, POINTS: cloud.points, LEFT_OUT: np.array(cloud.left_out)}
+    return {**attributes, POINTS: cloud.points, LEFT_OUT: np.array(cloud.left_out),
+            METRES: metres}
 
 
 def _pieces(path: Path) -> Iterator[Cloud]:
