@@ -5,6 +5,7 @@ import importlib.util
 import json
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -42,6 +43,18 @@ def test_what_is_wrong_is_named(check, monkeypatch):
         "filelock: licence 'Proprietary' is not known to go with GPL-3.0-or-later"]
     with pytest.raises(SystemExit, match="not a pinned package"):
         check.pins("filelock>=3\n")
+
+
+def test_an_audit_without_answers_is_no_audit(check, monkeypatch, capsys):
+    """pip-audit finds no vulnerabilities where it reaches no data; then that is printed."""
+    told = {"dependencies": [
+        {"name": "filelock", "skip_reason": "not found"},
+        {"name": "pillow", "version": "9.0", "vulns": [{"id": "CVE-1"}]}]}
+    monkeypatch.setattr(check.shutil, "which", lambda name: name)
+    monkeypatch.setattr(check.subprocess, "run", lambda *given, **named: SimpleNamespace(
+        stdout=json.dumps(told), stderr="", returncode=0))
+    assert check.audited() == ["pillow 9.0: CVE-1"]
+    assert "no answer on 1 of 2 packages: filelock" in capsys.readouterr().out
 
 
 def test_the_list_of_packages_names_each_with_its_hashes(check):
