@@ -96,8 +96,9 @@ def _read_text(path: Path) -> Cloud:
     """XYZ, TXT, CSV; see :mod:`limber.core.files.text_columns`."""
     try:
         table = Table(path)
-        held = gathered(Cloud(piece[:, table.axes], {"row": piece}) for piece in table.pieces())
-        read = table.columns(held.attributes["row"])
+        held = gathered(Cloud(piece[:, table.axes], {"others": np.delete(piece, table.axes, 1)})
+                        for piece in table.pieces())
+        read = table.columns(_joined(held, table.axes))
     except ColumnsError as error:
         raise InputError(error.seen, error.why, error.fix) from error
     # A column with the name of an earlier one would replace it.
@@ -106,6 +107,15 @@ def _read_text(path: Path) -> Cloud:
                                dict(zip(names, read.titles, strict=True)))
     return replace(cloud, unit=read.unit, notes=read.notes, not_finite=held.not_finite,
                    left_out=held.left_out)
+
+
+def _joined(held: Cloud, axes: list[int]) -> np.ndarray:
+    """The table of which columns ``axes`` are the points, and all others an attribute."""
+    others = held.attributes["others"]
+    values = np.empty((len(held), 3 + others.shape[1]))
+    values[:, axes] = held.points
+    values[:, [k for k in range(values.shape[1]) if k not in axes]] = others
+    return values
 
 
 def _read_vertices(path: Path) -> Cloud:
