@@ -1,4 +1,5 @@
-"""Titles of columns: names without units, units of length, and the roles of three columns.
+"""Titles of columns: names without units, units of length, the roles of three columns, and guesses
+for columns without a title.
 
 Does not import Limber: ``addon/column_titles.py`` is a copy, so that worker and add-on read alike.
 ``scripts/make_addon_schema`` makes the copy; a test compares the two.
@@ -7,6 +8,8 @@ Does not import Limber: ``addon/column_titles.py`` is a copy, so that worker and
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
+
+import numpy as np
 
 LENGTHS = {**{unit: unit for unit in ("m", "cm", "mm", "um", "in")},
            **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
@@ -21,8 +24,9 @@ _FORMS = ("{}", "{}coordinate", "{}coord", "coordinate{}", "coord{}", "{}koordin
           "koordinate{}", "{}pos", "{}position", "pos{}", "position{}", "p{}", "point{}",
           "points{}", "scan{}", "world{}", "local{}")
 _PLANES = (("easting", "northing"), ("east", "north"), ("e", "n"), ("rechtswert", "hochwert"),
-           ("ostwert", "nordwert"), ("ost", "nord"))
-_HEIGHTS = ("height", "elevation", "altitude", "z", "h", "hohe", "hoehe", "alt", "up", "elev")
+           ("ostwert", "nordwert"), ("ost", "nord"), ("este", "norte"), ("est", "nord"))
+_HEIGHTS = ("height", "elevation", "altitude", "z", "h", "hohe", "hoehe", "alt", "up", "elev",
+            "elevacion", "cota", "quota", "hauteur")
 ROLES = {
     "position": (*(tuple(form.format(axis) for axis in "xyz") for form in _FORMS),
                  *(tuple(f"{word}{k}" for k in range(3)) for word in ("points", "point",
@@ -38,6 +42,8 @@ ROLES = {
               ("rot", "grun", "blau"), ("rot", "gruen", "blau"), ("rgb0", "rgb1", "rgb2"))}
 """Names of three columns with one role, in :func:`plain` letters; the first names found are used.
 """
+_COUNTED = 5
+"""Fewest points whose numbers are recognised as such."""
 _STATED = re.compile(r"\b(?:units?|einheit(?:en)?)\b\W{0,3}(?:(?:are|is|in|sind|ist)\b\W{1,2})?"
                      r"([^\W\d_]+)", re.IGNORECASE)
 
@@ -83,3 +89,50 @@ def stated_unit(text: str) -> str | None:
     """Return the unit of length stated by a comment or a preamble, if any."""
     return next((LENGTHS[word.lower()] for word in _STATED.findall(text)
                  if word.lower() in LENGTHS), None)
+
+
+def counts_up(column: np.ndarray) -> bool:
+    """Whether a column [n] is 0, 1, 2 ... or 1, 2, 3 ..."""
+    return column[0] in (0, 1) and bool((np.diff(column) == 1).all())
+
+
+def counting_columns(values: np.ndarray) -> int:
+    """Return how many columns before the coordinates count points, or a scanner's rows and columns.
+
+    Args:
+        values: Columns without titles, shape [n, k].
+    """
+    for count in (1, 2) if len(values) >= _COUNTED else ():
+        lead, after = values[:, :count], values[:, count:count + 3]
+        if after.shape[1] < 3 or not (after % 1 != 0).any(axis=0).all() or (lead % 1 != 0).any():
+            continue
+        key = lead @ np.r_[lead.max(axis=0)[1:] + 1, 1.0]
+        back = lead[:, ::-1] @ np.r_[lead.max(axis=0)[:-1] + 1, 1.0]
+        if counts_up(lead[:, 0]) if count == 1 else (lead >= 0).all() and (
+                (np.diff(key) > 0).all() or (np.diff(back) > 0).all()):
+            return count
+    return 0
+
+
+def guessed_titles(extra: np.ndarray, intensity_first: bool) -> list[str]:
+    """Return names of columns [n, k] after x, y, z, in the order of scanners and CloudCompare.
+
+    Of four columns, a scanner writes intensity and colour, CloudCompare colour and a scalar. If
+    their values are ambiguous, ``intensity_first`` decides.
+    """
+    count = extra.shape[1]
+    if count == 3:
+        return ["red", "green", "blue"]
+    if count == 4:
+        before, after = _are_bytes(extra[:, :3]), _are_bytes(extra[:, 1:])
+        if after and (intensity_first or not before):
+            return ["intensity", "red", "green", "blue"]
+        if before:
+            return ["red", "green", "blue", "scalar_0"]
+    if count == 6:
+        return ["red", "green", "blue", "nx", "ny", "nz"]
+    return [f"scalar_{k}" for k in range(count)]
+
+
+def _are_bytes(columns: np.ndarray) -> bool:
+    return bool(((columns >= 0) & (columns <= 255) & (columns % 1 == 0)).all())

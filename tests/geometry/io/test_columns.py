@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
 from limber.geometry.io.clouds import read_points
@@ -165,3 +166,59 @@ def test_colours_of_any_scale_are_bytes(tmp_path, written):
     np.testing.assert_array_equal(cloud.attributes["color"], color)
     cloud.write_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(read_points(tmp_path / "a.ply").attributes["color"], color)
+
+
+def _lines(points, form="{} {} {}"):
+    return "\n".join(form.format(*point, k=k, row=k // 8, column=k % 8)
+                     for k, point in enumerate(points)) + "\n"
+
+
+@pytest.mark.parametrize(("form", "counting"), [
+    ("{k} {} {} {}", 1), ("{row} {column} {} {} {} 10 20 30", 2), ("{} {} {}", 0),
+    ("{} {} {} {k} {row} {column}", 0)])
+def test_columns_that_count_are_no_coordinates(tmp_path, form, counting):
+    """The number of a point, or a scanner's row and column, before coordinates without titles."""
+    points = np.random.default_rng(0).uniform(0, 1, (40, 3)).round(4)
+    (tmp_path / "a.xyz").write_text(_lines(points, form))
+    cloud = read_points(tmp_path / "a.xyz")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert ("index_0" in cloud.attributes) == (counting > 0) and bool(cloud.notes) == (counting > 0)
+
+
+@pytest.mark.parametrize("text", [
+    "0 0.5 0.5 0.5\n1 0.2 0.3 0.4\n",  # too few to tell
+    "".join(f"{k // 8} {k % 8} {0.1 * k + 0.05} 10 20 30\n" for k in range(40))])  # a height map
+def test_whole_coordinates_stay(tmp_path, text):
+    (tmp_path / "a.xyz").write_text(text)
+    cloud = read_points(tmp_path / "a.xyz")
+    assert cloud.points[1].tolist() == [float(word) for word in text.split("\n")[1].split()[:3]]
+
+
+@pytest.mark.parametrize(("titles", "mark"), [
+    ("x|y|z", "|"), ("Este;Norte;Elevaci\u00f3n", ";"), ("EST;NORD;QUOTA", ";")])
+def test_further_titles_and_separators(tmp_path, titles, mark):
+    points = np.random.default_rng(0).uniform(0, 1, (9, 3)).round(4)
+    (tmp_path / "a.csv").write_text(titles + "\n" + _lines(points, mark.join(["{}"] * 3)))
+    np.testing.assert_array_equal(read_points(tmp_path / "a.csv").points, points)
+
+
+def test_arrays_of_named_fields(tmp_path):
+    """A structured array; and one whose names are not those of coordinates."""
+    points = np.random.default_rng(0).uniform(0, 1, (9, 3))
+    kinds = [("z", "f8"), ("x", "f8"), ("y", "f8"), ("ring", "u1")]
+    np.save(tmp_path / "a.npy", np.array([(z, x, y, 3) for x, y, z in points], kinds))
+    cloud = read_points(tmp_path / "a.npy")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert cloud.attributes["ring"].tolist() == [3] * 9
+    np.savez(tmp_path / "b.npz", pcl=points)
+    with pytest.raises(InputError, match=r"b\.npz has the arrays pcl"):
+        read_points(tmp_path / "b.npz")
+
+
+def test_a_text_pcd_of_too_few_points_is_refused(tmp_path):
+    head = ("VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"
+            "POINTS 12\nDATA ascii\n")
+    points = np.random.default_rng(0).uniform(0, 1, (9, 3))
+    (tmp_path / "a.pcd").write_text(head + _lines(points))
+    with pytest.raises(InputError, match="announces 12 points and lists 9"):
+        read_points(tmp_path / "a.pcd")

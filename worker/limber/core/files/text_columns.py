@@ -15,7 +15,17 @@ from pathlib import Path
 import numpy as np
 
 # Relative, since the add-on has copies of both files.
-from .column_titles import LENGTHS, OTHER_LENGTHS, plain, split_title, stated_unit, three_of
+from .column_titles import (
+    LENGTHS,
+    OTHER_LENGTHS,
+    counting_columns,
+    counts_up,
+    guessed_titles,
+    plain,
+    split_title,
+    stated_unit,
+    three_of,
+)
 
 _COUNTERS = ("id", "index", "idx", "nr", "no", "number", "row", "point", "pointid", "pointnumber")
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
@@ -133,10 +143,13 @@ class Table:
     def columns(self, values: np.ndarray) -> Columns:
         """Return the table with ``values``, which are all pieces [n, columns], or a part of them.
         """
-        titles = self._titles or ["x", "y", "z", *_guessed(
-            values[:, 3:], self._path.suffix.lower() == ".pts")]
+        titles = self._titles or [*self._untitled(), *guessed_titles(
+            values[:, 3 + self._counting:], self._path.suffix.lower() == ".pts")]
         names, unit = _named(self._path, titles)
         return Columns(names, titles, values, unit or self._stated, self._notes)
+
+    def _untitled(self) -> list[str]:
+        return [*(f"index_{k}" for k in range(self._counting)), "x", "y", "z"]
 
     def _lines(self) -> Iterator[str]:
         with open(self._path, encoding=self._coding, errors="replace", newline="") as stream:
@@ -165,15 +178,19 @@ class Table:
             raise ColumnsError(f"{self._path} has {values.shape[1]} columns.",
                                "Coordinates need three columns.", "Export it again.")
         used = [k for k in range(self._width) if k not in self._words]
-        if len(titles) == values.shape[1] - 1 and _counts_up(values[:, 0]):
+        if len(titles) == values.shape[1] - 1 and counts_up(values[:, 0]):
             titles = ["", *titles]  # see _columns_of_words
         self._notes = tuple(f"Column {titles[k]!r} holds words and was not read."
                             for k in self._words)
         titles = [titles[k] for k in used] if len(titles) > max(used) else []
         titles = titles or _commented(comments, self._separator, values)
         self._titles = titles if len(titles) == values.shape[1] else []
+        self._counting = 0 if self._titles else counting_columns(values)
+        if self._counting:
+            self._notes += (f"The first {self._counting} columns only count and were not taken "
+                            "for coordinates.",)
         self._stated = stated_unit("\n".join([*comments, *self._head]))
-        names = _named(self._path, self._titles)[0] if self._titles else ["x", "y", "z"]
+        names = _named(self._path, self._titles)[0] if self._titles else self._untitled()
         self.axes = [names.index(axis) for axis in "xyz"]
 
     def _numbers(self, rows: list[str]) -> np.ndarray:
@@ -253,17 +270,13 @@ def _without_counts(rows: Iterator[str]) -> Iterator[str]:
     yield from rows
 
 
-def _counts_up(column: np.ndarray) -> bool:
-    return column[0] in (0, 1) and bool((np.diff(column) == 1).all())
-
-
 def _is_comment(line: str) -> bool:
     start = line.lstrip()
     return start.startswith(("#", "%")) or (start.startswith("//") and not start[2:3].isalpha())
 
 
 def _separator(line: str) -> str | None:
-    for mark in (";", "\t"):
+    for mark in (";", "\t", "|"):
         if mark in line:
             return mark
     blanks = line.split()
@@ -364,27 +377,3 @@ def _named(path: Path, titles: list[str]) -> tuple[list[str], str | None]:
                            "They must have one unit, out of m, cm, mm, um and in.",
                            "Convert the columns, or correct their titles.")
     return names, found.pop()
-
-
-def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:
-    """Names of unnamed columns [n, k] after x, y, z, in the order of scanners and CloudCompare.
-
-    Of four columns, a scanner writes intensity and colour, CloudCompare colour and a scalar. If
-    their values are ambiguous, ``intensity_first`` decides.
-    """
-    count = extra.shape[1]
-    if count == 3:
-        return ["red", "green", "blue"]
-    if count == 4:
-        before, after = _are_bytes(extra[:, :3]), _are_bytes(extra[:, 1:])
-        if after and (intensity_first or not before):
-            return ["intensity", "red", "green", "blue"]
-        if before:
-            return ["red", "green", "blue", "scalar_0"]
-    if count == 6:
-        return ["red", "green", "blue", "nx", "ny", "nz"]
-    return [f"scalar_{k}" for k in range(count)]
-
-
-def _are_bytes(columns: np.ndarray) -> bool:
-    return bool(((columns >= 0) & (columns <= 255) & (columns % 1 == 0)).all())

@@ -11,7 +11,7 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.column_titles import stated_unit
+from limber.core.files.column_titles import stated_unit, three_of
 from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
 from limber.core.files.reading import read_arrays
 from limber.core.files.text_columns import ColumnsError, Table
@@ -147,7 +147,13 @@ def _read_arrays(path: Path) -> Cloud:
     arrays = read_arrays(path, "a point cloud")
     names = ("points", "xyz", "positions", "vertices", "arr_0")
     key = next((name for name in names if name in arrays), None)
+    if key is not None and arrays[key].dtype.names:
+        arrays, key = {name: arrays[key][name] for name in arrays[key].dtype.names}, None
     if key is None:
+        if three_of("position", list(arrays)) is None:
+            raise InputError(f"{path} has the arrays {', '.join(arrays)[:200]}.",
+                             f"A cloud has one of {', '.join(names[:-1])}, or x, y and z.",
+                             "Save the coordinates under one of these names.")
         return Cloud.from_columns(arrays)
     points = np.asarray(arrays.pop(key), np.float64)
     if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:

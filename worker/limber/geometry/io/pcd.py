@@ -22,6 +22,10 @@ def read_pcd(path: Path) -> Cloud:
 
     stream, titles = _stream(path)
     content = PointCloud.from_fileobj(stream)
+    listed = len(content.pc_data)
+    if listed < content.points:
+        raise InputError(f"{path} announces {content.points} points and lists {listed}.",
+                         "It is cut short, or its header is damaged.", "Export it again.")
     columns = {name: np.asarray(content.pc_data[name]).ravel() for name in content.fields
                if not name.startswith(_PADDING)}
     if "rgb" in columns:
