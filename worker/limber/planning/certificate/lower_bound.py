@@ -213,11 +213,35 @@ class _Bounds:
 
 
 def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
+    ground, over = _ground(problem, grid, cell)
+    goal = about_goal(problem, grid, ground)
+    if not goal.meets:
+        centres = grid.points(np.argwhere(ground.open_cells) + 0.5)
+        if (problem.bounded_goal.uncertainty(problem.energy_field, centres) > 0.0).any():
+            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
+                            "of reach, but by less than the error of the energy field.")
+        wall = over & scipy.ndimage.binary_dilation(ground.open_cells, _NEAR)
+        raise _separated(problem, grid, ground.open_cells, grid.points(np.argwhere(wall) + 0.5))
+    if problem.longest < np.inf:
+        ground = ground._replace(
+            open_cells=_short_enough(problem, grid, ground.open_cells, goal.near, cell))
+    to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
+    slack = factor * goal.slack
+    lower = spline_value(to_goal, cell) - slack
+    return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
+                   goal.near)
+
+
+def _ground(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> tuple[Terrain, np.ndarray]:
+    """Return the terrain of the cells connected to the start's, and the cells that limits close.
+
+    What is evaluated for it is not kept: that would be most of the memory of what follows.
+    """
     open_cells = grid.open_cells & ~_surely_outside(problem, grid)
     # One corner more than the active cells': for the second differences there.
     corners = np.argwhere(widened(corners_of(widened(open_cells, RIM))))
     points = grid.points(corners)
-    # Rows for the corners that count, not the whole box: that would be most of the memory.
+    # Rows for the corners that count, not the whole box.
     energy, force = problem.energy_field.energy(points), problem.energy_field.force(points)
     over = _surely_over(problem, grid, open_cells, corners, energy, force)
     open_cells &= ~over
@@ -229,33 +253,17 @@ def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
     raw = energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
     slopes = problem.weights.energy * grid.along_edges(force)
-    ground = terrain(grid.spread(corners, rate), grid.spread(corners, slopes),
-                     grid.spread(corners, raw) > 0.0, open_cells, grid.spacing,
-                     problem.weights.length)
-    goal = about_goal(problem, grid, ground)
-    if not goal.meets:
-        centres = grid.points(np.argwhere(open_cells) + 0.5)
-        if (problem.bounded_goal.uncertainty(problem.energy_field, centres) > 0.0).any():
-            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
-                            "of reach, but by less than the error of the energy field.")
-        wall = over & scipy.ndimage.binary_dilation(open_cells, _NEAR)
-        raise _separated(problem, grid, open_cells, grid.points(np.argwhere(wall) + 0.5))
-    if problem.longest < np.inf:
-        ground = ground._replace(
-            open_cells=_short_enough(problem, grid, open_cells, goal.near, cell))
-    to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
-    slack = factor * goal.slack
-    lower = spline_value(to_goal, cell) - slack
-    return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
-                   goal.near)
+    return terrain(grid.spread(corners, rate), grid.spread(corners, slopes),
+                   grid.spread(corners, raw) > 0.0, open_cells, grid.spacing,
+                   problem.weights.length), over
 
 
 def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
                   cell: np.ndarray) -> np.ndarray:
     """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
     start and the cells ``near`` the goal."""
-    offsets = np.moveaxis(np.indices(open_cells.shape), 0, -1) - cell
-    away = np.linalg.norm(offsets, axis=-1) + scipy.ndimage.distance_transform_edt(~near)
+    away = _cells_from(cell, open_cells.shape)
+    away += scipy.ndimage.distance_transform_edt(~near)
     # Half a diagonal in the cell itself, as much in the goal's, and at both ends of the path there.
     within = open_cells & (grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest)
     within[tuple(cell)] = True
@@ -263,11 +271,16 @@ def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, ne
     return together == together[tuple(cell)]
 
 
+def _cells_from(cell: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the distance of each cell of a grid from ``cell`` [3], in cells."""
+    offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
+               for axis, (n, k) in enumerate(zip(shape, cell, strict=True))]
+    return np.sqrt(sum(offset**2 for offset in offsets))
+
+
 def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
     h = ground.spacing
-    offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
-               for axis, (n, k) in enumerate(zip(ground.open_cells.shape, cell, strict=True))]
-    away = h * np.sqrt(sum(offset**2 for offset in offsets))
+    away = h * _cells_from(cell, ground.open_cells.shape)
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a blunt tip: no kink
     nothing = np.zeros(ground.open_cells.shape, bool)
     u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)

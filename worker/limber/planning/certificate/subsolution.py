@@ -96,6 +96,7 @@ def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cel
     are not neighbours of an open cell's.
     """
     bends = turns(slopes, open_cells)
+    del slopes  # three numbers a corner of the whole box
     bends *= 0.25
     np.maximum(_bends(rate, open_cells), bends, out=bends)
     level = with_corner(positive) & with_corner(~positive)
