@@ -262,25 +262,23 @@ def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, ne
                   cell: np.ndarray) -> np.ndarray:
     """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
     start and the cells ``near`` the goal."""
-    away = _cells_from(cell, open_cells.shape)
-    away += scipy.ndimage.distance_transform_edt(~near)
+    numbers = np.argwhere(open_cells)
+    nearest = scipy.ndimage.distance_transform_edt(~near, return_distances=False,
+                                                   return_indices=True)[:, *numbers.T].T
+    away = np.linalg.norm(numbers - cell, axis=1) + np.linalg.norm(numbers - nearest, axis=1)
+    within = np.zeros_like(open_cells)
     # Half a diagonal in the cell itself, as much in the goal's, and at both ends of the path there.
-    within = open_cells & (grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest)
+    within[tuple(numbers.T)] = grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest
     within[tuple(cell)] = True
     together = scipy.ndimage.label(within, _NEAR)[0]
     return together == together[tuple(cell)]
 
 
-def _cells_from(cell: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the distance of each cell of a grid from ``cell`` [3], in cells."""
-    offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
-               for axis, (n, k) in enumerate(zip(shape, cell, strict=True))]
-    return np.sqrt(sum(offset**2 for offset in offsets))
-
-
 def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
     h = ground.spacing
-    away = h * _cells_from(cell, ground.open_cells.shape)
+    offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
+               for axis, (n, k) in enumerate(zip(ground.open_cells.shape, cell, strict=True))]
+    away = h * np.sqrt(sum(offset**2 for offset in offsets))
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a blunt tip: no kink
     nothing = np.zeros(ground.open_cells.shape, bool)
     u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)
