@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError, NoPathError
+from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.obstacles import Box
 from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named
+from limber.stages.paths.execute import _told
+from limber.stages.paths.execute_path import offsets_along
 from limber.stages.paths.plan import plan as plan_paths
 from limber.stages.paths.plan_cell import KeptClear, blocked_by, clearance_in, places_in
 from limber.store import Branch
@@ -57,6 +60,37 @@ def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     assert list(legs) == ["approach", "grasp", "path", "hold", "return", "release", "leaving"]
     assert legs["path"]["peak_force_n"] == pytest.approx(plan.motion.force_sizes.max(), rel=0.01)
     assert legs["approach"]["peak_force_n"] == 0.0 and legs["path"]["self_distance_m"] > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
+def test_the_gripper_lags_behind_where_it_may_not_turn_with_the_branch(copied, monkeypatch):
+    """Refused without a slack; with one the plan has the rotations and their torque, to second
+    order and on the full model; an execution reads them."""
+    there = read_plan(copied / "plans/there.json")
+    turn = angle_between(there.plan.poses[-1, 3:], np.zeros(3))
+
+    def blocked(flange, _joints):
+        turned_by = angle_between(*pose_vectors(flange[[0, -1]])[:, 3:])
+        return NoPathError("Turned too far.", "", "") if turned_by > 0.7 * turn else None
+    monkeypatch.setattr("limber.stages.paths.plan_cell.blocked_by", lambda *_: blocked)
+    settings = SETTINGS.model_copy(update={
+        "iterations": 100, "inertia": False, "goal": tuple(map(float, there.plan.poses[-1, :3]))})
+    path = cell_file(copied)
+    with pytest.raises(NoPathError, match="Turned too far"):
+        plan_paths(copied, settings, name="stiff", cell_file=path, workers=1)
+    plan_paths(copied, settings.model_copy(update={"turn_slack": turn}), name="lagging",
+               cell_file=path, workers=1)
+    summary = read_plan(copied / "plans/lagging.json").summary
+    turning, legs = summary["turning"], {leg["name"]: leg for leg in summary["legs"]}
+    assert 0.2 * turn < turning["largest_rad"] < 0.6 * turn
+    whole = turning["full_model"]
+    assert 0.0 < whole["torque_error_nm"] < 0.4 * whole["peak_torque_nm"]  # a large rotation
+    assert legs["path"]["peak_torque_nm"] == pytest.approx(turning["peak_torque_nm"], rel=0.2)
+    told = _told(Branch.open(copied), "lagging")["turning"]
+    ahead = there.motion.poses[np.array(there.motion.phases) != "return", :3]
+    assert np.linalg.norm(offsets_along(told, ahead)[-1]) == pytest.approx(
+        turning["largest_rad"], rel=1e-3)
 
 
 @pytest.mark.slow

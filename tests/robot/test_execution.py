@@ -17,14 +17,15 @@ from limber.robot.cell.compatibility import check_plan
 from limber.robot.motion.execution import across, followed, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.ur.arms import ARMS
+from limber.stages.paths import execute_path
 from limber.stages.paths.execute import (
     ExecuteOptions,
     ExecuteSettings,
     _as_planned,
     _as_slow_as_checked,
-    _planned,
     execute,
 )
+from limber.stages.paths.execute_path import planned_poses
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -171,7 +172,7 @@ def test_the_plans_own_approach_is_taken(planned_folder):
     with branch.stage("plan:path") as stage:
         stage.path("plans/path-motion.csv").write_text(
             "x_m,y_m,z_m,phase\n" + "".join(f"{x},0,0.3,{phase}\n" for phase, x in rows))
-    found = _planned(branch, "path", np.array([0, 0, 0.3]))
+    found = planned_poses(branch, "path", np.array([0, 0, 0.3]))
     np.testing.assert_allclose(found[:, 0], [0.0, 0.03, 0.02, 0.01])
 
 
@@ -204,11 +205,9 @@ def test_a_plan_is_executed_at_its_own_speed_and_held_as_long_as_it_says():
 def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folder, tmp_path,
                                                                    monkeypatch):
     """Solving the forces of a long path takes a minute; the plan's own poses tell the reach."""
-    from limber.stages.paths import execute as stage
-
     def solved(*_arguments: object) -> None:
         raise AssertionError("forces were solved")
-    monkeypatch.setattr(stage, "_predicted", solved)
+    monkeypatch.setattr(execute_path, "predicted_along", solved)
     cell = standing_at(Branch.open(planned_folder), "127.0.0.97", fraction=FRACTION)
     base = (cell.base.pose[0] + 3.0, *cell.base.pose[1:])
     away = cell.model_copy(update={"base": cell.base.model_copy(update={"pose": base})})
@@ -220,9 +219,9 @@ def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folde
 def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder, tmp_path,
                                                                   monkeypatch):
     """A box around the grasp, and a gripper with a shape: refused before any force is solved."""
-    from limber.stages.paths import execute as stage
 
-    monkeypatch.setattr(stage, "_predicted", lambda *_: pytest.fail("forces were solved"))
+    monkeypatch.setattr(execute_path, "predicted_along",
+                        lambda *_: pytest.fail("forces were solved"))
     branch = Branch.open(planned_folder)
     cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)
     place = tuple(map(float, load_skeleton(branch).point_at(FRACTION)))
@@ -239,7 +238,8 @@ def test_the_planned_clearance_is_kept_when_executed(planned_folder, tmp_path, m
     """Gripper and arm keep what the plan states, not just the obstacle's surface."""
     from limber.stages.paths import execute as stage
 
-    monkeypatch.setattr(stage, "_predicted", lambda *_: pytest.fail("forces were solved"))
+    monkeypatch.setattr(execute_path, "predicted_along",
+                        lambda *_: pytest.fail("forces were solved"))
     monkeypatch.setattr("limber.robot.motion.execution._TURNS", 2)
     branch = Branch.open(planned_folder)
     cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)

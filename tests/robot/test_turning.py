@@ -10,7 +10,7 @@ from limber.robot.cell.cell import Cell
 from limber.robot.motion import turning
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.motion.turning import TurnCost, turned, turned_motion
-from limber.stages.paths.execute import _offsets_along
+from limber.stages.paths.execute_path import offsets_along
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)}, approach={"distance_m": 0.02})
@@ -79,10 +79,10 @@ def test_an_arm_that_does_not_come_to_the_branch_is_refused_at_once(monkeypatch)
 
 def test_an_executed_plan_turns_as_planned():
     """Interpolated by the length of the way; of a plan that turns with the branch not at all."""
-    offsets = _offsets_along({"along_m": [0.0, 0.1, 0.2], "offsets_rad": [
+    offsets = offsets_along({"along_m": [0.0, 0.1, 0.2], "offsets_rad": [
         [0, 0, 0], [0, 0, 0.1], [0, 0, 0.3]]}, np.array([[0.0, 0, 0], [0.15, 0, 0], [0.2, 0, 0]]))
     assert offsets[:, 2] == pytest.approx([0.0, 0.2, 0.3])
-    assert not _offsets_along(None, PLACES).any()
+    assert not offsets_along(None, PLACES).any()
     poses = turned(np.hstack([PLACES, NATURAL]), -0.5 * NATURAL)
     assert turn_between(poses[0, 3:], poses[-1, 3:]) == pytest.approx([0, 0, 0.3])
     with pytest.raises(ValueError, match="a row for each"):

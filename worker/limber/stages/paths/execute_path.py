@@ -1,0 +1,131 @@
+"""The path that a plan is executed along: its poses, and the branch's forces solved again there."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import Akima1DInterpolator
+
+from limber.core.errors import InputError, WorkError
+from limber.core.files.reading import csv_records, read_columns
+from limber.core.numerics.rigid import composed
+from limber.core.progress import Progress
+from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses
+from limber.mechanics.sensitivities import grasp_slopes, static_sensitivities
+from limber.planning.constraints.chance import YoungUncertainty
+from limber.planning.cost import arc_lengths
+from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.recordings.recording import POSE_COLUMNS
+from limber.robot.motion.expected_wrench import Predicted
+from limber.stages.paths.plan_cell import KeptClear
+from limber.stages.paths.plan_uncertainty import estimated_uncertainty
+from limber.stages.pulls.record_path import GRASP_RADIUS_M
+from limber.store import Branch
+
+_SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
+# a branch by 3 micrometres
+_MOST_POSES = 120
+
+
+def planned_poses(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
+    """Return the path of the grasp from rest to the path's end [m, rad], shape [n, 6].
+
+    Rotations are those of the branch; NaN if the table has none. Approach and path are as planned;
+    a path without a planned approach gets a straight one.
+    """
+    whole = branch.has(f"plans/{name}-motion.csv")
+    path = branch.require(f"plans/{name}-motion.csv" if whole else f"plans/{name}.csv", "plan")
+    table = read_columns(path, ("x_m", "y_m", "z_m"), "the table of a path")
+    nothing = np.full(len(table["x_m"]), np.nan)
+    planned = np.column_stack([table.get(column, nothing) for column in POSE_COLUMNS])
+    if whole:
+        rows = csv_records(path, "the table of a motion")
+        planned = planned[[row.get("phase") != "return" for row in rows]]
+    if len(planned) < 2:
+        raise InputError(f"{path} has {len(planned)} points.", "This is not a path.", "Plan again.")
+    # At rest the grasped piece is at its own position and not rotated.
+    start = np.r_[rest, np.zeros(3)]
+    way = float(np.linalg.norm(planned[0, :3] - rest))
+    leading = start + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
+        planned[0] - start)
+    return np.vstack([leading, planned]) if way > 1e-4 else planned
+
+
+def offsets_along(turning: dict[str, Any] | None, positions: np.ndarray) -> np.ndarray:
+    """Return a plan's rotations beyond the branch's own at ``positions`` [n, 3] [rad], [n, 3]."""
+    if turning is None:
+        return np.zeros_like(positions)
+    known, along = np.array(turning["along_m"]), arc_lengths(positions)
+    share = along / max(float(along[-1]), 1e-12) * known[-1]
+    return np.column_stack([np.interp(share, known, column)
+                            for column in np.array(turning["offsets_rad"]).T])
+
+
+def predicted_along(branch: Branch, model: GraspModel, positions: np.ndarray,
+                    turning: dict[str, Any] | None, clear: KeptClear, progress: Progress,
+                    ) -> Predicted:
+    """Return the model's prediction from rest to the path's end, through ``positions`` [n, 3].
+
+    The grasp passes the plan's positions, rotated as the branch itself would rotate, and by the
+    plan's offset from that (``turning``) if it has one. Steps are small enough that straight lines
+    between positions stretch nothing. The wrench is that of the branch clamped in this way.
+
+    Raises:
+        NoPathError: the branch comes nearer to an obstacle than ``clear`` allows.
+        WorkError: a pose has no reliable solution.
+    """
+    uncertainty = estimated_uncertainty(branch, model)
+    if uncertainty is None:
+        progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
+                      "The interval of the predicted force does not include it.")
+    positions = _closely(positions)
+    offsets = offsets_along(turning, positions)
+    clamped = Grasp.gripping(model.mesh, model.grasp.centre, GRASP_RADIUS_M)
+    firm = model.model.gripped(clamped)
+    poses, wrenches, stiffness, covariances = [], [], [], []
+    state = held = model.rest.displacement
+    for number, position in enumerate(positions):
+        free = model.follow(position[None], state)[0]
+        reason = refusal(free)
+        if reason is None:
+            state = free.displacement
+            pose = np.r_[position, model.pose(state)[3:]]
+            if offsets[number].any():
+                pose[3:] = composed(offsets[number], pose[3:])
+            result = follow_poses(firm, clamped, pose[None], start=held)[0]
+            reason = refusal(result)
+        if reason is not None:
+            raise WorkError(f"Pose {number + 1} of {len(positions)} has no reliable solution "
+                            f"({reason}).", "Its force is unknown, so the robot does not go "
+                                            "there.",
+                            "Plan a gentler path.")
+        held = result.displacement
+        clear.require(pose[:3], model.mesh, held)
+        poses.append(pose)
+        wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
+        stiffness.append(grasp_slopes(firm, clamped, held).wrench)
+        covariances.append(np.zeros((3, 3)) if uncertainty is None
+                           else _by_young(firm, clamped, result, uncertainty))
+        progress(0.05 + 0.35 * number / len(positions), "forces along the path")
+    return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
+                     np.array(covariances))
+
+
+def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, uncertainty: YoungUncertainty,
+              ) -> np.ndarray:
+    """Covariance of the force due to the uncertainty of Young's modulus [N^2], shape [3, 3]."""
+    slopes = static_sensitivities(model, result, grasp, None, shares=uncertainty.shares.T)
+    scaled = slopes.reaction_force * uncertainty.deviations
+    return scaled @ uncertainty.correlation @ scaled.T
+
+
+def _closely(positions: np.ndarray) -> np.ndarray:
+    """Return positions [n, 3] with more in between, on a smooth curve with little overshoot."""
+    kept = np.r_[True, np.linalg.norm(np.diff(positions, axis=0), axis=1) > 1e-9]
+    positions = positions[kept]
+    places = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    spacing = max(_SPACING, places[-1] / _MOST_POSES)
+    wanted = np.concatenate([
+        np.linspace(a, b, max(int(np.ceil((b - a) / spacing)), 1) + 1)[:-1]
+        for a, b in pairwise(places)] + [places[-1:]])
+    return Akima1DInterpolator(places, positions, method="makima")(wanted)
