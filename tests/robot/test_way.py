@@ -71,3 +71,14 @@ def test_the_way_of_another_arm_or_tool_is_none():
         "grasp_pose": (0, 0, 0.1, 0, 0, 0)})})) is None
     assert read_way(CELL.model_copy(update={"robot": CELL.robot.model_copy(update={
         "model": "ur3e"})})) is None
+
+
+@pytest.mark.parametrize("gone", [2e-3, 2e-4, 2e-5])
+def test_a_short_way_back_does_not_take_forever(gone):
+    """Stopped at once against something stiff, the way has two places: it took half an hour."""
+    way = WayBack(ARM.joint_names)
+    way.begin(sample_at(POSE), Trajectory(along(line(0.05), 0.03, 0.3), line(0.05)))
+    here = sample_at(POSE + np.r_[0.0, gone, np.zeros(4)])
+    back = way.from_here(here, 0.3)
+    assert len(back.times) == 2 and back.duration < 0.5
+    assert back.greatest_speeds[0] <= 0.015 * (1 + 1e-6)

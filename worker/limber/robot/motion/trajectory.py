@@ -110,7 +110,11 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
     steps = np.maximum(steps, 1e-9)
     way = np.r_[0.0, np.cumsum(steps)]
     bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(way, way[-1] - way)))
-    durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
+    if len(steps) == 1:
+        # It begins and ends at rest, so it must not be passed at zero speed.
+        durations = np.maximum(2 * np.sqrt(steps / acceleration), 2 * steps / speed)
+    else:
+        durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
     return pause + np.r_[0.0, np.cumsum(durations)]
 
 
