@@ -128,7 +128,9 @@ def test_home_and_retreat_move_only_when_armed(e_series, tmp_path, capfd):
     assert e_series.state["joints"] == pytest.approx(cell.arm.home, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_release_opens_the_gripper_and_goes_away_from_the_branch(e_series, tmp_path, capfd):
+    """Slow: the command starts a driver, and the arm goes back 20 mm in real time."""
     cell = cell_for(e_series.address)
     cell = cell.model_copy(update={
         "tool": cell.tool.model_copy(update={"mass_kg": 0.0, "gripper": "digital_output",
@@ -145,7 +147,9 @@ def test_release_opens_the_gripper_and_goes_away_from_the_branch(e_series, tmp_p
     assert moved == pytest.approx(-0.02 * begin[:3, 2], abs=2e-4)
 
 
+@pytest.mark.slow
 def test_goto_start_ends_where_execute_begins(e_series, planned_folder, tmp_path, capfd):
+    """Slow: two dry runs of the plan, and a motion in real time."""
     cell = standing_at(Branch.open(planned_folder), e_series.address, grip_seconds=0.1)
     path = str(cell_file(cell, tmp_path))
     code, told = run(["goto-start", path, str(planned_folder)], capfd)
