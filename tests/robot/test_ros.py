@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.robot.rosbridge import RosBridge
 
+from benchmarks.robot_rosbridge import RosBridge
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell
@@ -90,6 +90,31 @@ def test_a_plan_is_followed_and_a_force_stops_it_in_time():
         # After a stop only a person's choice moves it again.
         with pytest.raises(SafetyStop, match="Choose"):
             robot.guard.begin()
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+@pytest.mark.usefixtures("_first_in_line")
+def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypatch, tmp_path):
+    """Slow: there and back in real time. Another program goes back, by the tare of the first."""
+    monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
+    start = CELL.arm.forward(HOME)[:3, 3]
+    with RosBridge(HOME) as server:
+        server.wrench = np.array([2.0, 0, 0, 0, 0, 0])
+        robot = robot_at(server)
+        server.load = lambda joints: np.r_[0, 0, 400.0 * np.linalg.norm(
+            CELL.arm.forward(joints)[:3, 3] - start), 0, 0, 0]
+        path = line(0.05)
+        event = robot.follow(Trajectory(path.times, path.poses, None, path.joints))
+        assert event["event"] == "stopped" and "soft force" in event["reason"]
+        robot.close()
+        assert np.abs(server.joints - HOME).max() > 0.01
+        other = RosRobot(CELL, Bridge(server.url), Topics())
+        other.recall_tare()
+        event = other.retreat()
+        assert event["event"] == "reached" and event["force_n"] < 1.0, event
+        assert server.joints == pytest.approx(HOME, abs=2e-3)
+        other.close()
 
 
 @pytest.mark.real_time

@@ -28,6 +28,7 @@ from benchmarks.robot_faults import (
 )
 from benchmarks.robot_loop import LOOP_ROWS, closed_loops
 from benchmarks.robot_retreats import RETREAT_ROW, retreats
+from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
 from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
 from benchmarks.table import Asked, Part, Row, Setting
 from limber.core.errors import LimberError
@@ -283,6 +284,7 @@ PARTS = {
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
+    "ros": Part(ros_door, LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
     "lost": Part(_watched(partial(lost_branches, address=_ADDRESS)), 100, (LOST_ROW,), grows=True),

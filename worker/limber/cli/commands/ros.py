@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +90,8 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
                          f"Give --confirm {name}, with the workspace free and a hand at the "
                          "emergency stop.")
     began = time.monotonic()
-    event = _followed(run, cell, trajectory, url, is_held=leg in ("path", "return"))
+    event = _followed(run, cell, trajectory, url, is_held=leg in ("path", "return"),
+                      goes_on=leg == "return")
     result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason"),
                "followed_s": time.monotonic() - began}
     if not result["reached"]:
@@ -99,32 +101,78 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     return result
 
 
-def _followed(run: Run, cell: Cell, trajectory: Trajectory, url: str, *, is_held: bool,
-              ) -> dict[str, Any]:
-    """Tare, or with the branch held recall the tare, and follow; return how that ended."""
+@stage_command("retreat")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.option("--arm", "armed", is_flag=True, help="Move the robot. Default: a dry run.")
+@click.option("--confirm", help="The word retreat, to confirm that the robot may move.")
+@_url
+def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: str,
+            ) -> dict[str, Any]:
+    """Go back along the path followed last while the force falls, judged by its tare.
+
+    The path is on disk, so this works after a stop and after a crash. Exit code 4 where the force
+    does not fall: open the gripper then.
+    """
+    from limber.core.errors import InputError, SafetyStop
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.motion.way_file import read_way
+
+    cell = read_cell(cell_file)
+    way = read_way(cell)
+    if way is None:
+        raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
+                         "known.", "It has followed none from this account, or the cell has "
+                         "changed since.", "Open the gripper, and free the branch by hand.")
+    result: dict[str, Any] = {"armed": armed, "tare_known": way.bias is not None,
+                              "places": len(way.poses)}
+    if not armed:
+        return result
+    if confirm != "retreat":
+        raise InputError("Nobody confirmed that the robot may move.", "",
+                         "Give --confirm retreat, with a hand at the emergency stop.")
+    event = _followed(run, cell, None, url, is_held=True)
+    result |= {"retreated": event["event"] == "reached", "stop_reason": event.get("reason"),
+               "force_n": event["force_n"]}
+    if not result["retreated"]:
+        raise SafetyStop(f"The robot was stopped: {event['reason']}.",
+                         f"The force on the branch is {event['force_n']:.1f} N.",
+                         "Open the gripper, and free the branch by hand.", result=result)
+    return result
+
+
+def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, is_held: bool,
+              goes_on: bool = False) -> dict[str, Any]:
+    """Tare, or with the branch held recall the tare, and follow; return how that ended.
+
+    Args:
+        trajectory: None: go back along the path that was followed last.
+        goes_on: It belongs to the path of the leg before: a retreat goes back along both.
+    """
     from limber.core.errors import SafetyStop
     from limber.robot.driver.real_time import claim_real_time
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.guarded import RosRobot, Topics
 
-    bridge = Bridge(url)
-    try:
-        robot = RosRobot(cell, bridge, Topics())
-        if is_held:
-            robot.recall_tare()
-        else:
-            robot.tare(_SECONDS)
-        claim_real_time()
-        event = robot.follow(trajectory)
-    except ConnectionError as error:
-        raise SafetyStop(f"{error}.", "Whether the arm stands is not known.",
-                         "Check the robot; its stop node acts on silence.") from error
-    finally:
-        bridge.close()
+    with ExitStack() as around:
+        bridge = Bridge(url)
+        around.callback(bridge.close)
+        try:
+            robot = RosRobot(cell, bridge, Topics())
+            around.callback(robot.close)
+            if trajectory is None or is_held:
+                robot.recall_tare()
+            else:
+                robot.tare(_SECONDS)
+            claim_real_time()
+            event = (robot.retreat() if trajectory is None
+                     else robot.follow(trajectory, goes_on=goes_on))
+        except ConnectionError as error:
+            raise SafetyStop(f"{error}.", "Whether the arm stands is not known.",
+                             "Check the robot; its stop node acts on silence.") from error
     for text in robot.warnings:
         run.progress.warn(text)
     return event
 
 
-for each in (check, follow):
+for each in (check, follow, retreat):
     command.add_command(each)

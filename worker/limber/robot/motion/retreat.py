@@ -36,13 +36,18 @@ class WayBack:
                                                                          _LEAST_SPEEDS)
         self._rest: np.ndarray | None = None
 
-    def begin(self, sample: Sample, trajectory: Trajectory) -> None:
+    def begin(self, sample: Sample, trajectory: Trajectory, *, goes_on: bool = False) -> None:
         """A trajectory is followed from ``sample`` on.
 
         Legs on which the same branch is held, from the same rest pose, are one path.
+
+        Args:
+            goes_on: So is this leg with the path of an earlier program.
         """
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
-        if rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0:
+        goes_on = goes_on and bool(self._poses)
+        if not goes_on and (
+                rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0):
             self._poses, self._joints, self._speeds = [], [], _LEAST_SPEEDS
             if self._kept is not None:
                 self._kept.begin()
@@ -103,9 +108,12 @@ class WayBack:
             raise SafetyStop("There is no path to return "
                              "along.", "The arm is at its starting point.", "")
         # At least to the start: against a stiff object even a fraction of a millimetre is a path.
-        back = np.vstack([sample.pose, poses[:max(_first_time(off), 1)][::-1]])
+        first = max(_first_time(off), 1)
+        back = np.vstack([sample.pose, poses[:first][::-1]])
+        joints = np.vstack([sample.joints, np.array(self._joints[:first])[::-1]])
         speed, turn_speed = _SLOWER * self._speeds
-        return Trajectory(along(back, speed, acceleration, turn_speed=turn_speed), back)
+        times = along(back, speed, acceleration, turn_speed=turn_speed)
+        return Trajectory(times, back, joints=joints)
 
 
 def _first_time(off: np.ndarray) -> int:

@@ -20,6 +20,7 @@ from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
 from limber.robot.driver.guard import Decision, Guard, GuardSettings, Verdict
 from limber.robot.interface import Sample
+from limber.robot.motion.retreat import WayBack
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.motion.way_file import WayFile, read_way
@@ -38,6 +39,7 @@ _LISTEN_SECONDS = 0.01
 _BEAT_SECONDS = 0.1
 _OLDEST_READING_SECONDS = 0.05
 _STANDS_RAD_S = 1e-3
+_SETTLE_SECONDS = 0.3
 _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 _OFF_PATH_M = 0.02  # a controller in ROS is behind its trajectory by a time that it does not tell
 
@@ -84,6 +86,8 @@ class RosRobot:
         self.smooth = np.full(6, np.nan)
         self._goals = 0
         self.warnings: list[str] = []
+        self._kept = WayFile(cell)
+        self._way = WayBack(cell.arm.joint_names, read_way(cell), self._kept)
         self._hold_ups = HoldUps(_LISTEN_SECONDS,
                                  lambda **told: self.warnings.append(told["text"]))
         for topic, kind in ((topics.joint_states, JOINT_STATE), (topics.wrench, WRENCH),
@@ -144,6 +148,7 @@ class RosRobot:
                              "With the branch in the gripper the sensor cannot be tared.",
                              "Follow the approach first, then close the gripper.")
         self._chain.bias = followed.bias
+        self._kept.tared(followed.bias)
         self._warm_up()
         self.guard.tared()
 
@@ -162,10 +167,8 @@ class RosRobot:
         sigma = self._chain.end_tare()
         self._warm_up()
         self.guard.tared()
-        kept = WayFile(self._cell)
-        kept.begin()
-        kept.tared(self._chain.bias)
-        kept.close()
+        self._kept.begin()
+        self._kept.tared(self._chain.bias)
         return sigma
 
     def _warm_up(self) -> None:
@@ -180,9 +183,12 @@ class RosRobot:
                    uncertainty=np.eye(6), grasp=self.last.pose[:3], sent=self.last.pose[:3])
         turn_between(self.last.pose, self.last.pose)
 
-    def follow(self, trajectory: Trajectory) -> dict[str, Any]:
+    def follow(self, trajectory: Trajectory, *, goes_on: bool = False) -> dict[str, Any]:
         """Follow a trajectory to its end; returns the event that ended it, as
         :meth:`.RobotLink.follow`: ``reached``, or ``stopped`` with its reason.
+
+        Args:
+            goes_on: The branch is held as in the leg before, whose path belongs to this one.
 
         Raises:
             SafetyStop: the arm is not at its start, or the guard refuses.
@@ -195,6 +201,43 @@ class RosRobot:
             raise SafetyStop("The arm moves already.", "Something else drives it.",
                              "Stop it, and begin again.")
         self.guard.begin()
+        self._way.begin(sample, trajectory, goes_on=goes_on)
+        return self._watched_goal(trajectory)
+
+    def retreat(self) -> dict[str, Any]:
+        """Go back along the path that was followed, while the force falls; a person has chosen it.
+
+        Returns:
+            ``reached``, or ``stopped`` with its reason; and ``force_n``, the force that is left.
+
+        Raises:
+            SafetyStop: no path is known, the arm left it, or the guard refuses.
+        """
+        sample = self._settled()
+        back = self._way.from_here(sample, self._cell.limits.acceleration_m_s2)
+        self.guard.begin_retreat(self.smooth)
+        event = self._watched_goal(back)
+        self._settled()
+        return event | {"force_n": float(np.linalg.norm(self.smooth[:3]))}
+
+    def _settled(self) -> Sample:
+        """Read until the smoothed force is that of the arm at rest; returns the last sample."""
+        end = time.monotonic() + _SETTLE_SECONDS
+        while time.monotonic() < end:
+            if (sample := self._take(self._bridge.receive(_LISTEN_SECONDS))) is not None:
+                assert self._reading is not None
+                _, self.smooth = self._chain.wrench(sample, self._reading)
+        assert self.last is not None
+        return self.last
+
+    def close(self) -> None:
+        """Make sure that the path is on disk, and close the connection."""
+        self._kept.close()
+        self._bridge.close()
+
+    def _watched_goal(self, trajectory: Trajectory) -> dict[str, Any]:
+        """Send a trajectory as a goal and watch it to its end."""
+        assert self._states is not None and trajectory.joints is not None
         self._goals += 1
         goal = f"limber-{self._goals}"
         self._bridge.send(op="send_action_goal", id=goal, action=self._topics.trajectory,
@@ -213,6 +256,7 @@ class RosRobot:
             if (ended := self._ended(message, goal)) is not None:
                 return ended
             if (sample := self._take(message)) is not None:
+                self._way.note(sample)
                 place = self._nearest(trajectory, sample.joints, place)
                 decision = self._judge(trajectory, sample, place)
             else:

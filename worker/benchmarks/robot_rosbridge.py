@@ -1,4 +1,4 @@
-"""A rosbridge server for tests: an arm that follows trajectories, and its force sensor."""
+"""A rosbridge server for tests and the bench: an arm that follows goals, and its force sensor."""
 
 import contextlib
 import json
@@ -6,8 +6,6 @@ import threading
 import time
 
 import numpy as np
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.server import serve
 
 STEP = 0.008
 _NAMES = [f"{name}_joint" for name in (
@@ -21,6 +19,8 @@ class RosBridge:
     Attributes:
         joints: Where the arm stands, in its own order [rad], shape [6].
         wrench: What the sensor tells besides noise [N, N m], shape [6].
+        load: Returns more of that, from the joints.
+        stood_at: When the last goal was cancelled, and the arm stood [s, monotonic].
         heard: Operations that came, each with its time.
         silent: Topics that send nothing.
     """
@@ -28,11 +28,14 @@ class RosBridge:
     def __init__(self, joints):
         self.joints, self.speeds = np.array(joints, float), np.zeros(6)
         self.wrench, self.heard, self.silent = np.zeros(6), [], set()
-        self.followed, self.stands_at = [], None
+        self.followed, self.stood_at = [], None
+        self.load = lambda joints: np.zeros(6)
         self._goal, self._open = None, []
         self._rng = np.random.default_rng(0)
 
     def __enter__(self):
+        from websockets.sync.server import serve
+
         self._server = serve(self._serve, "127.0.0.1", 0, compression=None,
                              close_timeout=0.2)
         self.url = f"ws://127.0.0.1:{self._server.socket.getsockname()[1]}"
@@ -45,6 +48,8 @@ class RosBridge:
         self._server.shutdown()
 
     def _serve(self, socket):
+        from websockets.exceptions import ConnectionClosed
+
         self._open.append(socket)
         listening = threading.Thread(target=self._listen, args=(socket,), daemon=True)
         listening.start()
@@ -56,7 +61,7 @@ class RosBridge:
                 self._send(socket, "/joint_states", count, {
                     "name": _NAMES, "position": self.joints[_ORDER].tolist(),
                     "velocity": self.speeds[_ORDER].tolist(), "effort": []})
-                told = self.wrench + 0.02 * self._rng.standard_normal(6)
+                told = self.wrench + self.load(self.joints) + 0.02 * self._rng.standard_normal(6)
                 self._send(socket, "/force_torque_sensor_broadcaster/wrench", count, {"wrench": {
                     kind: dict(zip("xyz", map(float, part), strict=True))
                     for kind, part in (("force", told[:3]), ("torque", told[3:]))}})
@@ -87,6 +92,8 @@ class RosBridge:
         self.speeds = (self.joints - before) / STEP
 
     def _listen(self, socket):
+        from websockets.exceptions import ConnectionClosed
+
         with contextlib.suppress(ConnectionClosed):
             for text in socket:
                 self._hear(json.loads(text))
@@ -101,4 +108,10 @@ class RosBridge:
                 point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
                 for point in points]), ways, 0.0)
         elif order["op"] == "cancel_action_goal":
-            self._goal = None
+            self._goal, self.stood_at = None, time.monotonic()
+
+    def publish_stop(self):
+        """Publish True on the stop topic, as any node may."""
+        for socket in self._open:
+            socket.send(json.dumps({"op": "publish", "topic": "/limber/stop",
+                                    "msg": {"data": True}}))
