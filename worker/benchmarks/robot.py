@@ -284,7 +284,7 @@ PARTS = {
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
-    "ros": Part(ros_door, LEAST_ROS_S, ROS_ROWS, grows=True),
+    "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
     "lost": Part(_watched(partial(lost_branches, address=_ADDRESS)), 100, (LOST_ROW,), grows=True),
