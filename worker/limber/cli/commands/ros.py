@@ -1,4 +1,4 @@
-"""Move a robot through ROS 2 by rosbridge: `limber ros check`, `limber ros follow`."""
+"""Move a robot through ROS 2 by rosbridge: `limber ros check`, `describe`, `follow`, `retreat`."""
 
 from __future__ import annotations
 
@@ -54,6 +54,28 @@ def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
             "samples_per_second": len(ages) / _SECONDS,
             "longest_gap_s": float(np.diff(ages).max()) if len(ages) > 1 else None,
             "force_without_tare_n": forces.mean(axis=0), "force_sigma_n": forces.std(axis=0)}
+
+
+@stage_command("describe")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("cell.urdf"),
+              show_default=True, help="URDF to write; the SRDF is written beside it.")
+def describe(run: Run, cell_file: Path, output: Path) -> dict[str, Any]:
+    """Write a cell as URDF and SRDF: arm, gripper, camera and obstacles in the branch's frame.
+
+    robot_state_publisher makes TF of it, MoveIt a planning scene; the launch file of
+    scripts/examples/ros2 takes it as urdf:=cell.urdf.
+    """
+    from limber.core.files.atomic import write_atomically
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.ros.cell_description import cell_srdf, cell_urdf, joint_names
+
+    cell = read_cell(cell_file)
+    srdf = output.with_suffix(".srdf")
+    write_atomically(output, cell_urdf(cell))
+    write_atomically(srdf, cell_srdf(cell))
+    return {"urdf": str(output), "srdf": str(srdf), "joints": joint_names(cell.arm),
+            "obstacles": len(cell.obstacles)}
 
 
 @stage_command("follow")
@@ -174,5 +196,5 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
     return event
 
 
-for each in (check, follow, retreat):
+for each in (check, describe, follow, retreat):
     command.add_command(each)
