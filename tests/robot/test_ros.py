@@ -1,5 +1,6 @@
 """The door to ROS 2, against a rosbridge server in the test: followed, guarded, stopped in time."""
 
+import base64
 import gc
 import os
 import threading
@@ -19,8 +20,9 @@ from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.ros import guarded
 from limber.robot.ros.bridge import Bridge
+from limber.robot.ros.cloud_topic import CloudTopic
 from limber.robot.ros.guarded import RosRobot, Topics
-from limber.robot.ros.messages import JointStates, goal_of
+from limber.robot.ros.messages import JointStates, cloud_of, goal_of
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
@@ -210,3 +212,51 @@ def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
     for path in package.rglob("*.py"):
         compile(path.read_text(encoding="utf-8"), str(path), "exec")
     assert guarded._BEAT_SECONDS < 0.3 / 2
+
+
+def cloud_message(points: np.ndarray, *, big: bool = False) -> dict:
+    """As rosbridge sends it: padded points and rows, base64 text."""
+    order = ">" if big else "<"
+    layout = np.dtype({"names": ["x", "y", "z"], "formats": [f"{order}f4"] * 3,
+                       "offsets": [4, 8, 12], "itemsize": 20})
+    rows = np.zeros((2, len(points) // 2 + 1), layout)
+    for axis, values in zip("xyz", points.T, strict=True):
+        rows[axis][:, :-1] = values.reshape(2, -1)
+    rows["x"][:, -1] = np.nan
+    fields = [{"name": axis, "offset": 4 + 4 * k, "datatype": 7, "count": 1}
+              for k, axis in enumerate("xyz")]
+    return {"height": 2, "width": rows.shape[1], "fields": fields, "is_bigendian": big,
+            "point_step": 20, "row_step": rows.strides[0],
+            "data": base64.b64encode(rows.tobytes()).decode()}
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_a_cloud_comes_in_the_branchs_frame(big):
+    """By a camera on the flange: only once it is known where the arm stands."""
+    points = np.random.default_rng(1).uniform(-0.3, 0.3, (40, 3)) + [0, 0, 0.8]
+    message = cloud_message(points, big=big)
+    assert cloud_of(message) == pytest.approx(points, abs=1e-6)
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.5, 0.1, 0, 0, 0, 1.2)},
+                camera={"pose": (0.05, 0, 0.02, 0, 0, 0.1), "mount": "flange",
+                        "range_m": (0.2, 0.9)})
+    with RosBridge(HOME) as server:
+        bridge = Bridge(server.url)
+        camera = CloudTopic(cell, bridge, "/points", "/joint_states")
+        server.publish("/points", message)
+        time.sleep(0.05)
+        server.publish("/points", message)
+        found = camera.next_cloud()
+        bridge.close()
+    frame = (matrices(np.array(cell.base.pose)) @ cell.arm.forward(HOME)
+             @ matrices(np.array(cell.camera.pose)))
+    near = points[points[:, 2] <= 0.9]
+    assert 0 < len(near) < 40
+    assert found == pytest.approx(near @ frame[:3, :3].T + frame[:3, 3], abs=1e-5)
+
+
+@pytest.mark.parametrize("change", [
+    {"data": "no base64!"}, {"data": "AAAA"}, {"fields": []}, {"point_step": 8}, {"width": 10**9},
+    {"height": None}])
+def test_what_is_no_cloud_is_refused(change):
+    with pytest.raises(InputError, match="no cloud of points"):
+        cloud_of(cloud_message(np.ones((4, 3))) | change)

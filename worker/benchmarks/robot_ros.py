@@ -73,7 +73,7 @@ def _stopped() -> float:
 
         def publish() -> None:
             published.append(time.monotonic())
-            server.publish_stop()
+            server.publish("/limber/stop", {"data": True})
         threading.Timer(0.5, publish).start()
         event = robot.follow(_path(5.0))
         robot.close()

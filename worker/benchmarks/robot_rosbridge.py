@@ -110,8 +110,7 @@ class RosBridge:
         elif order["op"] == "cancel_action_goal":
             self._goal, self.stood_at = None, time.monotonic()
 
-    def publish_stop(self):
-        """Publish True on the stop topic, as any node may."""
+    def publish(self, topic, message):
+        """Publish a message to every client, as any node may."""
         for socket in self._open:
-            socket.send(json.dumps({"op": "publish", "topic": "/limber/stop",
-                                    "msg": {"data": True}}))
+            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -76,6 +77,55 @@ def describe(run: Run, cell_file: Path, output: Path) -> dict[str, Any]:
     write_atomically(srdf, cell_srdf(cell))
     return {"urdf": str(output), "srdf": str(srdf), "joints": joint_names(cell.arm),
             "obstacles": len(cell.obstacles)}
+
+
+@stage_command("scan")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.option("--topic", default="/camera/depth/color/points", show_default=True,
+              help="Topic of the camera's clouds (sensor_msgs/msg/PointCloud2).")
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("scan.ply"),
+              show_default=True, help="PLY file to write.")
+@click.option("--views", default=1, show_default=True, help="Number of clouds. Between them the "
+              "arm or the branch is moved, and Enter pressed.")
+@_url
+def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: str,
+         ) -> dict[str, Any]:
+    """Take clouds of a depth camera, in the branch's frame by the cell's [camera].
+
+    A camera on the flange is placed by the arm's joints while it stands. Nothing moves.
+    """
+    import shlex
+
+    from limber.core.errors import InputError
+    from limber.geometry.cloud.cloud import Cloud
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.ros.bridge import Bridge
+    from limber.robot.ros.cloud_topic import CloudTopic
+    from limber.robot.ros.guarded import Topics
+
+    cell = read_cell(cell_file)
+    if views > 1 and not sys.stdin.isatty():
+        raise InputError(f"--views {views} needs a terminal, and standard input is none.", "",
+                         "Run it in a terminal, or take one view at a time.")
+    found = []
+    bridge = Bridge(url)
+    try:
+        camera = CloudTopic(cell, bridge, topic, Topics().joint_states)
+        for number in range(views):
+            if number:
+                input(f"View {number + 1} of {views}: move the camera, then press Enter ")
+            found.append(camera.next_cloud())
+    finally:
+        bridge.close()
+    points = np.concatenate(found)
+    if not len(points):
+        raise InputError(f"The clouds on {topic} have no point within camera.range_m.", "",
+                         "Check the camera and [camera] in the cell file.")
+    Cloud(points, {}).write_ply(output)
+    run.close(f"{len(points):,} points from {views} views.", where=output,
+              then=f"limber reconstruct {shlex.quote(str(output))} -o "
+              f"{shlex.quote(output.stem)}.branch")
+    return {"cloud": str(output), "point_count": len(points), "view_count": views}
 
 
 @stage_command("follow")
@@ -196,5 +246,5 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
     return event
 
 
-for each in (check, describe, follow, retreat):
+for each in (check, describe, scan, follow, retreat):
     command.add_command(each)

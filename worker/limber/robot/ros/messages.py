@@ -1,5 +1,6 @@
 """Messages of ROS 2 as the robot's own values: joint states, wrenches, trajectories."""
 
+import base64
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,10 @@ from limber.robot.motion.trajectory import Trajectory
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 STOP = "std_msgs/msg/Bool"
+CLOUD = "sensor_msgs/msg/PointCloud2"
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
+_AXES = ("x", "y", "z")
+_FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/msg/PointField
 
 
 def stamp_of(message: dict[str, Any]) -> float:
@@ -79,6 +83,34 @@ def wrench_of(message: dict[str, Any]) -> np.ndarray:
     told = message["wrench"]
     values = [told[kind].get(axis) for kind in ("force", "torque") for axis in "xyz"]
     return np.array([np.nan if value is None else value for value in values], float)
+
+
+def cloud_of(message: dict[str, Any]) -> np.ndarray:
+    """Return the finite points [m] of a PointCloud2 as rosbridge sends it, shape [n, 3].
+
+    Its data is base64 text (rosbridge v2 protocol: byte arrays).
+
+    Raises:
+        InputError: it has no coordinates, or another size than it states.
+    """
+    try:
+        data = base64.b64decode(message["data"], validate=True)
+        kinds = {field["name"]: (int(field["offset"]), _FLOATS[field["datatype"]])
+                 for field in message["fields"] if field["name"] in _AXES}
+        order = ">" if message["is_bigendian"] else "<"
+        layout = np.dtype({"names": _AXES, "formats": [order + kinds[axis][1] for axis in _AXES],
+                           "offsets": [kinds[axis][0] for axis in _AXES],
+                           "itemsize": int(message["point_step"])})
+        width, height, step = (int(message[name]) for name in ("width", "height", "row_step"))
+        if len(data) != height * step or step < width * layout.itemsize:
+            raise ValueError(f"{len(data)} bytes for {height} rows of {step}")
+        rows: np.ndarray = np.ndarray((height, width), layout, data, strides=(step, layout.itemsize))
+        points = np.stack([rows[axis].astype(float) for axis in _AXES], axis=-1).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"A message is no cloud of points ({error!r}).",
+                         "x, y and z as floating-point numbers are needed.",
+                         "Check the topic: it has to be a sensor_msgs/msg/PointCloud2.") from error
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
