@@ -14,8 +14,8 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.fit_preparation import forwards_of, is_path_observed
 from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.free_frame import fitted_frame, put_right
 from limber.estimation.fitting.initial_modulus import FALL, led_start, standing_start
+from limber.estimation.fitting.large_errors import far_points, fitted_frame, put_right
 from limber.estimation.fitting.nuisances import eliminated, in_words, told, unlikely
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward import quasi_static
@@ -115,6 +115,32 @@ def test_elimination_is_the_joint_least_squares_problem():
     free = np.linalg.inv(slopes.T @ slopes)
     assert free == pytest.approx(covariance[:3, :3])
     assert errors.total_covariance(free) == pytest.approx(covariance[3:, 3:])
+
+
+def test_a_known_part_of_an_error_is_in_its_value_and_its_prior():
+    """Simulated with a part of the errors, the joint problem has the same solution."""
+    rng = np.random.default_rng(1)
+    jacobian, columns = rng.standard_normal((40, 3)), rng.standard_normal((40, 5))
+    residual, known = rng.standard_normal(40), rng.standard_normal(5)
+    left, slopes, errors = eliminated(residual, jacobian, columns)
+    with_part, its_slopes, its_errors = eliminated(residual + columns @ known, jacobian, columns,
+                                                   known)
+    assert its_errors.values == pytest.approx(errors.values)
+    assert its_slopes == pytest.approx(slopes)
+    assert with_part @ with_part == pytest.approx(left @ left)
+
+
+def test_points_that_are_far_off_are_simulated_where_they_are():
+    """Beyond 4 mm from where the pull was simulated: of each pull, in the order of its points."""
+    def listed(*values):
+        return [{"name": f"position of point {k + 1} along the branch", "pull": "a", "value": value}
+                for k, value in enumerate(values)] + [
+                    {"name": "camera position x", "pull": None, "value": 1.0}]
+
+    assert far_points(listed(1e-3, -3e-3), {}) is None
+    far = far_points(listed(1e-3, -9e-3), {})
+    assert far["a"] == pytest.approx([1e-3, -9e-3])
+    assert far_points(listed(1e-3, -10e-3), far) is None
 
 
 def test_a_cell_that_is_off_does_not_move_the_moduli(found):

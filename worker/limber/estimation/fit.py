@@ -20,8 +20,14 @@ from limber.estimation.fit_preparation import (
     require_scale_in_principle,
 )
 from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.free_frame import ROUNDS, SMALL_RAD, fitted_frame, put_right
 from limber.estimation.fitting.initial_modulus import led_start, scaled_start, standing_start
+from limber.estimation.fitting.large_errors import (
+    ROUNDS,
+    SMALL_RAD,
+    far_points,
+    fitted_frame,
+    put_right,
+)
 from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
@@ -40,6 +46,11 @@ from limber.estimation.uncertainty.profile_likelihood import profiled
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recording import Pull
 from limber.recordings.sensor_checks import force_unit_suspicion
+
+AS_LIKELY = 8.0
+"""Difference of the objectives below which two fits explain the pulls as well: one is then 3,000
+times as likely as the other, about as much as priors that are stated roughly may be wrong.
+"""
 
 
 class _ForceLeadsNowhereError(WorkError):
@@ -66,12 +77,31 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     def once(branch: Subject, chosen: EstimateSettings, log: EvaluationLog) -> Estimate:
         if not chosen.free_frame:
             return in_frame(pulls, branch, chosen, log)
-        return _in_free_frame(pulls, lambda seen: in_frame(
+        found = _in_free_frame(pulls, lambda seen: in_frame(
             seen, branch, chosen, log if seen is pulls else EvaluationLog(None, "")))
+        as_stated = chosen.model_copy(update={"free_frame": False})
+        try:
+            other = in_frame(pulls, branch, as_stated, EvaluationLog(None, ""))
+        except (WorkError, InputError):
+            return found
+        _require_one_explanation(found, other)
+        return found
 
     def in_frame(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
                  log: EvaluationLog) -> Estimate:
-        forwards = forwards_of(pulls, branch, chosen, progress)
+        shifts: dict[str, np.ndarray] = {}
+        found = in_place(pulls, branch, chosen, log, shifts)
+        for _ in range(ROUNDS - 1):
+            far = None if found.stopped else far_points(found.cell_errors, shifts)
+            if far is None:
+                break
+            shifts = far
+            found = in_place(pulls, branch, chosen, EvaluationLog(None, ""), shifts)
+        return found
+
+    def in_place(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
+                 log: EvaluationLog, shifts: dict[str, np.ndarray]) -> Estimate:
+        forwards = forwards_of(pulls, branch, chosen, progress, shifts)
         objective = Objective(forwards, parameter_space(branch, forwards, chosen),
                               log=log, force_sigma=[pull.entry.sensor.force_sigma_n
                                                     for pull in pulls], progress=progress,
@@ -106,6 +136,31 @@ def _in_free_frame(pulls: list[Pull], fitted: Callable[[list[Pull]], Estimate]) 
         seen = [put_right(pull, shift, turn) for pull in seen]
         found = fitted(seen)
     return found
+
+
+def _require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
+    """Refuse a free frame where points that are off along the branch explain the pulls as well.
+
+    Raises:
+        WorkError: with the frame as stated the fit is as good, with moduli outside the intervals.
+    """
+    loss, other = (each.fit.evaluation.objective for each in (free, as_stated))
+    if free.stopped or as_stated.is_bad is not None or other - loss > AS_LIKELY:
+        return
+    low, high = free.uncertainty.young_interval.T
+    young = as_stated.values.young
+    if np.any((young < low) | (young > high)):
+        raise WorkError(
+            "The pulls do not tell a shift of the frame from a shift of the points.",
+            f"With a free frame they give {_listed(free.values.young)} MPa, with the frame as "
+            f"stated and points off along the branch {_listed(young)} MPa. Both fit as well.",
+            "Register the camera (camera_sigma_m) and omit --free-frame. Or mark the points on "
+            "the branch, give their positions (--nominal of import-pull), and state that under "
+            "[calibration] (point_sigma_m).")
+
+
+def _listed(young: np.ndarray) -> str:
+    return ", ".join(f"{value / 1e6:.4g}" for value in young)
 
 
 def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],

@@ -1,5 +1,6 @@
 """Prepare a fit: forward simulations and free parameters of a branch and its pulls."""
 
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.forward.observed_path import ObservedPathForward
+from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings
@@ -20,9 +22,13 @@ FREE_FRAME_M, FREE_FRAME_RAD = 0.1, 0.3
 
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
-                progress: Progress = SILENT,
+                progress: Progress = SILENT, shifts: Mapping[str, np.ndarray] | None = None,
                 ) -> list[Forward]:
     """Make the forward simulation of each pull.
+
+    Args:
+        shifts: Name of a pull to distances by which its observed points are farther along the
+            branch than stated [m], shape [m].
 
     Raises:
         InputError: a pull has no measurements to compare, or observes other points.
@@ -48,7 +54,13 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
                 "Import it with the markers, depth images or clouds of the same time, or name "
                 "other pulls with --pull.")
         _check_rest(pull, frames, rest, progress)
-        forwards.append(_forward(pull.name, entry, frames, rest, subject, settings))
+        moved = (shifts or {}).get(pull.name)
+        if moved is not None:
+            rest = rest + moved[:, None] * PointDirections.at(subject.mesh, rest).rest
+        forward = _forward(pull.name, entry, frames, rest, subject, settings)
+        if moved is not None:
+            forward.point_shifts = moved
+        forwards.append(forward)
     return forwards
 
 

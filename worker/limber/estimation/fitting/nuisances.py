@@ -92,20 +92,21 @@ class Eliminated:
 
 
 def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.ndarray,
-               ) -> tuple[np.ndarray, np.ndarray | None, Eliminated]:
+               known: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray | None, Eliminated]:
     """Eliminate k errors of unit standard deviation from the residuals.
 
     Args:
         residual: Standardised, shape [r].
         jacobian: Derivative to the free vector, shape [r, p], or None.
         columns: Derivative to the errors, shape [r, k].
+        known: Parts of the errors that are in the simulation already, in deviations, [k].
 
     Returns:
         Residual [r + k] and Jacobian [r + k, p] with the rows of the priors, and the errors.
     """
     count = columns.shape[1]
     basis, triangle = np.linalg.qr(np.vstack([columns, np.eye(count)]))
-    residual = np.concatenate([residual, np.zeros(count)])
+    residual = np.concatenate([residual, np.broadcast_to(known, count)])
     inside = basis.T @ residual
     values = -solve_triangular(triangle, inside)
     inverse = solve_triangular(triangle, np.eye(count))
@@ -115,7 +116,8 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
         along = basis.T @ jacobian
         gain = -solve_triangular(triangle, along)
         jacobian = jacobian - basis @ along
-    return residual - basis @ inside, jacobian, Eliminated(values, inverse @ inverse.T, gain)
+    covariance = inverse @ inverse.T
+    return residual - basis @ inside, jacobian, Eliminated(values + known, covariance, gain)
 
 
 @dataclass(frozen=True)
@@ -182,6 +184,16 @@ class CellErrors:
                     used[place] = known[key]
                 places.append((source, used))
             self._places.append(places)
+
+    @property
+    def known(self) -> np.ndarray:
+        """Parts of the errors that the simulations already have, in deviations, shape [k]."""
+        parts = np.zeros(self.count)
+        for forward, places in zip(self._forwards, self._places, strict=True):
+            for source, used in places:
+                if source.slopes is _along:
+                    parts[used] = forward.point_shifts / np.array(source.sigma)
+        return parts
 
     @property
     def count(self) -> int:

@@ -273,8 +273,9 @@ class Objective:
         jacobian = self.on_free(np.vstack(jacobians)) if jacobians else None
         errors: Eliminated | None = None
         if with_errors:
-            residual, jacobian, told = eliminated(residual, jacobian, np.vstack(columns))
-            pulls = [_shown(simulated, of_errors, told.values)
+            known = self.cell_errors.known
+            residual, jacobian, told = eliminated(residual, jacobian, np.vstack(columns), known)
+            pulls = [_shown(simulated, of_errors, told.values - known)
                      for simulated, of_errors in zip(pulls, slopes, strict=True)]
             errors = told
             unknown_count += self.cell_errors.count

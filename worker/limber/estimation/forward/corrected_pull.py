@@ -30,6 +30,7 @@ class CorrectedForward(Forward):
     def __init__(self, full: QuasiStaticForward, reduced: ReducedForward):
         super().__init__(full.name, full.entry, full.frames, full.rest_points)
         self._full, self.reduced = full, reduced
+        self.point_shifts = full.point_shifts
         self._correction: _Correction | None = None
 
     def correct(self, values: Values, extra: tuple[str, ...]) -> bool:

@@ -73,6 +73,11 @@ class Forward(ABC):
     is_dynamic = False
     """Whether inertia acts; a frame then depends on all earlier ones."""
 
+    point_shifts: np.ndarray | float = 0.0
+    """Distances along the branch by which ``rest_points`` have been moved from the stated ones [m],
+    shape [m].
+    """
+
     def __init__(self, name: str, entry: PullEntry, frames: Frames, rest_points: np.ndarray):
         self.name, self.entry, self.frames = name, entry, frames
         self.rest_points = np.asarray(rest_points, float)
