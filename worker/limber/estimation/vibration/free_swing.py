@@ -45,6 +45,10 @@ _SETTLED = 0.5
 Nearly all of it is then an exchange between the two damping parameters: of the virtual beams the
 modulus changed by 0.03 %, a fiftieth of its deviation.
 """
+_ROUNDS = 200
+"""Most evaluations of a fit: by modes each takes milliseconds, and the two damping parameters, of
+which one vibration determines the sum, take many.
+"""
 _MARGIN = 0.1
 """Deviation of a marker's gain if the registration is not known."""
 
@@ -385,7 +389,7 @@ class _Swing:
         scale = np.r_[0.1, 0.02 * self.period, 1.0, 1.0, 0.1, np.full(count - 5, 0.05)]
         found = least_squares(residual, np.clip(free, low + 1e-9, high - 1e-9), jacobian,
                               bounds=(low, high), x_scale=scale, xtol=1e-5, ftol=1e-6, gtol=1e-8,
-                              loss="linear", max_nfev=25)
+                              loss="linear", max_nfev=_ROUNDS)
         return _Found(found.x, chosen, duration, found.success, known, sigma, priors)
 
     def left_over(self, found: "_Found") -> tuple[float, float, float]:
