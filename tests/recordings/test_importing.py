@@ -15,7 +15,12 @@ from limber.perception.observe import list_frames, read_depth, write_depth
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.importing.recording_formats import RECORDINGS
 from limber.recordings.masks import read_mask
-from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.recording import (
+    POSE_COLUMNS,
+    WRENCH_COLUMNS,
+    read_pull,
+    write_pull,
+)
 from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, read_stream, write_stream
 from limber.stages.pulls.import_pull import import_pull
@@ -49,6 +54,39 @@ def test_markers_in_millimetres_and_gram_force(bare_folder, source, plain_pull):
     assert pull.entry.time_offset_s == 0.05
     assert pull.entry.sensor.torque_sigma_nm == 0.002
     assert pull.entry.grasp.point_m == (0.0, 0.0, 0.5)
+
+
+def test_entries_of_the_users_file_replace_the_imports(bare_folder, source, tmp_path):
+    """Table by table, also those of a whole pull; a wrong key is named."""
+    stated = tmp_path / "mine.toml"
+    stated.write_text("[calibration]\ncamera_sigma_m = 0.004\n[sensor]\ntared = false\n")
+    settings = ImportSettings(robot=str(source / "robot.csv"), unit="mm", force_unit="gf",
+                              time_offset=0.05, pull_toml=str(stated))
+    import_pull(bare_folder, source / "markers.csv", "m", settings)
+    entry = read_pull(bare_folder / "pulls" / "m").entry
+    assert entry.calibration.camera_sigma_m == 0.004
+    assert not entry.sensor.tared and entry.sensor.position_sigma_m == 1e-3
+    stated.write_text("[calibration]\ncamera_sigma_m = 0.005\n")
+    import_pull(bare_folder, bare_folder / "pulls" / "m", "whole", ImportSettings(
+        pull_toml=str(stated)))
+    whole = read_pull(bare_folder / "pulls" / "whole").entry
+    assert whole.calibration.camera_sigma_m == 0.005 and whole.sensor == entry.sensor
+    stated.write_text("[calibration]\ncamera_sigma = 0.005\n")
+    with pytest.raises(InputError, match=r"mine.toml: calibration.camera_sigma: "):
+        import_pull(bare_folder, source / "markers.csv", "m", settings)
+
+
+def test_markers_in_another_frame_are_refused(branch_folder, source, small):
+    """Without their nominal positions they would count as displacements."""
+    write_stream(source / "robot.csv", Stream(
+        np.array([0.0, 4.0]), np.hstack([np.tile(small.skeleton.nodes[-3], (2, 1)),
+                                         np.zeros((2, 9))]), POSE_COLUMNS + WRENCH_COLUMNS))
+    seen = np.full((2, 3), 3.0)
+    write_stream(source / "far.csv", Stream(np.array([0.0, 4.0]), seen,
+                                            ("tip_x_m", "tip_y_m", "tip_z_m")))
+    with pytest.raises(InputError, match="--nominal"):
+        import_pull(branch_folder, source / "far.csv", "m", ImportSettings(
+            robot=str(source / "robot.csv")))
 
 
 def test_a_robot_table_is_needed_and_its_columns_are_named(bare_folder, source):

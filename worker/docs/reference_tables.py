@@ -6,7 +6,7 @@ the benches.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import click
 from accuracy_page import accuracy_page
@@ -40,7 +40,8 @@ def pages() -> dict[str, str]:
         "reference/commands.md": commands_page(),
         "reference/pull_toml.md": _model_page("pull.toml", PullEntry, (
             "The settings of a recording, in `pulls/NAME/pull.toml`. `limber import-pull` and "
-            "`limber record` write it; you may also write it by hand.")),
+            "`limber record` write it. `import-pull --pull-toml mine.toml` replaces entries by your "
+            "own. Do not edit the copy in the branch folder: it is compared with its checksum.")),
         "reference/cell_toml.md": _model_page("The cell file", Cell, (
             "`cell.toml` says which robot stands where, what it holds, and what it must not "
             "exceed. Lengths are in metres, angles in radians, masses in kilograms.")),
@@ -95,27 +96,30 @@ def _table(prefix: str, model: type[BaseModel]) -> list[str]:
     """Rows of a model's own entries, then a section for each model inside it."""
     rows, inner = [], []
     for name, field in model.model_fields.items():
-        child = _child(field)
-        if child is not None:
-            inner.append((f"{prefix}{name}", child))
+        models, is_list = _models(field.annotation)
+        if models:
+            heading = f"[[{prefix}{name}]]" if is_list else f"[{prefix}{name}]"
+            inner += [(prefix + name, heading, child) for child in models]
             continue
         rows.append(f"| `{name}` | {_kind(field)} | {_default(field)} "
                     f"| {_escaped(field.description or '')} |")
     parts = []
     if rows:
         parts = ["| key | type | default | meaning |", "|---|---|---|---|", *rows, ""]
-    for name, child in inner:
-        told = (child.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
-        parts += [f"## [{name}]\n", f"{_escaped(' '.join(told.split()))}\n",
+    for name, heading, child in inner:
+        about = (child.__doc__ or "").strip().split("\n\n")[0]
+        parts += [f"## {heading}\n", f"{_escaped(about)}\n",
                   *_table(f"{name}.", child)]
     return parts
 
 
-def _child(field: FieldInfo) -> type[BaseModel] | None:
-    """The model that an entry holds, if it holds just one."""
-    kinds = [field.annotation, *getattr(field.annotation, "__args__", ())]
-    models = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)]
-    return models[0] if len(models) == 1 else None
+def _models(annotation: Any) -> tuple[list[type[BaseModel]], bool]:
+    """The models that an entry may hold, and whether it is a list of them."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation], False
+    inner = [_models(part) for part in get_args(annotation)]
+    return ([model for models, _ in inner for model in models],
+            get_origin(annotation) in (tuple, list) or any(is_list for _, is_list in inner))
 
 
 def _kind(field: FieldInfo) -> str:

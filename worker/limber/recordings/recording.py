@@ -222,6 +222,18 @@ def entry_of_text(text: str, where: str) -> PullEntry:
     return _checked(toml_content(text, where, "the description of a pull"), where)
 
 
+def entry_with(entry: PullEntry, content: dict[str, Any], where: str) -> PullEntry:
+    """Return an entry with values of ``content`` in place of its own, table by table.
+
+    Raises:
+        InputError: as :func:`read_entry`; ``where`` names the source of the values.
+    """
+    known = _without_none(plain(entry))
+    return _checked(known | {
+        key: known.get(key, {}) | value if isinstance(value, dict) else value
+        for key, value in content.items()}, where) if content else entry
+
+
 def _checked(content: dict[str, Any], where: str) -> PullEntry:
     try:
         return validated(PullEntry, content)

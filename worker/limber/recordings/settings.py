@@ -26,7 +26,7 @@ class ImportSettings(Settings):
         "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "weight", "load",
             "own_weight"),
         "simulation": ("drive", "motion", "swing_start"),
-        "noise": ("position_sigma", "force_sigma", "torque_sigma"),
+        "noise": ("position_sigma", "force_sigma", "torque_sigma", "pull_toml"),
     }
     common = ("unit", "grasp_point", "cell")
 
@@ -43,6 +43,9 @@ class ImportSettings(Settings):
     nominal: str | None = Field(
         None, description="CSV with label,x_m,y_m,z_m: positions of the markers on the branch at "
         "rest. A rigid transform fits the recording's first frames to them.")
+    pull_toml: str | None = Field(
+        None, description="TOML file whose entries replace those that the import writes to the "
+        "pull's pull.toml, such as [calibration], or tared of [sensor].")
     coordinates: Literal["branch", "scan"] = Field(
         "branch", description="Coordinates of --nominal, --grasp-point and --load: the branch "
         "folder's, or those of the scan's file.")

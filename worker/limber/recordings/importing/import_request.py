@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 from limber.core.alignment import Alignment
 from limber.core.constants import GRAVITY
 from limber.core.errors import InputError
+from limber.core.files.reading import read_toml
 from limber.core.progress import SILENT, Progress
 from limber.recordings.bags.bag_pull import JointPoses
 from limber.recordings.cell_errors import CalibrationEntry
-from limber.recordings.recording import GraspEntry, Pull, PullEntry, SensorEntry
+from limber.recordings.recording import GraspEntry, Pull, PullEntry, SensorEntry, entry_with
 from limber.recordings.registration import Registration, read_nominal, register
 from limber.recordings.settings import ImportSettings
 
@@ -98,6 +100,24 @@ class ImportRequest:
         known, nominal = read_nominal(Path(self.settings.nominal))
         return register(rest, labels, known, self.in_branch(nominal), self.name)
 
+    @cached_property
+    def replaced(self) -> dict[str, Any]:
+        """The entries of ``pull.toml`` that the user's file replaces.
+
+        Raises:
+            InputError: the file is missing or not TOML.
+        """
+        path = self.settings.pull_toml
+        return {} if path is None else read_toml(Path(path), "entries of a pull.toml")
+
+    def as_stated(self, entry: PullEntry) -> PullEntry:
+        """Return the entry with the user's entries in place of its own.
+
+        Raises:
+            InputError: an entry of the user's file makes no sense; names it.
+        """
+        return entry_with(entry, self.replaced, str(self.settings.pull_toml))
+
     def entry(self, observation: Any, rest: np.ndarray | None, *, drive: Any, mode: Any,
               sigma: float, grasp: tuple[float, float, float]) -> PullEntry:
         """Return the description of the pull: markers at rest [m, 3] and the grasp in the
@@ -156,7 +176,7 @@ def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
     A pull that states its calibration is unchanged; without a cell the assumed values are reported.
     """
     settings, robot = request.settings, request.robot
-    if pull.entry.calibration is not None:
+    if pull.entry.calibration is not None or "calibration" in request.replaced:
         return pull
     if robot is None:
         taken = CalibrationEntry()
@@ -166,7 +186,8 @@ def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
             f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, force "
             f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, "
             f"force drift {taken.force_drift_sigma_n:g} N. They widen the interval of an "
-            "estimate. Give the robot's cell file with --cell.")
+            "estimate. Give the robot's cell file with --cell, or "
+            "[calibration] in --pull-toml.")
     sensor = pull.entry.sensor.model_copy(update={
         "force_range_n": robot.noise.force_range_n,
         **({} if "force_sigma" in request.given else {

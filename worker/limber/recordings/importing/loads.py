@@ -135,7 +135,8 @@ def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.
     grasp = request.grasp_or(lambda: _nearest(nodes, found.rest[_farthest(moved)]))
     entry = request.entry("markers", found.rest, drive="force", mode="pinned", grasp=grasp,
                           sigma=sigma)
-    entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER, **further})
+    entry = request.as_stated(entry.model_copy(
+        update={"calibration": WITHOUT_GRIPPER, **further}))
     require_on_branch(entry.grasp, request.name, nodes)
     poses = np.zeros((2, 6))
     poses[:, :3] = entry.grasp.point_m

@@ -11,6 +11,7 @@ from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope
 from limber.recordings.importing.import_request import (
     ImportRequest,
     of_known_robot,
+    require_near,
     require_on_branch,
 )
 from limber.recordings.importing.loads import import_load, require_loadable
@@ -83,8 +84,12 @@ def _import_force(read: tuple[np.ndarray, np.ndarray, tuple[str, ...]], request:
 def _import_motion(chosen: RecordingFormat, request: ImportRequest) -> dict[str, Any]:
     is_whole = chosen.holds == "pull"
     pull = _read(chosen, request) if is_whole else _assembled(chosen, request)
+    if request.replaced:
+        pull = replace(pull, entry=request.as_stated(pull.entry))
     if not (request.folder / "pull.toml").exists():
         write_pull(request.folder, pull)
+    elif request.replaced:
+        write_entry(request.folder / "pull.toml", pull.entry)
     cleaned = clean(pull)
     for message in cleaned.warnings:
         request.progress.warn(message)
@@ -158,6 +163,8 @@ def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
     seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
     placed = request.registered(seen.positions[0], labels)
     if placed is None:
+        if request.branch.nodes is not None:
+            require_near(seen.positions[0], request.name, request.branch.nodes)
         return seen, None, list(stream.warnings)
     moved = placed.apply(seen.positions[:, placed.used])
     return (replace(seen, positions=moved), moved[0],

@@ -104,7 +104,8 @@ def cloud_of(message: dict[str, Any]) -> np.ndarray:
         width, height, step = (int(message[name]) for name in ("width", "height", "row_step"))
         if len(data) != height * step or step < width * layout.itemsize:
             raise ValueError(f"{len(data)} bytes for {height} rows of {step}")
-        rows: np.ndarray = np.ndarray((height, width), layout, data, strides=(step, layout.itemsize))
+        rows: np.ndarray = np.ndarray((height, width), layout, data,
+                                      strides=(step, layout.itemsize))
         points = np.stack([rows[axis].astype(float) for axis in _AXES], axis=-1).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"A message is no cloud of points ({error!r}).",

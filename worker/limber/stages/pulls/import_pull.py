@@ -62,7 +62,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     branch = (Branch.create if is_force else Branch.open)(branch_folder)
     key, digests = f"pull:{name}", {"source": _digest(source)}
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
-                          ("yolo", settings.yolo_weights), ("cell", settings.cell)):
+                          ("yolo", settings.yolo_weights), ("cell", settings.cell),
+                          ("pull_toml", settings.pull_toml)):
         if named and Path(named).is_file():
             digests[key_of] = _digest(Path(named))
     if not force and branch.is_current(key, settings, digests=digests):
