@@ -201,7 +201,7 @@ def test_a_field_of_odd_numbers_is_refused(tmp_path, ridge_field, name, change):
         arrays = {key: file[key] for key in file.files}
     arrays[name] = change(arrays[name])
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match="is not an energy field"):
+    with pytest.raises(InputError, match=r"energy\.npz.* energy field"):
         EnergyField.read(path)
 
 
