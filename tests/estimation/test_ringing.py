@@ -163,3 +163,19 @@ def test_the_readings_of_a_logger_are_found(tmp_path, stamp):
     assert record.columns == ("ax", "az")
     assert any("taken as readings, because they ring: ax, az" in text for text in record.warnings)
     assert identify(record.times, record.values).frequencies[0] == pytest.approx(5.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("axes", [1, 3])
+def test_the_magnitude_of_the_others_is_no_reading(axes):
+    """Telephones add it; it rings at twice the frequency. Of two equal columns both stay."""
+    times = np.arange(0, 4, 0.01)
+    swing = np.exp(-0.5 * times) * np.cos(2 * np.pi * 3 * times)
+    values = swing[:, None] * [[1.0, 0.4, -0.2][:axes]] * np.ones((1, axes))
+    names = tuple("abcd"[:axes + 1])
+    record = Stream(times, np.c_[values, np.linalg.norm(values, axis=1)], names)
+    used = ringing_columns(record)
+    assert used.columns == names[:-1]
+    found = identify(used.times, used.values)
+    assert found.frequencies[0] == pytest.approx(3.0, rel=5e-3)
+    equal = Stream(times, np.c_[swing + 2, swing + 2], ("a", "b"))
+    assert ringing_columns(equal).columns == ("a", "b")

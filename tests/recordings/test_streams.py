@@ -118,3 +118,15 @@ def test_stamps_of_no_recorder(step):
     with pytest.raises(InputError, match="apart"):
         in_order(Path("a.csv"), step * count, np.zeros((9, 1)), [])
     assert len(in_order(Path("a.csv"), count, np.zeros((9, 1)), [])[0]) == 9
+
+
+def test_rows_that_share_their_times():
+    """Half of them or more: a clock of whole seconds, or a row for each of two markers."""
+    rows = np.arange(40.0)[:, None]
+    for share in (2, 10):
+        with pytest.raises(InputError, match="the time of another row"):
+            in_order(Path("a.csv"), np.arange(40) // share * 1.0, rows, [])
+    told: list[str] = []
+    stamps = np.sort(np.r_[np.arange(30.0), np.arange(10.0)])
+    times, values = in_order(Path("a.csv"), stamps, rows, told)
+    assert len(times) == len(values) == 30 and "10 duplicate" in told[0]

@@ -151,3 +151,19 @@ def test_the_log_of_a_serial_monitor(tmp_path, above, row, titles):
     np.testing.assert_allclose(stream.values[:, 0], a, atol=6e-4)
     if len(titles) == 2:
         np.testing.assert_array_equal(stream.values[:, 1], 90 + np.arange(40))
+
+
+@pytest.mark.parametrize(("text", "row"), [
+    # LabVIEW: two headers, and a column of comments that rows lack
+    ("LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\nChannels\t1\n"
+     "***End_of_Header***\t\nX_Value\tForce (N)\tComment\n", "{t:.3f}\t{v:.4f}\n"),
+    # a telephone's decimal commas with exponents
+    ('"Time (s)";"Force (N)"\n', "{t:.6E};{v:.6E}\n")])
+def test_loggers_of_laboratory_and_telephone(tmp_path, text, row):
+    times, values = 0.01 * np.arange(30), np.sin(np.arange(30))
+    rows = "".join(row.format(t=t, v=v) for t, v in zip(times, values, strict=True))
+    path = written(tmp_path, text + (rows.replace(".", ",") if "E" in row else rows))
+    stream = time_stream(read_table(path))
+    assert stream.columns == ("Force (N)",)
+    np.testing.assert_allclose(stream.times, times, atol=1e-9)
+    np.testing.assert_allclose(stream.values[:, 0], values, atol=1e-4)

@@ -46,6 +46,7 @@ TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
 
 _UNITS = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
                                     *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _COUNTERS = r"frames?|samples?|index|framenumber"
 
 
@@ -300,6 +301,9 @@ def _titles(above: list[list[str]], comments: list[str], width: int, separator: 
         fitting = [row for comment in comments
                    if len(row := fields_of(comment, separator)) == width and _is_named(row)]
     if not fitting:
+        # LabVIEW's comment column is mostly empty.
+        fitting = [row[:width] for row in above[-1:] if len(row) > width and _is_named(row[:width])]
+    if not fitting:
         return None
     units = _units(fitting[-1]) if len(fitting) > 1 else None
     if units is None:
@@ -321,7 +325,7 @@ def _units(row: list[str]) -> list[str] | None:
 def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool,
              words: list[int]) -> np.ndarray:
     name, width = table.path.name, len(table.titles)
-    comma = any(re.fullmatch(r"-?\d+,\d+", part) for row in rows[:50] for part in row)
+    comma = any(_DECIMAL_COMMA.fullmatch(part) for row in rows[:50] for part in row)
     kept, bad = [], []
     for index, row in enumerate(rows):
         numbers = [np.nan if k in words else number_of(part, comma) for k, part in enumerate(row)]

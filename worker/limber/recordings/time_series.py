@@ -183,8 +183,8 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
     Each repair adds a sentence to ``warnings``.
 
     Raises:
-        InputError: a tenth or more of the stamps run backwards, or they are closer together, or
-            farther apart, than those of any recorder.
+        InputError: a tenth or more of the stamps run backwards, half or more are not unique, or
+            they are closer together, or farther apart, than those of any recorder.
     """
     finite = np.isfinite(times)
     if not finite.all():
@@ -206,6 +206,11 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
                          f"Recorders take {_SHORTEST_STEP:g} s to {_LONGEST_STEP:g} s.",
                          "Check the column used as time, and its unit.")
     doubled = len(values) - len(first)
+    if 2 * doubled >= len(values) > 1:
+        raise InputError(f"{path}: {doubled} of {len(values)} rows have the time of another row.",
+                         "The clock is too coarse, or several rows belong together.",
+                         "Give times with more digits; of several markers, one row for each time, "
+                         "with columns for each marker.")
     if doubled:
         warnings.append(f"{path.name}: there are {doubled} duplicate time stamps. The first row "
                         "of each was kept.")

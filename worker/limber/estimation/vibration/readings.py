@@ -49,7 +49,7 @@ def ringing_columns(record: Stream) -> Stream:
         raise InputError(f"The record has a reading over {_LARGEST:g}.",
                          "No sensor gives such a number.", "Check the file and its units.")
     changing = [k for k in range(record.values.shape[1])
-                if not _is_counter(record.values[:, k])]
+                if not _is_counter(record.values[:, k]) and not _is_magnitude(record.values, k)]
     if not changing:
         raise InputError(f"No column of the record changes ({', '.join(record.columns)}), but for "
                          "those that only count.", "A vibration goes to and fro.",
@@ -74,6 +74,17 @@ def _is_counter(values: np.ndarray) -> bool:
     """Whether a column is constant, or increases from row to row as a clock does."""
     steps = np.diff(values)
     return not steps.any() or bool((steps > 0).all() or (steps < 0).all())
+
+
+def _is_magnitude(values: np.ndarray, k: int) -> bool:
+    """Whether column ``k`` is the magnitude of the others, as telephones add it.
+
+    It tells nothing more, and rings at twice the frequency.
+    """
+    own, others = values[:, k], np.delete(values, k, axis=1)
+    # Of two equal columns, neither is the magnitude of the other.
+    return bool((others.shape[1] > 1 or (others < 0).any()) and (own >= 0).all() and own.any()
+                and np.abs(own - np.linalg.norm(others, axis=1)).max() < 1e-3 * own.max())
 
 
 def _spectrum(times: np.ndarray, values: np.ndarray) -> _Spectrum:

@@ -12,7 +12,12 @@ _EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
 
 
 def section_of(lines: list[str]) -> list[str]:
-    """Return the lines that are not empty; of a Vicon file only its trajectories."""
+    """Return the lines that are not empty; of a Vicon file only its trajectories, of a LabVIEW file
+    those below its headers.
+    """
+    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
+    if ends:
+        return [line for line in lines[ends[-1] + 1:] if line.strip()]
     begin = next((k for k, line in enumerate(lines)
                   if line.strip('",;\t \ufeff').lower() == "trajectories"), None)
     if begin is None:
