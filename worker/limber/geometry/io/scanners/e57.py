@@ -71,8 +71,9 @@ def read_e57(path: Path) -> Cloud:
     shared = set.intersection(*(scan.attributes for scan in scans))
     cloud = gathered(piece for scan in scans for piece in scan.pieces(shared))
     if not len(cloud):
-        raise InputError(f"None of the points in {path} was seen by the scanner.",
-                         "All of them are marked as invalid.", "Export it again.")
+        raise InputError(f"None of the points in {path} has valid coordinates.",
+                         "All of them are marked as not seen, or are no numbers.",
+                         "Export it again.")
     return replace(cloud, unit="m")
 
 
