@@ -16,6 +16,7 @@ from limber.core.errors import BranchFolderError, InputError
 from limber.core.files.safe_names import FOLLOW_LINKS, inside, relative_name
 from limber.store import Branch, journal
 from limber.store.lock import commit_lock
+from limber.store.manifest import checked_name
 
 OUTSIDE = ["../victim.txt", "../../victim.txt", "pulls/../../victim.txt", "/etc/victim.txt", "..",
            "", ".", "a\\..\\..\\victim.txt", "C:/victim.txt", "C:victim.txt", "pulls/C:victim.txt",
@@ -66,6 +67,16 @@ def test_names_that_lead_out_are_refused(tmp_path, name):
         relative_name(name)
     with pytest.raises(InputError):
         inside(tmp_path, name)
+
+
+@pytest.mark.parametrize("name", [
+    "NUL", "frames/con.pc2", "aux/x", "COM1", "Lpt9 .log", "a.", "frames/a ", "a. /b",
+    "branch.json::$DATA", "branch.json:x", "branch.json.", "Branch.JSON "])
+def test_names_that_mean_another_file_on_windows_are_refused(name):
+    """Devices, hidden streams, and what is the manifest without its last character."""
+    with pytest.raises(InputError):
+        checked_name(name)
+    assert checked_name("consul/auxin.nul") == "consul/auxin.nul"
 
 
 def test_plain_names_are_taken(tmp_path):

@@ -130,7 +130,8 @@ def checked_name(name: str) -> str:
         InputError: it is outside the folder, or is one of the folder's own.
     """
     plain = relative_name(name)
-    if plain.casefold() == MANIFEST or plain.startswith("."):
+    # Windows takes what follows a colon for a stream of the file before it.
+    if plain.casefold().partition(":")[0] == MANIFEST or plain.startswith("."):
         raise InputError(f"{name!r} cannot be used as a file name in a branch folder.",
                          f"{MANIFEST} and names that begin with a dot are reserved.",
                          "Use another name.")

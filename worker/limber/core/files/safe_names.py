@@ -13,7 +13,10 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from limber.core.errors import InputError
 
-_PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_. +-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_. +-]*)*")
+_DEVICE = re.compile(r"(?:^|/)(?:con|prn|aux|nul|conin\$|conout\$|(?:com|lpt)[0-9\xb9\xb2\xb3])"
+                     r"\s*(?:\.[^/]*)?(?:/|$)", re.IGNORECASE)
+"""Names that Windows takes for a device in every folder, whatever follows the dot."""
+_PLAIN = re.compile(r"(?:[A-Za-z0-9_-](?:[A-Za-z0-9_. +-]*[A-Za-z0-9_+-])?(?:/(?!$)|$))+")
 """Names that need no further check: manifests list thousands of them."""
 _MOST_LEVELS = 32
 FOLLOW_LINKS = "LIMBER_FOLLOW_LINKS"
@@ -28,16 +31,21 @@ def relative_name(name: str) -> str:
     Raises:
         InputError: it is absolute, leads upwards, names a drive, or is no valid file name.
     """
-    if _PLAIN.fullmatch(name):
+    is_device = _DEVICE.search(name) is not None
+    if _PLAIN.fullmatch(name) and not is_device:
         return name
     pure = PurePosixPath(name)
     if pure.is_absolute() or PureWindowsPath(name).anchor or "\\" in name:
         why = "It is absolute, or has a backslash or a drive."
     elif any(not part.strip(". ") for part in pure.parts) or not pure.parts:
-        # Windows drops dots and spaces at the end of a name.
         why = "It leads to a parent folder, or does not name a file."
     elif any(PureWindowsPath(part).drive for part in pure.parts):
         why = "Part of it is the name of a drive."
+    elif is_device or ":$" in name:
+        why = "Windows takes a part of it for a device or a hidden stream."
+    elif any(part[-1] in ". " for part in pure.parts):
+        # It would name the file without them.
+        why = "Windows drops dots and spaces at the end of a name."
     elif any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
         why = "It contains control characters, or is not valid Unicode."
     else:
