@@ -70,5 +70,7 @@ def test_a_cut_lets_the_rest_rise_and_swing_faster(lying, axis):
     assert loaded.cut_mass == pytest.approx(DENSITY * SIDE**2 * 0.3, rel=0.05)
     end = np.linalg.norm(lying.mesh.nodes - [0, 0, 0.29], axis=1).argmin()
     assert bent.displacement[end, 0] > 0
-    with pytest.raises(InputError, match="is invalid"):
-        LoadedOutdoors(lying, axis, Outdoors(cuts=((0.5, 0.0, 0.3),)))
+    for place, why in (((0.5, 0.0, 0.3), "500 mm away"), ((0.0, 0.0, -0.5), "500 mm away"),
+                       ((0.0, 0.0, 0.0), "at the base")):
+        with pytest.raises(InputError, match=why):
+            LoadedOutdoors(lying, axis, Outdoors(cuts=(place,)))

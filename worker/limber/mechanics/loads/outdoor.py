@@ -233,10 +233,11 @@ def _beyond(skeleton: Skeleton, cuts: Sequence[tuple[float, float, float]]) -> n
     for place in cuts:
         node = int(np.linalg.norm(skeleton.nodes - np.array(place), axis=1).argmin())
         distance = float(np.linalg.norm(skeleton.nodes[node] - np.array(place)))
-        if node == 0 or distance > max(3 * skeleton.radius[node], 0.02):
+        is_away = distance > max(3 * skeleton.radius[node], 0.02)
+        if node == 0 or is_away:
             raise InputError(f"The cut at {place} m is invalid.",
-                             "It lies at the base." if node == 0 else
-                             f"It is {1e3 * distance:.0f} mm away from the branch.",
+                             f"It is {1e3 * distance:.0f} mm away from the branch." if is_away
+                             else "It lies at the base.",
                              "Give a position on the branch, in its frame [m].")
         gone[node] = True
     for node in range(1, skeleton.node_count):
