@@ -32,7 +32,7 @@ _MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 _COLMAP, _HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
 _COLMAP_TITLES = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-_LINES = 20_000
+LINES_AT_ONCE = 20_000
 """Lines read at a time: numpy holds the interpreter lock meanwhile."""
 _BLOCK = 1 << 20
 """Characters read at a time."""
@@ -67,26 +67,32 @@ class Columns:
     notes: tuple[str, ...] = ()
 
 
-def decoded(raw: bytes) -> str:
-    """Return the text of a file in UTF-8, UTF-16 or, as spreadsheets write it, a Windows code page.
+def coding_of(path: Path) -> str:
+    """Return the coding of a text file: UTF-8, UTF-16 or, as spreadsheets write it, a Windows code
+    page.
     """
-    return raw.decode(_coding_of([raw]), errors="replace")
-
-
-def _coding_of(blocks: Iterable[bytes]) -> str:
-    """The coding of a text in pieces, the first of at least four bytes if there are more."""
     reader = codecs.getincrementaldecoder("utf-8")()
-    for number, block in enumerate(blocks):
-        if number == 0:
-            for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
-                                 (codecs.BOM_UTF16_BE, "utf-16")):
-                if block.startswith(mark):
-                    return coding
+    with open(path, "rb") as stream:
+        start = stream.read(_BLOCK)
+        for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+                             (codecs.BOM_UTF16_BE, "utf-16")):
+            if start.startswith(mark):
+                return coding
         try:
-            reader.decode(block)
+            while start:
+                reader.decode(start)
+                start = stream.read(_BLOCK)
+            reader.decode(b"", final=True)
         except UnicodeDecodeError:
             return "cp1252"
-    return "cp1252" if reader.getstate()[0] else "utf-8"
+    return "utf-8"
+
+
+def lines_of(path: Path, coding: str) -> Iterator[str]:
+    """Yield the lines of a text file, of which a part is held in memory."""
+    with open(path, encoding=coding, errors="replace", newline="") as stream:
+        while block := stream.readlines(_BLOCK):
+            yield from "".join(block).splitlines()
 
 
 def read_columns(path: Path) -> Columns:
@@ -112,8 +118,7 @@ class Table:
 
     def __init__(self, path: Path):
         self._path = path
-        with open(path, "rb") as stream:
-            self._coding = _coding_of(iter(lambda: stream.read(_BLOCK), b""))
+        self._coding = coding_of(path)
         start = "\n".join(itertools.islice(self._lines(), _HEAD))[:_HEAD]
         self._is_colmap = _COLMAP in start or _has_tracks(start)
         sample = list(itertools.islice(self._rows(), _HEAD))
@@ -137,7 +142,7 @@ class Table:
     def pieces(self) -> Iterator[np.ndarray]:
         """Yield the numbers of some lines after the other, shape [n, columns] each."""
         rows = itertools.islice(self._rows(), self._first, None)
-        while piece := list(itertools.islice(rows, _LINES)):
+        while piece := list(itertools.islice(rows, LINES_AT_ONCE)):
             yield self._numbers(piece)
 
     def columns(self, values: np.ndarray) -> Columns:
@@ -152,9 +157,7 @@ class Table:
         return [*(f"index_{k}" for k in range(self._counting)), "x", "y", "z"]
 
     def _lines(self) -> Iterator[str]:
-        with open(self._path, encoding=self._coding, errors="replace", newline="") as stream:
-            while block := stream.readlines(_BLOCK):
-                yield from "".join(block).replace('"', "").splitlines()
+        return (line.replace('"', "") for line in lines_of(self._path, self._coding))
 
     def _rows(self) -> Iterator[str]:
         """Lines without comments and counts of points; COLMAP's without the images of a point,

@@ -89,7 +89,7 @@ def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
         content.write(path)
     for module in (ply, las):
         monkeypatch.setattr(module, "PIECE_POINTS", 700)
-    monkeypatch.setattr(text_columns, "_LINES", 700)
+    monkeypatch.setattr(text_columns, "LINES_AT_ONCE", 700)
     whole = read_points(path)
     np.testing.assert_allclose(whole.points, points, atol=1e-6)
     np.testing.assert_array_equal(whole.attributes["intensity"], intensity)
@@ -107,7 +107,7 @@ def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
 
 def test_a_text_is_held_in_parts(tmp_path, monkeypatch):
     """Rows with a missing value, a count before each scan and comments may come in any part."""
-    monkeypatch.setattr(text_columns, "_LINES", 1000)
+    monkeypatch.setattr(text_columns, "LINES_AT_ONCE", 1000)
     monkeypatch.setattr(text_columns, "_BLOCK", 10_000)
     path, rows = tmp_path / "a.txt", [f"{k} {k / 7:.6f} {-k} 5" for k in range(30_000)]
     rows[15_000] = "15000 NA -15000 5"

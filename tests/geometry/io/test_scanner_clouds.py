@@ -10,6 +10,7 @@ from limber.core.errors import InputError
 from limber.geometry.cloud.gathering import gathered
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.scanners import e57 as e57_module
+from limber.geometry.io.scanners import ptx as ptx_module
 from limber.geometry.io.scanners.e57 import checksums
 
 RNG = np.random.default_rng(5)
@@ -39,6 +40,25 @@ def test_ptx(tmp_path, colour, silent):
     np.testing.assert_allclose(cloud.points, np.vstack([POINTS, POINTS]), atol=1e-7)
     assert cloud.unit == "m" and cloud.not_finite == 2 * silent
     assert cloud.attributes["intensity"][0] == 0.25 and ("color" in cloud.attributes) == colour
+
+
+def test_ptx_in_pieces(tmp_path, monkeypatch):
+    """Pieces end within scans; a part of the points is kept; a row may not change its width."""
+    ptx(tmp_path / "a.ptx", colour=True, silent=7)
+    whole = read_points(tmp_path / "a.ptx")
+    monkeypatch.setattr(ptx_module, "LINES_AT_ONCE", 8)
+    pieces = read_points(tmp_path / "a.ptx")
+    np.testing.assert_array_equal(pieces.points, whole.points)
+    np.testing.assert_array_equal(pieces.attributes["color"], whole.attributes["color"])
+    assert pieces.not_finite == 14
+    monkeypatch.setattr(ptx_module, "gathered", lambda pieces: gathered(pieces, 30))
+    some = read_points(tmp_path / "a.ptx")
+    assert len(some) <= 30 and some.left_out == len(whole) - len(some) and some.unit == "m"
+    lines = (tmp_path / "a.ptx").read_text().splitlines()
+    lines[10 + 16:10 + 24] = [line.rsplit(" ", 1)[0] for line in lines[10 + 16:10 + 24]]
+    (tmp_path / "a.ptx").write_text("\n".join(lines))
+    with pytest.raises(InputError, match="6 columns instead of 7"):
+        read_points(tmp_path / "a.ptx")
 
 
 @pytest.mark.parametrize("text", [None, "3\n1\n0 0 0\n", "1 2 3\n4 5 6\n"])
