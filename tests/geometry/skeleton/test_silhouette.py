@@ -1,5 +1,7 @@
 """A skeleton against the image that it came from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,18 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.single_view import View
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
-from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.radii.silhouette import (
+    within_silhouette,
+    without_edges,
+    without_hidden_twigs,
+)
+from limber.geometry.skeleton.skeleton import (
+    INTERPOLATED,
+    LIMITED,
+    MEASURED,
+    UNRESOLVED,
+    Skeleton,
+)
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.stages.shape.reconstruct import reconstruct
 
@@ -96,3 +108,18 @@ def test_a_skeleton_without_thickness_or_of_another_unit_is_refused(tmp_path):
                             scale * thick * truth.radius).write_swc(path)
         with pytest.raises(InputError, match=complaint):
             reconstruct(tmp_path / "cloud.ply", tmp_path / "a.branch", skeleton_path=path)
+
+
+def test_edges_take_a_quarter_pixel_from_measured_radii():
+    """A radius from elsewhere stays; none is more than halved."""
+    truth = generate_branch(81, length=0.6, fork_count=1).skeleton
+    state = np.where(truth.branch == 0, MEASURED, INTERPOLATED).astype(np.int8)
+    truth = replace(truth, radius_state=state)
+    view = View(np.array([1.0, 0.0, 0.3]), 0.002)
+    less = without_edges(truth, view)
+    pixel = 0.002 * np.linalg.norm(truth.nodes - view.eye, axis=1)
+    measured = state == MEASURED
+    assert less.radius[measured] == pytest.approx((truth.radius - 0.25 * pixel)[measured])
+    assert (less.radius == truth.radius)[~measured].all()
+    coarse = without_edges(truth, View(view.eye, 1.0))
+    assert (coarse.radius[measured] == truth.radius[measured] / 2).all()

@@ -34,7 +34,11 @@ from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, edited
 from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.radii.silhouette import (
+    within_silhouette,
+    without_edges,
+    without_hidden_twigs,
+)
 from limber.geometry.skeleton.search_result import SkeletonResult, given_skeleton
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -310,9 +314,8 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
         reach: ``silhouette_reach`` of the settings.
     """
     skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
-    skeleton, limited = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
-    if not (dropped or limited):
-        return replace(found, skeleton=skeleton), ""
+    skeleton = without_edges(skeleton, prepared.view)
+    skeleton, _ = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
     text = ""
     if dropped:

@@ -11,13 +11,16 @@ import numpy as np
 
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, MEASURED, UNRESOLVED, Skeleton
 
 _ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouette tells the width
 _WINDOW = 3  # nodes to each side whose silhouette is taken together
 _SLACK = 1.2  # times as thick as its silhouette a branch may be
 _LEAST = 8  # pixels that make a silhouette
 _WIDE = 0.35  # of a radius that a silhouette tells: leaves and crossing branches are in it too
+# Pixels that a silhouette is wider to each side: images that assign a pixel to the branch if any
+# part of it is on the branch are half a pixel wider, those that decide by its middle are not.
+_FATTER = 0.25
 _EDGE = 0.3  # pixels that a radius may be off, whatever its fit says: each edge is known to one
 
 
@@ -51,6 +54,18 @@ def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
             dropped.append({"length": _length(skeleton.nodes[members]),
                             "at": skeleton.nodes[members[-1]]})
     return (skeleton.subset(keep), dropped) if dropped else (skeleton, [])
+
+
+def without_edges(skeleton: Skeleton, view: View) -> Skeleton:
+    """Return the skeleton with radii of whole silhouettes less what their edges may have added.
+
+    Args:
+        skeleton: With radii by the width of its points across the sight.
+        view: The camera's view of the cloud.
+    """
+    pixel = view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
+    added = np.where(skeleton.radius_state == MEASURED, _FATTER * pixel, 0.0)
+    return replace(skeleton, radius=np.maximum(skeleton.radius - added, 0.5 * skeleton.radius))
 
 
 def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
@@ -91,9 +106,7 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
             # position.
             cap = _SLACK * half + pixels
             if state[node] == UNRESOLVED:
-                # Images that assign a pixel to the branch if any part of it is on the branch are
-                # half a pixel wider to each side; those that decide by its middle are not.
-                radius[node] = max(half - 0.25 * pixels, 0.25 * pixels)
+                radius[node] = max(half - _FATTER * pixels, _FATTER * pixels)
                 sigma[node] = max(_WIDE * radius[node], 0.5 * pixels)
             elif radius[node] > cap:
                 radius[node], state[node] = cap, LIMITED

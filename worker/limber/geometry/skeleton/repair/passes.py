@@ -11,6 +11,7 @@ from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.cylinders import point_counts
+from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
 from limber.geometry.skeleton.repair.backwards import without_backward_starts
 from limber.geometry.skeleton.repair.ends import ends_within, with_full_tips, without_bare_ends
@@ -45,6 +46,7 @@ class Repaired:
         radius_limits: Least and largest radius [m].
         prune: A twig is kept if it extends this many radii of its parent beyond the parent.
         camera: The points are a depth camera's.
+        rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
         pinched: Start of the first fit, where only one side of wood was seen: it may make a stem
             far too thin.
@@ -58,6 +60,7 @@ class Repaired:
     radius_limits: tuple[float, float]
     prune: float
     camera: bool = False
+    rays: bool = False
     fit: AxisFit | None = None
     pinched: Skeleton | None = None
     strands: int = 0
@@ -71,6 +74,8 @@ class Repaired:
     def fitted(self, first: Skeleton, **how: Any) -> "Repaired":
         """The same after a fit that starts from ``first``."""
         fit = fit_axes(first, self.points, along_sight=self.camera, progress=self.progress, **how)
+        if self.rays:
+            fit = fit_of_rays(fit, self.points, certain=True) or fit
         return replace(self, fit=fit, skeleton=fit.skeleton)
 
     @property
@@ -110,6 +115,9 @@ class Pass:
 
 def _fit_coarsely(now: Repaired) -> Repaired:
     after = now.fitted(resampled(now.skeleton, _COARSE), uncertainty=False)
+    by_rays = fit_of_rays(after.last_fit, now.points, certain=now.camera)
+    if by_rays is not None:
+        return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
     # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
     may_be = after.last_fit.seen.one_sided and after.beside <= LEAF_SHARE
     return replace(after, pinched=now.skeleton if may_be else None)

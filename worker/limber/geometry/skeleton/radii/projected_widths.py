@@ -1,0 +1,193 @@
+"""Axes and radii of branches that one sensor saw, from their width across its sight.
+
+A scanner's or a camera's rays are evenly spaced, and their readings err along the ray. So points
+lie evenly across a branch as the sensor saw it, from edge to edge, however far their ranges are
+off. The edges show its radius and its middle; ranges only show its depth. A circle fitted to such
+points by their distance from it comes out up to half too thin.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from limber.geometry.skeleton.radii.cylinders import on_cylinders
+from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
+from limber.geometry.skeleton.sweep import arc_lengths, tangents
+
+_ROUNDS = 4
+_NEAR = 30  # points to each side along the axis, whose spread is one width, at least
+_LONG, _REACH = 2.0, 8.0  # radii to each side, at least and at most
+_LEAST = 8  # points that make a width
+# Fraction of the points beyond each edge of what is measured: stray ones are there, and a quantile
+# of so many is known to half the radius over the square root of their number.
+_TAIL, _QUANTILE_SIGMA = 0.1, 0.5
+_ASIDE = 0.5  # sine of the angle between axis and sight, from which a width shows
+_BESIDE = 3.0  # radii across, from which a point belongs to something else
+_PRIOR = 0.03  # weight of the mean normal as the sight, against that of all points
+_HALF_CIRCLE = np.pi / 4  # length of the mean normal of points evenly spread across
+
+
+@dataclass(frozen=True)
+class SightField:
+    """Directions towards one sensor: ``towards - nearer * (place - middle)``, made unit vectors.
+
+    Attributes:
+        towards: At the middle, shape [3].
+        nearer: Inverse of the sensor's distance [1/m].
+        middle: [m], shape [3].
+    """
+
+    towards: np.ndarray
+    nearer: float
+    middle: np.ndarray
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """Unit vectors towards the sensor at places [m], shape [n, 3]."""
+        way = self.towards - self.nearer * (places - self.middle)
+        return way / np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
+
+
+def sight_field(skeleton: Skeleton, points: np.ndarray) -> SightField:
+    """Where one sensor stood, from the sides of the branches that have points.
+
+    Across each axis, the mean normal of its points points to the sensor.
+    """
+    _, high, _, offset = on_cylinders(skeleton, points)
+    axis = _axes(skeleton)
+    size = np.linalg.norm(offset, axis=1)
+    near = size < _BESIDE * skeleton.radius[high]
+    out = offset[near] / np.maximum(size[near], 1e-300)[:, None]
+    count = np.bincount(high[near], minlength=skeleton.node_count)
+    used = np.flatnonzero(count >= _LEAST)
+    mean = np.stack([np.bincount(high[near], column, skeleton.node_count) for column in out.T],
+                    axis=1)[used] / _HALF_CIRCLE
+    across = np.eye(3) - axis[used][:, :, None] * axis[used][:, None, :]
+    middle = points.mean(axis=0)
+    offset = np.einsum("nij,nj->ni", across, skeleton.nodes[used] - middle)
+    system = np.concatenate([across * count[used, None, None],
+                             -(count[used, None] * offset)[:, :, None]], axis=2).reshape(-1, 4)
+    normal = system.T @ system
+    scale = np.trace(normal[:3, :3]) / 3
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    # A direction along all axes does not show, nor does the distance of a far sensor.
+    held = _PRIOR * scale * np.array([1, 1, 1, extent**2])
+    expected = np.append(mean.sum(axis=0) / max(float(np.linalg.norm(mean.sum(axis=0))), 1e-300), 0)
+    found = np.linalg.solve(normal + np.diag(held), system.T @ mean.reshape(-1) + held * expected)
+    size = max(float(np.linalg.norm(found[:3])), 1e-300)
+    return SightField(found[:3] / size, float(max(found[3], 0.0)) / size, middle)
+
+
+def by_projected_widths(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, SightField]:
+    """Return the skeleton with axes and radii by the width of its points, and the sight.
+
+    Args:
+        skeleton: Fitted by the distances of the points.
+        points: The scan [m], shape [m, 3].
+    """
+    field = sight_field(skeleton, points)
+    for _ in range(_ROUNDS):
+        skeleton = _moved(skeleton, points, field)
+        field = sight_field(skeleton, points)
+    return skeleton, field
+
+
+def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleton:
+    """One round: each run by the points that are nearest to it."""
+    low, high, share, offset = on_cylinders(skeleton, points)
+    axis = _axes(skeleton)
+    beside, depth, aside = _across_sight(offset, axis[high], field.at(points))
+    good = (aside > _ASIDE) & (np.abs(beside) < _BESIDE * skeleton.radius[high])
+    nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
+    sigma, state = skeleton.radius_sigma.copy(), skeleton.radius_state.copy()
+    branch = skeleton.branch[high]
+    for run, (members, own) in enumerate(zip(skeleton.runs(), skeleton.own_runs(), strict=True)):
+        along = arc_lengths(skeleton.nodes[members])
+        place = np.zeros(skeleton.node_count)
+        place[members] = along
+        inside = np.flatnonzero(good & (branch == run))
+        if len(inside) < _LEAST:
+            continue
+        at = place[low[inside]] + share[inside] * (place[high[inside]] - place[low[inside]])
+        inside = inside[np.argsort(at, kind="stable")]
+        at = np.sort(at, kind="stable")
+        told = np.array([_width(at, beside[inside], depth[inside], here, thick)
+                         for here, thick in zip(along[-len(own):], skeleton.radius[own],
+                                                strict=True)])
+        known = np.isfinite(told[:, 0])
+        if not known.any():
+            continue
+        # Gaps are filled; beyond the first and the last place nothing is known.
+        within = slice(int(np.argmax(known)), len(known) - int(np.argmax(known[::-1])))
+        own, here, known = own[within], along[-len(own):][within], known[within]
+        told = np.stack([np.interp(here, here[known], column[within][known]) for column in told.T],
+                        axis=1)
+        sight = field.at(skeleton.nodes[own])
+        side = np.cross(axis[own], sight)
+        side /= np.maximum(np.linalg.norm(side, axis=1), 1e-300)[:, None]
+        nodes[own] += told[:, 1:2] * side + told[:, 2:3] * np.cross(side, axis[own])
+        radius[own], sigma[own] = told[:, 0], told[:, 3]
+        state[own] = np.where(known, MEASURED, INTERPOLATED)
+    return replace(skeleton, nodes=nodes, radius=radius, radius_sigma=sigma, radius_state=state)
+
+
+def cross_sections(skeleton: Skeleton, points: np.ndarray, field: SightField,
+                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each point's offset across the sight and towards the sensor [m], and the radius there [m].
+
+    Points of branches that point to the sensor have NaN.
+    """
+    _, high, _, offset = on_cylinders(skeleton, points)
+    beside, depth, aside = _across_sight(offset, _axes(skeleton)[high], field.at(points))
+    hidden = aside <= _ASIDE
+    return (np.where(hidden, np.nan, beside), np.where(hidden, np.nan, depth),
+            skeleton.radius[high])
+
+
+def _across_sight(offset: np.ndarray, axis: np.ndarray, towards: np.ndarray,
+                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets from the axis across the sight and towards the sensor, and the sine between axis
+    and sight, shape [m] each."""
+    across = np.cross(axis, towards)
+    aside = np.linalg.norm(across, axis=1)
+    across /= np.maximum(aside, 1e-300)[:, None]
+    return (np.einsum("ij,ij->i", offset, across),
+            np.einsum("ij,ij->i", offset, np.cross(across, axis)), aside)
+
+
+def _width(at: np.ndarray, beside: np.ndarray, depth: np.ndarray, here: float, thick: float,
+           ) -> tuple[float, float, float, float]:
+    """Radius, shift across and shift in depth at one place, and the radius's deviation [m].
+
+    Args:
+        at: Places of a run's points along it [m], ascending, shape [m].
+        beside: Their offsets from the axis across the sight [m], shape [m].
+        depth: Their offsets towards the sensor [m], shape [m].
+        here: The place [m].
+        thick: The radius so far [m].
+    """
+    middle, (least, most) = int(np.searchsorted(at, here)), (
+        np.searchsorted(at, [here - way * thick, here + way * thick]) for way in (_LONG, _REACH))
+    near = slice(max(min(middle - _NEAR, least[0]), most[0]),
+                 min(max(middle + _NEAR, least[1]), most[1]))
+    if near.stop - near.start < _LEAST:
+        return np.nan, 0.0, 0.0, 0.0
+    way, side = at[near] - here, beside[near]
+    centred = way - way.mean()
+    slope = float(centred @ side) / max(float(centred @ centred), 1e-300)
+    side = side - slope * way
+    first, last = np.quantile(side, [_TAIL, 1 - _TAIL])
+    count = len(side)
+    # Expected ranks of a sample's quantiles are nearer to its middle, by (n - 1) / (n + 1).
+    radius = float(last - first) / (2 * (1 - 2 * _TAIL)) * (count + 1) / (count - 1)
+    shift = float(first + last) / 2
+    rise = np.sqrt(np.maximum(radius**2 - (side - shift)**2, 0.0))
+    return (radius, shift, float(np.median(depth[near] - rise)),
+            _QUANTILE_SIGMA * radius / np.sqrt(count))
+
+
+def _axes(skeleton: Skeleton) -> np.ndarray:
+    """Unit vector along the axis at each node, shape [n, 3]."""
+    axis = np.zeros_like(skeleton.nodes)
+    for members, own in zip(skeleton.runs(), skeleton.own_runs(), strict=True):
+        axis[own] = tangents(skeleton.nodes[members])[-len(own):]
+    return axis
