@@ -7,6 +7,7 @@ from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import sides_seen
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
+from limber.geometry.skeleton.radii.shared_errors import shared_error
 from limber.geometry.skeleton.radii.sides_seen import side_told, side_uncertainty
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -66,3 +67,19 @@ def test_radii_of_one_side_are_not_too_thick(seed: int) -> None:
     case = one_sided_case(seed)
     volume = cylinder_volume(seen_part(case.truth, case.points))
     assert cylinder_volume(skeletonise(case.points).skeleton) == pytest.approx(volume, rel=0.03)
+
+
+@pytest.mark.parametrize(("shift", "error"), [(0.0, 0.0), (0.0006, 0.0004)])
+def test_errors_that_patches_share(shift: float, error: float) -> None:
+    """Independent errors share none; a second station ``shift`` [m] aside shows in its sides."""
+    rng = np.random.default_rng(8)
+    angle, height = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(0, 0.5, 6000)
+    points = np.stack([0.008 * np.cos(angle), 0.008 * np.sin(angle), height], axis=1)
+    points += rng.normal(0, 0.0006, points.shape)
+    points[:, 1] += shift * np.sign(np.sin(2 * angle))
+    stem = np.stack([np.zeros(80), np.zeros(80), np.linspace(0, 0.5, 80)], axis=1)
+    skeleton = Skeleton.from_edges(stem, np.arange(-1, 79), np.full(80, 0.008))
+    assert shared_error(skeleton, points, 0.0006) == pytest.approx(error, abs=0.00012)
+    # Where noise blurs the ring, the means of its patches tell nothing.
+    assert shared_error(skeleton, points, 0.002) == 0.0
+    assert shared_error(skeleton, points[:40], 0.0006) == 0.0

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.doubtful_parts import start_angle
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.shared_errors import shared_error
 from limber.geometry.skeleton.radii.unresolved import SPACINGS, point_spacing, weighed
 from limber.geometry.skeleton.skeleton import BRIDGED, STATES, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import stretches
@@ -36,7 +37,10 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
         noise: Standard deviation of the points [m].
     """
     spacing, count = _shown(skeleton, points, noise)
-    told = weighed(skeleton, spacing, noise)
+    # A quarter of a circle is off together; the four average.
+    shared = shared_error(skeleton, points, noise) / 2
+    told = weighed(replace(skeleton, radius_sigma=np.hypot(skeleton.radius_sigma, shared)),
+                   spacing, noise)
     gap = _gaps(told, count, spacing)
     sigma = np.where(gap > 0, np.maximum(told.radius_sigma, _BRIDGED_SIGMA * told.radius),
                      told.radius_sigma)
