@@ -102,3 +102,12 @@ def test_a_run_without_points_keeps_its_radius() -> None:
     assert np.isfinite(found.nodes).all() and (found.radius > 0).all()
     assert (found.radius_state[found.branch == 0] == MEASURED).mean() > 0.9
     assert found.radius[bare] == pytest.approx(start.radius[bare])
+
+
+def test_widths_that_show_nothing_change_little() -> None:
+    """Points on the axis have no width, and far too few no sensor: no radius vanishes."""
+    start = _axes(0.0)
+    line = start.nodes[np.repeat(np.arange(40), 20)]
+    for points in (line, line[:3] + [0.001, 0, 0]):
+        found, _ = by_projected_widths(start, points)
+        assert (found.radius >= start.radius / 3.001).all() and np.isfinite(found.nodes).all()

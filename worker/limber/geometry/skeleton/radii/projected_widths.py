@@ -23,6 +23,7 @@ _LEAST = 8  # points that make a width
 _TAIL, _QUANTILE_SIGMA = 0.1, 0.5
 _ASIDE = 0.5  # sine of the angle between axis and sight, from which a width shows
 _BESIDE = 3.0  # radii across, from which a point belongs to something else
+_CHANGE = 3.0  # times a radius of the fit by distances, and of these that its axis may move
 _PRIOR = 0.03  # weight of the mean normal as the sight, against that of all points
 _HALF_CIRCLE = np.pi / 4  # length of the mean normal of points evenly spread across
 
@@ -67,7 +68,7 @@ def sight_field(skeleton: Skeleton, points: np.ndarray) -> SightField:
     system = np.concatenate([across * count[used, None, None],
                              -(count[used, None] * offset)[:, :, None]], axis=2).reshape(-1, 4)
     normal = system.T @ system
-    scale = np.trace(normal[:3, :3]) / 3
+    scale = max(float(np.trace(normal[:3, :3])) / 3, 1e-12)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     # A direction along all axes does not show, nor does the distance of a far sensor.
     held = _PRIOR * scale * np.array([1, 1, 1, extent**2])
@@ -84,11 +85,20 @@ def by_projected_widths(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleto
         skeleton: Fitted by the distances of the points.
         points: The scan [m], shape [m, 3].
     """
-    field = sight_field(skeleton, points)
+    field, start = sight_field(skeleton, points), skeleton
     for _ in range(_ROUNDS):
-        skeleton = _moved(skeleton, points, field)
+        skeleton = _near(start, _moved(skeleton, points, field))
         field = sight_field(skeleton, points)
     return skeleton, field
+
+
+def _near(start: Skeleton, moved: Skeleton) -> Skeleton:
+    """Limit what widths may change: those of crossing branches, or of few points, show nothing."""
+    radius = np.clip(moved.radius, start.radius / _CHANGE, start.radius * _CHANGE)
+    shift = moved.nodes - start.nodes
+    size = np.linalg.norm(shift, axis=1)
+    shift *= np.minimum(1.0, _CHANGE * start.radius / np.maximum(size, 1e-300))[:, None]
+    return replace(moved, nodes=start.nodes + shift, radius=radius)
 
 
 def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleton:
