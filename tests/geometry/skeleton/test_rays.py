@@ -28,7 +28,7 @@ def _rays(rng: np.random.Generator) -> np.ndarray:
     for start, end in (([0, 0, 0], [0, 0, _LENGTH]), ([0, 0, 0.2542], [0, 0.16, 0.3742])):
         start, end = np.array(start, float), np.array(end, float)
         length = np.linalg.norm(end - start)
-        count = int(2 * _RADIUS * length / 0.0015**2)
+        count = int(2 * _RADIUS * length / 0.0018**2)
         foot = start + rng.uniform(0, 1, count)[:, None] * (end - start)
         axis = (end - start) / length
         sight = _EYE - foot
@@ -45,7 +45,7 @@ def _rays(rng: np.random.Generator) -> np.ndarray:
 
 def _skin(rng: np.random.Generator, half: float) -> np.ndarray:
     """Evenly over the skin, up to ``half`` [rad] from the sight, with errors in all directions."""
-    angle, height = rng.uniform(-half, half, 3000), rng.uniform(0, _LENGTH, 3000)
+    angle, height = rng.uniform(-half, half, 2000), rng.uniform(0, _LENGTH, 2000)
     points = np.stack([_RADIUS * np.cos(angle), _RADIUS * np.sin(angle), height], axis=1)
     return points + rng.normal(0, _NOISE, points.shape)
 

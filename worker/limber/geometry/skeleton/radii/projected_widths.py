@@ -14,7 +14,7 @@ from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, tangents
 
-_ROUNDS = 4
+_ROUNDS = 3
 _NEAR = 30  # points to each side along the axis, whose spread is one width, at least
 _LONG, _REACH = 2.0, 8.0  # radii to each side, at least and at most
 _LEAST = 8  # points that make a width
@@ -69,7 +69,7 @@ def sight_field(skeleton: Skeleton, points: np.ndarray) -> SightField:
                              -(count[used, None] * offset)[:, :, None]], axis=2).reshape(-1, 4)
     normal = system.T @ system
     scale = max(float(np.trace(normal[:3, :3])) / 3, 1e-12)
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    extent = max(float(np.linalg.norm(np.ptp(skeleton.nodes, axis=0))), 1e-12)
     # A direction along all axes does not show, nor does the distance of a far sensor.
     held = _PRIOR * scale * np.array([1, 1, 1, extent**2])
     expected = np.append(mean.sum(axis=0) / max(float(np.linalg.norm(mean.sum(axis=0))), 1e-300), 0)
@@ -185,13 +185,15 @@ def _width(at: np.ndarray, beside: np.ndarray, depth: np.ndarray, here: float, t
     centred = way - way.mean()
     slope = float(centred @ side) / max(float(centred @ centred), 1e-300)
     side = side - slope * way
-    first, last = np.quantile(side, [_TAIL, 1 - _TAIL])
     count = len(side)
-    # Expected ranks of a sample's quantiles are nearer to its middle, by (n - 1) / (n + 1).
-    radius = float(last - first) / (2 * (1 - 2 * _TAIL)) * (count + 1) / (count - 1)
+    rank = int(_TAIL * count)
+    ordered = np.sort(side)
+    first, last = ordered[rank], ordered[count - 1 - rank]
+    # Of n even places, the k-th and the k-th last are (n + 1 - 2 k) / (n + 1) of the width apart.
+    radius = float(last - first) / 2 * (count + 1) / (count - 1 - 2 * rank)
     shift = float(first + last) / 2
     rise = np.sqrt(np.maximum(radius**2 - (side - shift)**2, 0.0))
-    return (radius, shift, float(np.median(depth[near] - rise)),
+    return (radius, shift, float(np.sort(depth[near] - rise)[count // 2]),
             _QUANTILE_SIGMA * radius / np.sqrt(count))
 
 
