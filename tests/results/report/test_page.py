@@ -19,6 +19,7 @@ from limber.results.report.report_tables import (
     deviation_rows,
     held_out_rows,
     held_sentence,
+    leg_rows,
     modulus_rows,
 )
 from limber.results.scene.graphs import young_graph
@@ -116,6 +117,19 @@ def test_tables_without_truth_or_numbers():
                     ["1", "2", "1 to 4"], ["2", "3", "undetermined"]]
     plan = {"baseline": {"length_m": 0.5, "peak_force_n": None}, "plan": {"length_m": 0.55}}
     assert comparison_rows(plan)[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
+
+
+def test_the_legs_of_a_motion_stand_in_order():
+    """Where the gripper stands there is neither way nor speed; what is not known stays empty."""
+    path = {"name": "path", "start_s": 4.0, "duration_s": 12.25, "length_m": 0.2,
+            "peak_speed_m_s": 0.02, "peak_force_n": 1.234, "obstacle_distance_m": 0.1,
+            "branch_distance_m": -0.004}
+    hold = {"name": "hold", "start_s": 16.2, "duration_s": 2.0, "length_m": 0.0,
+            "peak_speed_m_s": 0.0, "peak_force_n": 1.2}
+    assert leg_rows([path, hold])[1:] == [
+        ["path", "4.0", "12.2", "200", "20", "1.23", "100", "-4"],
+        ["hold", "16.2", "2.0", "", "", "1.2", "", ""]]
+    assert leg_rows([]) == []
 
 
 def test_a_known_truth_tells_how_far_the_intervals_held():

@@ -120,7 +120,10 @@ def test_goal_path_and_motion(tmp_path, mesh):
 def test_paths_are_called_as_in_the_report(tmp_path, mesh):
     """Gentle and shortest, whichever planner found them; where both are one, that is said."""
     plan = _plan({}, [[0.0, 0.0, 0.3], [0.1, 0.0, 0.3]])
-    summary = json.loads(plan["plans/p.json"]) | {"length_added_percent": 0.0}
+    leg = dict.fromkeys(("start_s", "length_m", "peak_speed_m_s", "peak_force_n",
+                         "peak_torque_nm"), 0.0)
+    summary = json.loads(plan["plans/p.json"]) | {"length_added_percent": 0.0, "legs": [
+        leg | {"name": "path", "duration_s": 12.0}, leg | {"name": "hold", "duration_s": 2.0}]}
     plan |= {"plans/p-baseline.csv": plan["plans/p.csv"]}
     strength = {"median_strain": 0.006, "source": "green wood, assumed"}
     for saved, note in ((3.0, "energy -3 %, length +0 % against the shortest path"),
@@ -132,7 +135,7 @@ def test_paths_are_called_as_in_the_report(tmp_path, mesh):
                                   plan__p=plan | {"plans/p.json": told})).info
         assert {key: about["title"] for key, about in info["paths"].items()} == {
             "plan": "gentle", "baseline": "shortest"}
-        assert note in info["notes"]
+        assert note in info["notes"] and "motion: path 12 s, hold 2 s" in info["notes"]
         assert ("strain, shortest: over the 0.6 % at which half of such branches break (green "
                 "wood, assumed)") in info["notes"]
 
