@@ -104,6 +104,16 @@ def test_large_goals_are_aimed_at_from_the_near_side(field, small_model):
     assert away.min() <= 1.02 * np.linalg.norm(inside - start, axis=1).min()
 
 
+def test_a_region_that_no_draw_comes_near_is_found_from_the_samples(field, monkeypatch):
+    """The tip of a state of the full model is reachable, however small the region about it."""
+    monkeypatch.setattr(TargetGoal, "_walked", lambda self, field, points, generator: points)
+    inner = field.samples.positions[field.region.contains(field.samples.positions)]
+    tip = field.tip(inner[[5]])[0]
+    goal = TargetGoal(Ball(tuple(map(float, tip)), 1e-5))
+    assert np.allclose(goal_points(goal, field, field.limited(), count=20), inner[5], atol=1e-3)
+    assert np.linalg.norm(goal.centre(field) - inner[5]) < 1e-3
+
+
 def test_walking_into_a_large_region_stays_among_the_samples(field):
     """Poses outside it step to its border, not to places far beyond the branch's reach."""
     rest = field.tip(field.rest[None])[0]
