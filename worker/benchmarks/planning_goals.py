@@ -59,7 +59,8 @@ class RegionGoal:
 def run_region_goal(model: GraspModel, known: EnergyField, number: int, seed: int, **whose: str,
                     ) -> RegionGoal:
     """Draw a goal of a kind, plan to it from outside, and try one out of reach."""
-    kind = _KINDS[number % len(_KINDS)]
+    # Seeds of six branches at one number, and of six numbers on one branch, give every kind.
+    kind = _KINDS[seed % len(_KINDS)]
     found = RegionGoal(number, seed=seed, kind=str(kind), **whose)
     generator = np.random.default_rng([seed, number])
     try:
