@@ -174,7 +174,7 @@ class PlanLeg(_Told):
 
     name: str
     start_s: float = Field(ge=0)
-    duration_s: float = Field(ge=0)
+    duration_s: float = Field(ge=0, le=1e5)
     length_m: float = Field(ge=0)
     peak_speed_m_s: float = Field(ge=0)
     peak_force_n: float = Field(ge=0)
