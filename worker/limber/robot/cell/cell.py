@@ -125,8 +125,10 @@ class ApproachEntry(_Entry):
 class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
-    kind: Literal["controller", "ft300", "replay", "none"] = Field(
-        "controller", description="replay reads a file and works only with the virtual robot.")
+    kind: Literal["controller", "ft300", "ft300_usb", "replay", "none"] = Field(
+        "controller", description="ft300: by its URCap's stream. ft300_usb: by Modbus on device. "
+        "replay reads a file and works only with the virtual robot.")
+    device: str | None = Field(None, description="Serial line of kind = \"ft300_usb\".")
     file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
                              "sensor's frame.")
     pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's frame.")
@@ -140,6 +142,8 @@ class SensorEntry(_Entry):
     def _has_its_file(self) -> "SensorEntry":
         if (self.kind == "replay") != (self.file is not None):
             raise ValueError("file is the CSV of kind = \"replay\", and is allowed only with it")
+        if self.kind == "ft300_usb" and self.device is None:
+            raise ValueError("device, the serial line of kind = \"ft300_usb\", is missing")
         return self
 
 

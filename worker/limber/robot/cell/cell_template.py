@@ -15,7 +15,7 @@ _EXAMPLES: dict[str, Any] = {
                         "radius_m": 0.04}]},
     "robot": {"version": "5.11.6", "joint_limits_rad": [[-3.1, 3.1]] * 6},
     "base": {"residual_m": 0.001},
-    "sensor": {"file": "forces.csv"},
+    "sensor": {"file": "forces.csv", "device": "/dev/ttyUSB0"},
     "limits": {"contact_n_per_m": 20000.0},
     "camera": {"pose": [0.0, -1.0, 0.5, -1.57, 0.0, 0.0]},
     "second_arm": {"model": "ur5e", "base_pose": [0.6, 0.6, 0.0, 0.0, 0.0, 0.0]},

@@ -21,6 +21,7 @@ from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, inverse_of, turned_wrench, weight_wrench
 from limber.robot.cell.cell import Cell
 from limber.robot.interface import Sample
+from limber.robot.ur.ft300_modbus import Ft300Line
 
 FT300_PORT = 63351
 INDEPENDENT_READINGS = 2
@@ -131,6 +132,34 @@ class Ft300Sensor:
         self._socket.close()
 
 
+class Ft300UsbSensor:
+    """A Robotiq FT300 by Modbus over its USB converter: about 70 readings a second.
+
+    Raises:
+        LimberError: as :class:`.Ft300Line`.
+    """
+
+    connections = ()
+
+    def __init__(self, cell: Cell):
+        self._frame = frame_of(np.array(cell.sensor.pose))
+        assert cell.sensor.device is not None
+        self._line = Ft300Line(cell.sensor.device)
+        self._last = np.full(6, np.nan)
+        self._arrived = time.monotonic()
+
+    def read(self, sample: Sample) -> Reading:
+        found = self._line.poll()
+        if found is not None:
+            self._last, self._arrived = found, time.monotonic()
+        frame = self._frame
+        return Reading(turned_wrench(frame[:3, :3], self._last, frame[:3, 3]),
+                       time.monotonic() - self._arrived, self._last)
+
+    def close(self) -> None:
+        self._line.close()
+
+
 class ReplayedSensor:
     """Readings from a CSV file: ``t_s`` and six columns, in the sensor's frame.
 
@@ -183,6 +212,8 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
         raise InputError("The cell file names no force sensor.",
                          "The guard does not move a branch that it cannot feel.",
                          "Set sensor.kind to ft300 or controller.")
+    if cell.sensor.kind == "ft300_usb":
+        return Ft300UsbSensor(cell)
     if cell.sensor.kind == "ft300":
         return Ft300Sensor(cell)
     if not cell.arm.measures_force:

@@ -12,7 +12,7 @@ OVER_HARD = 1.1
 # of the controller. Measured with the virtual one: 4 ms at 500 Hz, 14 ms at 125 Hz.
 _LOOP_SECONDS = 0.002
 _STEPS = 2.0
-_FT300_SECONDS = 0.010  # between two of its readings
+_FT300_SECONDS = {"ft300": 0.010, "ft300_usb": 0.022}  # between two of its readings, at most
 # The joints brake at 8 rad/s^2; the joint that moves a gripper is rarely nearer than this.
 _BRAKING_M_S2 = 8.0 * 0.3
 _SLOWEST_M_S = 1e-3
@@ -20,7 +20,7 @@ _SLOWEST_M_S = 1e-3
 
 def reaction_seconds(cell: Cell) -> float:
     """Return the longest time from a force to the brake [s]."""
-    sensor = _FT300_SECONDS if cell.sensor.kind == "ft300" else 0.0
+    sensor = _FT300_SECONDS.get(cell.sensor.kind, 0.0)
     return _LOOP_SECONDS + _STEPS / cell.arm.rate + sensor
 
 
