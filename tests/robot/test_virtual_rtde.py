@@ -108,6 +108,7 @@ def test_dashboard_refuses_changes_in_local_control():
     assert answer(controller, "is in remote control\n") == "false"
     assert "not allowed" in answer(controller, "power off\n")
     assert answer(controller, "robotmode\n") == "Robotmode: RUNNING"
+    assert answer(Controller("ur5"), "is in remote control\n").startswith("could not understand")
     controller.load_script("def rtde_control():\nend\n")
     assert answer(controller, "running\n") == "Program running: false"
 

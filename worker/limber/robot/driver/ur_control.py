@@ -65,7 +65,7 @@ class UrControl(SampleStream):
         ask = self._dashboard.ask
         model = ask("get robot model")
         facts = {"address": self.address, "version": version, "model": model,
-                 "serial": ask("get serial number"), "remote": ask("is in remote control"),
+                 "serial": ask("get serial number"), "remote": _told(ask("is in remote control")),
                  "rate_hz": self.rate}
         known = model.lower()
         if known.startswith("ur") and known != arm.name.rstrip("e"):
@@ -73,7 +73,7 @@ class UrControl(SampleStream):
                              f"{arm.name}.",
                              "Reach and limits would be those of another arm.",
                              "Correct robot.model in the cell file.")
-        if facts["remote"] == "false":
+        if facts["remote"] is False:
             raise SafetyStop("The robot is not in remote control.",
                              "It would not accept a program.",
                              "Switch it to remote control on the pendant.")
@@ -185,6 +185,11 @@ class UrControl(SampleStream):
             self._gripper.close()
         super().close()
         self._dashboard.close()
+
+
+def _told(answer: str) -> bool | None:
+    """Whether a controller says yes; None if it does not know the question, as a CB3."""
+    return {"true": True, "false": False}.get(answer)
 
 
 def _first_sample(stream: SampleStream) -> Sample:

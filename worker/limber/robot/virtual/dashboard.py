@@ -15,6 +15,7 @@ _STATES = {RuntimeState.STOPPED: "STOPPED", RuntimeState.PLAYING: "PLAYING",
 # Commands that change something are refused in local control, as on the e-Series.
 _CHANGES = ("play", "stop", "pause", "load", "power on", "power off", "brake release",
             "unlock protective stop", "restart safety", "shutdown", "close safety popup")
+_CB3 = 3
 _REFUSED = "Command is not allowed due to safety reasons"
 
 
@@ -74,12 +75,19 @@ def _unlock(controller: Controller) -> str:
     return "Cannot unlock protective stop until 5s after occurrence"
 
 
+def _remote(controller: Controller) -> str:
+    """A CB3 knows no remote control (Universal Robots, "Dashboard server": e-Series, 5.6)."""
+    if controller.version[0] <= _CB3:
+        return "could not understand: 'is in remote control'"
+    return "true" if controller.remote else "false"
+
+
 _QUESTIONS = {
     "polyscopeversion": lambda c: f"URSoftware {'.'.join(map(str, c.version))} (Jan 01 2022)",
     "version": lambda c: ".".join(map(str, c.version)),
     "get serial number": lambda c: "20220000001",
     "get robot model": lambda c: c.arm.name.upper().rstrip("E"),
-    "is in remote control": lambda c: "true" if c.remote else "false",
+    "is in remote control": _remote,
     "get operational mode": lambda c: "NONE",
     "robotmode": lambda c: f"Robotmode: {_MODES[c.robot_mode]}",
     "safetymode": lambda c: f"Safetymode: {c.safety_mode.name}",
