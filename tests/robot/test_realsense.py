@@ -1,0 +1,120 @@
+"""A RealSense camera: the small part of its package that is used, from a fake of it."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from limber.cli.commands.robot import command
+from limber.core.numerics.rigid import matrices
+from limber.geometry.io.clouds import read_cloud
+from limber.robot.cell.cell import Cell, write_cell
+from limber.robot.realsense import RealSense, seen_points
+
+WIDTH, HEIGHT, SCALE = 12, 8, 0.001
+CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.5, 0.1, 0, 0, 0, 1.2)},
+            camera={"pose": (0.05, 0, 0.02, 0, 0, 0.1), "range_m": (0.2, 0.9)})
+
+
+class Library:
+    """As pyrealsense2: a pipeline of depth frames in units of a millimetre.
+
+    Attributes:
+        frames: Image of each frame, in turn.
+        fails: Raised where the pipeline starts or waits.
+    """
+
+    stream = SimpleNamespace(depth="depth")
+
+    def __init__(self):
+        row = np.full((HEIGHT, WIDTH), 500, np.uint16)
+        row[0, 0], row[0, 1] = 0, 1500
+        self.frames, self.count, self.stopped = [row], 0, False
+        self.fails = {}
+
+    def config(self):
+        return SimpleNamespace(enable_stream=lambda kind: None)
+
+    def pipeline(self):
+        return self
+
+    def start(self, config):
+        if "start" in self.fails:
+            raise RuntimeError(self.fails["start"])
+        seen = SimpleNamespace(width=WIDTH, height=HEIGHT, fx=10.0, fy=10.0, ppx=6.0, ppy=4.0)
+        video = SimpleNamespace(get_intrinsics=lambda: seen)
+        sensor = SimpleNamespace(get_depth_scale=lambda: SCALE)
+        return SimpleNamespace(
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video))
+
+    def wait_for_frames(self, milliseconds):
+        if "wait" in self.fails:
+            raise RuntimeError(self.fails["wait"])
+        self.count += 1
+        image = self.frames[self.count % len(self.frames)]
+        return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(get_data=lambda: image))
+
+    def stop(self):
+        self.stopped = True
+
+
+@pytest.fixture
+def library(monkeypatch) -> Library:
+    found = Library()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", found)
+    return found
+
+
+def test_an_image_is_the_median_of_frames_and_holes_are_none(library):
+    """Every third frame misses a pixel, another has noise; a pixel that most miss has no depth."""
+    first = library.frames[0]
+    missing, noisy = first.copy(), first.copy()
+    missing[3, 3] = 0
+    noisy[4, 4] = 900
+    library.frames = [first, missing, noisy]
+    with RealSense() as camera:
+        depth = camera.depth()
+    assert library.stopped
+    assert depth[3, 3] == depth[4, 4] == 0.5 and np.isnan(depth[0, 0]) and depth[0, 1] == 1.5
+
+
+@pytest.mark.parametrize("mount", ["branch", "flange"])
+def test_points_are_in_the_branchs_frame(library, mount):
+    cell = CELL.model_copy(update={"camera": CELL.camera.model_copy(update={"mount": mount})})
+    flange = cell.arm.forward(np.array(cell.arm.home)) if mount == "flange" else None
+    with RealSense() as camera:
+        points = seen_points(cell, camera, flange)
+    # The hole and what is beyond the range are left out.
+    assert len(points) == WIDTH * HEIGHT - 2
+    frame = matrices(np.array(cell.camera.pose))
+    if flange is not None:
+        frame = matrices(np.array(cell.base.pose)) @ flange @ frame
+    pixel = frame @ [0.5 * (11 - 6) / 10, 0.5 * (7 - 4) / 10, 0.5, 1.0]
+    assert points[-1] == pytest.approx(pixel[:3])
+
+
+def run(arguments: list[str], capfd) -> tuple[int, dict]:
+    with pytest.raises(SystemExit) as stop:
+        command.main(["scan", *arguments, "--json"], standalone_mode=False)
+    return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+
+
+def test_the_command_writes_a_cloud_and_names_what_is_missing(library, tmp_path, capfd,
+                                                             monkeypatch):
+    path, out = tmp_path / "cell.toml", tmp_path / "scan.ply"
+    write_cell(path, CELL)
+    code, told = run(["--realsense", str(path), "-o", str(out)], capfd)
+    assert code == 0 and told["point_count"] == WIDTH * HEIGHT - 2
+    assert len(read_cloud(out).points) == WIDTH * HEIGHT - 2
+    for name in ("start", "wait"):
+        library.fails = {name: "no device"}
+        code, told = run(["--realsense", str(path), "-o", str(out)], capfd)
+        assert code == 3 and "no device" in told["error"]
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    code, told = run(["--realsense", str(path), "-o", str(out)], capfd)
+    assert code != 0 and "pip install pyrealsense2" in told["error"]
+    code, told = run(["-o", str(out)], capfd)
+    assert code == 2 and "Neither --middle nor --realsense" in told["error"]

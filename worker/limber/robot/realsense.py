@@ -1,0 +1,99 @@
+"""Live depth images of an Intel RealSense camera, by its maker's package pyrealsense2.
+
+The package is large and not needed by anything else, so it belongs to no extra of Limber.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import MissingDependencyError, WorkError
+from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.geometry.cloud.camera import Camera, depth_to_cloud
+from limber.robot.cell.cell import Cell
+
+_FRAMES = 15
+"""Frames of one image: their median has less noise, and half of them may miss a pixel."""
+_SETTLE_FRAMES = 15  # until the exposure is steady
+_WAIT_MS = 2000
+
+
+class RealSense:
+    """The first camera that is connected; a context manager.
+
+    Attributes:
+        camera: Its intrinsics, as it reports them.
+
+    Raises:
+        MissingDependencyError: pyrealsense2 is not installed. WorkError: no camera answers.
+    """
+
+    def __init__(self) -> None:
+        library = _library()
+        self._pipeline = library.pipeline()
+        config = library.config()
+        config.enable_stream(library.stream.depth)
+        try:
+            profile = self._pipeline.start(config)
+        except RuntimeError as error:
+            raise WorkError(f"No RealSense camera answers ({error}).", "",
+                            "Check its USB cable, and that no other program uses it.") from error
+        self._scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        seen = profile.get_stream(library.stream.depth).as_video_stream_profile().get_intrinsics()
+        self.camera = Camera(width=seen.width, height=seen.height, fx=seen.fx, fy=seen.fy,
+                             cx=seen.ppx, cy=seen.ppy)
+
+    def __enter__(self) -> "RealSense":
+        for _ in range(_SETTLE_FRAMES):
+            self._frame()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._pipeline.stop()
+
+    def depth(self) -> np.ndarray:
+        """Return a depth image [m], shape [height, width]; NaN without a reading.
+
+        Raises:
+            WorkError: it sends no frames.
+        """
+        frames = np.array([self._frame() for _ in range(_FRAMES)])
+        is_seen = (frames > 0).sum(axis=0) > _FRAMES // 2
+        median = np.ma.median(np.ma.masked_equal(frames, 0), axis=0).filled(0)
+        return np.where(is_seen, self._scale * median, np.nan)
+
+    def _frame(self) -> np.ndarray:
+        try:
+            frame = self._pipeline.wait_for_frames(_WAIT_MS).get_depth_frame()
+        except RuntimeError as error:
+            raise WorkError(f"The RealSense camera sends no image ({error}).", "",
+                            "Check its USB cable: depth needs USB 3.") from error
+        return np.asanyarray(frame.get_data()).copy()
+
+
+def seen_points(cell: Cell, camera: RealSense, flange: np.ndarray | None) -> np.ndarray:
+    """Return the points that a camera sees within its range [m], branch frame, shape [n, 3].
+
+    Args:
+        cell: Its [camera] states pose and mount.
+        flange: The flange's frame in the robot's base, for a camera on it, shape [4, 4].
+    """
+    entry = cell.camera
+    assert entry is not None
+    frame = matrices(np.array(entry.pose))
+    if flange is not None:
+        frame = matrices(np.array(cell.base.pose)) @ flange @ frame
+    depth = camera.depth()
+    near, far = entry.range_m
+    placed = camera.camera.model_copy(update={"pose": tuple(map(float, pose_vectors(frame)))})
+    return depth_to_cloud(placed, depth, (depth >= near) & (depth <= far)).points
+
+
+def _library() -> Any:
+    try:
+        import pyrealsense2
+    except ImportError as error:
+        raise MissingDependencyError(
+            "pyrealsense2 is not installed.", "A RealSense camera is read by its maker's package.",
+            "Install with: pip install pyrealsense2") from error
+    return pyrealsense2
