@@ -170,7 +170,7 @@ def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
         after = robot.state
     # The force acts from the next step on.
     acts = before["clock"] + step
-    stopped = min(moment for line in after["log"] if line.endswith(("came", "dashboard"))
+    stopped = min(moment for line in after["log"] if line.endswith(("received", "dashboard"))
                   and (moment := float(line.split()[0])) > before["clock"])
     way = float(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))
     return _Stop(stopped - acts, way, since, came + stopped - acts)
