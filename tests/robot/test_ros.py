@@ -2,6 +2,7 @@
 
 import base64
 import gc
+import json
 import os
 import threading
 import time
@@ -11,9 +12,10 @@ import numpy as np
 import pytest
 
 from benchmarks.robot_rosbridge import RosBridge
+from limber.cli.commands.ros import command
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell
+from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.driver.real_time import claim_real_time
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
@@ -260,3 +262,24 @@ def test_a_cloud_comes_in_the_branchs_frame(big):
 def test_what_is_no_cloud_is_refused(change):
     with pytest.raises(InputError, match="no cloud of points"):
         cloud_of(cloud_message(np.ones((4, 3))) | change)
+
+
+def test_a_gripper_moves_by_its_action_and_tells_that_it_holds(tmp_path, capfd):
+    path = tmp_path / "cell.toml"
+    write_cell(path, CELL)
+
+    def run(*arguments: str) -> tuple[int, dict]:
+        with pytest.raises(SystemExit) as stop:
+            command.main(["gripper", str(path), "--position", "0.8", "--effort", "20", *arguments,
+                          "--url", server.url, "--json"], standalone_mode=False)
+        return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+    with RosBridge(HOME) as server:
+        assert run()[0] == 0 and run("--arm")[0] == 2 and not server.heard
+        code, told = run("--arm", "--confirm", "gripper")
+        assert code == 0 and told["stalled"] and told["position"] == 0.31
+        goal = server.heard[-1][1]
+        assert goal["args"] == {"command": {"position": 0.8, "max_effort": 20.0}}
+        assert goal["action"] == "/gripper_controller/gripper_cmd"
+        server.gripper_status = 6
+        code, told = run("--arm", "--confirm", "gripper")
+        assert code == 3 and "did not move" in told["error"]

@@ -20,6 +20,7 @@ class RosBridge:
         joints: Where the arm stands, in its own order [rad], shape [6].
         wrench: What the sensor tells besides noise [N, N m], shape [6].
         load: Returns more of that, from the joints.
+        gripper_status: With which the gripper's action ends.
         stood_at: When the last goal was cancelled, and the arm stood [s, monotonic].
         heard: Operations that came, each with its time.
         silent: Topics that send nothing.
@@ -30,6 +31,7 @@ class RosBridge:
         self.wrench, self.heard, self.silent = np.zeros(6), [], set()
         self.followed, self.stood_at = [], None
         self.load = lambda joints: np.zeros(6)
+        self.gripper_status = 4
         self._goal, self._open = None, []
         self._rng = np.random.default_rng(0)
 
@@ -96,11 +98,16 @@ class RosBridge:
 
         with contextlib.suppress(ConnectionClosed):
             for text in socket:
-                self._hear(json.loads(text))
+                self._hear(socket, json.loads(text))
 
-    def _hear(self, order):
+    def _hear(self, socket, order):
         self.heard.append((time.monotonic(), order))
-        if order["op"] == "send_action_goal":
+        if order["op"] == "send_action_goal" and order["action_type"].endswith("GripperCommand"):
+            socket.send(json.dumps({
+                "op": "action_result", "id": order["id"], "action": order["action"],
+                "status": self.gripper_status, "result": True, "values": {
+                    "position": 0.31, "effort": 0.0, "stalled": True, "reached_goal": False}}))
+        elif order["op"] == "send_action_goal":
             points = order["args"]["trajectory"]["points"]
             order_of = [order["args"]["trajectory"]["joint_names"].index(name) for name in _NAMES]
             ways = np.array([point["positions"] for point in points])[:, order_of][:, _ORDER]

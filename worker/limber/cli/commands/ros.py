@@ -212,6 +212,43 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     return result
 
 
+@stage_command("gripper")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.option("--position", type=float, required=True,
+              help="Where it moves, as its controller counts [m or rad].")
+@click.option("--effort", default=0.0, show_default=True,
+              help="Greatest effort [N]; 0 leaves it to the controller.")
+@click.option("--action", default="/gripper_controller/gripper_cmd", show_default=True,
+              help="Name of its action (control_msgs/action/GripperCommand).")
+@click.option("--arm", "armed", is_flag=True, help="Move it. Default: a dry run.")
+@click.option("--confirm", help="The word gripper, to confirm that it may move.")
+@_url
+def gripper(run: Run, cell_file: Path, position: float, effort: float, action: str, armed: bool,
+            confirm: str | None, url: str) -> dict[str, Any]:
+    """Close or open the gripper by its action in ROS; `stalled` tells that it holds something."""
+    from limber.core.errors import InputError, SafetyStop
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.ros.bridge import SECONDS, Bridge
+    from limber.robot.ros.gripper_action import drive
+
+    cell = read_cell(cell_file)
+    result: dict[str, Any] = {"armed": armed, "action": action, "wanted": position}
+    if not armed:
+        return result
+    if confirm != "gripper":
+        raise InputError("Nobody confirmed that the gripper may move.",
+                         "A bent branch springs back where it opens.", "Give --confirm gripper.")
+    bridge = Bridge(url)
+    try:
+        result |= drive(bridge, action, position, effort, cell.tool.grip_seconds + SECONDS)
+    except ConnectionError as error:
+        raise SafetyStop(f"{error}.", "Whether the gripper moved is not known.",
+                         "Check the gripper.") from error
+    finally:
+        bridge.close()
+    return result
+
+
 def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, is_held: bool,
               goes_on: bool = False) -> dict[str, Any]:
     """Tare, or with the branch held recall the tare, and follow; return how that ended.
@@ -246,5 +283,5 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
     return event
 
 
-for each in (check, describe, scan, follow, retreat):
+for each in (check, describe, scan, follow, gripper, retreat):
     command.add_command(each)
