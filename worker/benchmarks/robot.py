@@ -30,6 +30,7 @@ from benchmarks.robot_loop import LOOP_ROWS, closed_loops
 from benchmarks.robot_retreats import RETREAT_ROW, retreats
 from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
 from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
+from benchmarks.robot_wrong_states import STATES_ROW, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
 from limber.core.errors import LimberError
 from limber.robot.driver.link import RobotLink
@@ -283,6 +284,7 @@ PARTS = {
     "path": Part(_watched(_path), 20, (_PATH,)),
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
+    "wrong-states": Part(wrong_states, 30, (STATES_ROW,)),
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
     "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,

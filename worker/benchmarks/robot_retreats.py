@@ -24,7 +24,7 @@ from limber.robot.virtual.controller import Controller
 RETREAT_ROW = Asked("retreats from random stops on branch and wall: force under 1 N at the end, or "
                     "why not", "50 of 50")
 _COUNT, _LEFT_N = 50, 1.0
-_TOOL = np.array([0.0, 0.0, 0.15])
+TOOL = np.array([0.0, 0.0, 0.15])
 _WAY_M = 0.03
 _SECONDS = 100.0  # of the robot's time
 _OVER = "the program that drives the robot has ended"  # the bench's own end of a run
@@ -46,7 +46,7 @@ class _Patches:
 
 
 @contextmanager
-def _patched() -> Iterator[_Patches]:
+def patched() -> Iterator[_Patches]:
     patches = _Patches()
     try:
         yield patches
@@ -72,7 +72,7 @@ def retreats(setting: Setting) -> list[Row]:
 
 
 def _trial(seed: int, source: str) -> Numbers:
-    with _patched() as patches:
+    with patched() as patches:
         try:
             event, load = _retreat(np.random.default_rng(seed), patches)
         except LimberError as error:
@@ -91,16 +91,16 @@ def _retreat(rng: np.random.Generator, patches: robot_stepped.Patch,
              ) -> tuple[dict[str, Any], Wall | Spring]:
     """Move against a wall or with a branch until something stops it; then retreat."""
     controller = Controller("ur5e", seed=int(rng.integers(1 << 30)))
-    controller.set_tool(np.r_[_TOOL, 0, 0, 0])
+    controller.set_tool(np.r_[TOOL, 0, 0, 0])
     start = controller.pose.copy()
-    way = _direction(rng)
+    way = direction(rng)
     stiffness = float(np.exp(rng.uniform(np.log(3e3), np.log(1e5))))
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
-                tool={"grasp_pose": (*_TOOL, 0, 0, 0), "mass_kg": 0.0},
+                tool={"grasp_pose": (*TOOL, 0, 0, 0), "mass_kg": 0.0},
                 limits={"contact_n_per_m": stiffness})
     controller.load = load = (
-        Wall(_TOOL, -way, start[:3] + rng.uniform(0.005, 0.025) * way, stiffness)
-        if rng.random() < 0.5 else _branch(rng, start[:3], way))
+        Wall(TOOL, -way, start[:3] + rng.uniform(0.005, 0.025) * way, stiffness)
+        if rng.random() < 0.5 else branch_spring(rng, start[:3], way))
     poses = densely(np.array([start, start + np.r_[_WAY_M * way, 0, 0, 0]]))
     speed = speed_within(cell, float(rng.uniform(0.01, 0.05)))
     path = Trajectory(along(poses, speed, 0.3), poses)
@@ -116,15 +116,15 @@ def _retreat(rng: np.random.Generator, patches: robot_stepped.Patch,
     return event, load
 
 
-def _branch(rng: np.random.Generator, rest: np.ndarray, way: np.ndarray) -> Spring:
+def branch_spring(rng: np.random.Generator, rest: np.ndarray, way: np.ndarray) -> Spring:
     """A spring of 50 to 500 N/m across its axis, a hundred times that along it."""
-    axis = np.cross(way, _direction(rng))
+    axis = np.cross(way, direction(rng))
     axis /= np.linalg.norm(axis)
     across = float(np.exp(rng.uniform(np.log(50.0), np.log(500.0))))
-    return Spring(_TOOL, rest, across * (np.eye(3) + 99.0 * np.outer(axis, axis)))
+    return Spring(TOOL, rest, across * (np.eye(3) + 99.0 * np.outer(axis, axis)))
 
 
-def _direction(rng: np.random.Generator) -> np.ndarray:
+def direction(rng: np.random.Generator) -> np.ndarray:
     """A random direction, shape [3]."""
     way = rng.standard_normal(3)
     return way / np.linalg.norm(way)

@@ -51,12 +51,12 @@ class Spring(Nothing):
     """
 
     def __init__(self, tool: np.ndarray, rest: np.ndarray, stiffness: np.ndarray):
-        self._tool, self._rest, self._stiffness = tool, rest, stiffness
+        self._tool, self._rest, self.stiffness = tool, rest, stiffness
         self.peak = self.now = 0.0
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         tip = flange[:3, :3] @ self._tool + flange[:3, 3]
-        pull = self._stiffness @ (self._rest - tip)
+        pull = self.stiffness @ (self._rest - tip)
         self.now = float(np.linalg.norm(pull))
         self.peak = max(self.peak, self.now)
         force = flange[:3, :3].T @ pull
@@ -75,7 +75,8 @@ class SteppedControl:
     """As limber.robot.interface.ArmControl asks for it; each read is one step of the robot.
 
     Attributes:
-        after_step: Called with each sample.
+        after_step: Called with each sample, by a run.
+        each_sample: The same, for its user.
     """
 
     lookahead, silence = 0.06, 0.1
@@ -84,6 +85,7 @@ class SteppedControl:
         self.controller, self.rate = controller, 1.0 / controller.seconds
         self.facts: dict[str, Any] = {}
         self.after_step: Callable[[Sample], None] = lambda sample: None
+        self.each_sample: Callable[[Sample], None] = lambda sample: None
         self._pending: deque = deque([None] * _LATE_STEPS)
         controller.load_script("def rtde_control():\nend\n")
 
@@ -101,6 +103,7 @@ class SteppedControl:
             told["actual_TCP_speed"].copy(), told["actual_TCP_force"].copy(), told["robot_mode"],
             told["safety_mode"], 2, 1.0, told["tcp_offset"], told["payload"],
             told["payload_cog"])
+        self.each_sample(sample)
         self.after_step(sample)
         return [sample]
 

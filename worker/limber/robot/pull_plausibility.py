@@ -28,6 +28,10 @@ _RECENT_M = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012, 0.02)  # over which the f
 _RECENT_SHARE = 0.2  # measured, and of the whole way at least: a stop relaxes the wood
 _SLIPS = 0.5  # of the growth before: less is a slip
 _CERTAIN = 5.0  # standard deviations
+_LARGER = ("the force is larger than the known moduli allow: the sensor's unit is wrong, or "
+           "something stiff is in the way")
+_SMALLER = ("the force is smaller than the known moduli allow: the sensor's unit is wrong, or the "
+            "branch is not held")
 _BASE_DEVIATIONS, _AXIS_M = 2.0, 0.002  # of a calibration; error of a scanned axis
 _TURNED_M = 1e-3  # back from the farthest place: the way out is over
 
@@ -117,6 +121,14 @@ class _Growth:
                 return now / before, recent
         return None
 
+    def whole(self) -> tuple[float, float] | None:
+        """Return the growth per predicted newton since the start, and its standard deviation; None
+        over too short a way.
+        """
+        if self._farthest < 2 * _FROM_M or not self._sums[0, 0]:
+            return None
+        return self._whole(self._sums[1:].sum(axis=0))
+
     def _slope(self, sums: np.ndarray) -> tuple[float, float]:
         """Growth of the force per predicted newton, and its standard deviation."""
         count, wanted, felt, square, product = sums
@@ -171,7 +183,7 @@ class PullPlausibility:
                 self._agree(self._doubt(way, force))
             self._grow(way, row[_RAW])
         if self.reason is None:
-            self.reason = self._slip()
+            self.reason = self._slip() or self._scale()
         return self.reason
 
     def left_at_end(self, samples: np.ndarray) -> str | None:
@@ -201,6 +213,17 @@ class PullPlausibility:
         if size > 0.0:
             self._growth.take(way, size, float(force @ wanted) / size)
 
+    def _scale(self) -> str | None:
+        """The same as :meth:`_doubt` for a soft branch, whose single readings are mostly noise."""
+        factor, whole = self._predicted.factor, self._growth.whole()
+        if factor is None or whole is None:
+            return None
+        share, unsure = whole[0], _CERTAIN * whole[1]
+        told = f"it grows by {100 * share:.0f} % of the predicted force"
+        if share > factor + unsure:
+            return f"{_LARGER} ({told})"
+        return f"{_SMALLER} ({told})" if share < 1.0 / factor - unsure else None
+
     def _slip(self) -> str | None:
         slip = self._growth.slip()
         if slip is None:
@@ -227,11 +250,7 @@ class PullPlausibility:
         if factor is None:
             return ""
         if along > factor * size + self._noise:
-            return ("the force is larger than the known moduli allow: the sensor's unit is wrong, "
-                    f"or something stiff is in the way ({along:.2g} N {told}, "
-                    f"{size:.2g} N predicted)")
+            return f"{_LARGER} ({along:.2g} N {told}, {size:.2g} N predicted)"
         if along < size / factor - self._noise:
-            return ("the force is smaller than the known moduli allow: the sensor's unit is "
-                    f"wrong, or the branch is not held ({along:.2g} N {told}, {size:.2g} N "
-                    "predicted)")
+            return f"{_SMALLER} ({along:.2g} N {told}, {size:.2g} N predicted)"
         return ""
