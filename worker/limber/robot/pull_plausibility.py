@@ -70,9 +70,9 @@ class PredictedPull:
     forces: np.ndarray
     factor: float | None
 
-    def at(self, way: float) -> np.ndarray:
-        """Return the force at a travel [m], shape [3]."""
-        return np.array([np.interp(way, self.ways, self.forces[:, k]) for k in range(3)])
+    def at(self, way: float | np.ndarray) -> np.ndarray:
+        """Return the force at a travel [m], shape [3]; at travels [n], shape [n, 3]."""
+        return np.stack([np.interp(way, self.ways, self.forces[:, k]) for k in range(3)], axis=-1)
 
 
 class _Growth:
@@ -92,14 +92,21 @@ class _Growth:
         self._farthest = 0.0
         self._is_over = False
 
-    def take(self, way: float, wanted: float, felt: float) -> None:
-        """Take a reading along the prediction [N] at a way [m], where ``wanted`` [N] is predicted.
+    def take(self, ways: np.ndarray, wanted: np.ndarray, felt: np.ndarray) -> None:
+        """Take readings along the prediction [N] at ways [m], where ``wanted`` [N] are predicted,
+        shape [n] each.
         """
-        self._is_over = self._is_over or way < self._farthest - _TURNED_M
-        self._farthest = max(self._farthest, way)
-        place = int(way / _BIN_M)
-        if not self._is_over and place < len(self._sums):
-            self._sums[place] += 1.0, wanted, felt, wanted * wanted, wanted * felt
+        farthest = np.maximum.accumulate(np.r_[self._farthest, ways])[1:]
+        back = np.flatnonzero(ways < farthest - _TURNED_M)
+        out = len(ways) if not len(back) else int(back[0])
+        if self._is_over or not len(ways):
+            return
+        self._is_over = out < len(ways)
+        self._farthest = float(farthest[-1])
+        places = (ways[:out] / _BIN_M).astype(int)
+        rows = np.column_stack([np.ones(len(ways)), wanted, felt, wanted * wanted, wanted * felt])
+        known = places < len(self._sums)
+        np.add.at(self._sums, places[known], rows[:out][known])
 
     def slip(self) -> tuple[float, float] | None:
         """Return how much of the predicted growth the force has now, over that before, and the
@@ -173,15 +180,14 @@ class PullPlausibility:
         sensor cannot be right, or None."""
         if self._start is None:
             self._start, self._began = samples[0, 1:4].copy(), float(samples[0, 0])
-        for row in samples:
-            force = row[_COLUMNS]
+        ways = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)
+        for way, force in zip(ways, samples[:, _COLUMNS], strict=True):
             if not np.isfinite(force).all():
                 continue
             self._peak = max(self._peak, float(np.linalg.norm(force)))
-            way = float(np.linalg.norm(row[1:4] - self._start))
             if self.reason is None and _FROM_M <= way <= LOOKED_M:
-                self._agree(self._doubt(way, force))
-            self._grow(way, row[_RAW])
+                self._agree(self._doubt(float(way), force))
+        self._grow(samples, ways)
         if self.reason is None:
             self.reason = self._slip() or self._scale()
         return self.reason
@@ -206,12 +212,13 @@ class PullPlausibility:
         if doubt and self._told[1] >= _AGREE:
             self.reason = doubt
 
-    def _grow(self, way: float, force: np.ndarray) -> None:
+    def _grow(self, samples: np.ndarray, ways: np.ndarray) -> None:
         # Before it moves nothing is predicted, but the direction is known.
-        wanted = self._predicted.at(max(way, _MOVED_M))
-        size = float(np.linalg.norm(wanted))
-        if size > 0.0:
-            self._growth.take(way, size, float(force @ wanted) / size)
+        wanted = self._predicted.at(np.maximum(ways, _MOVED_M))
+        sizes = np.linalg.norm(wanted, axis=1)
+        good = np.isfinite(samples[:, _RAW]).all(axis=1) & (sizes > 0.0)
+        along = (samples[good, _RAW] * wanted[good]).sum(axis=1) / sizes[good]
+        self._growth.take(ways[good], sizes[good], along)
 
     def _scale(self) -> str | None:
         """The same as :meth:`_doubt` for a soft branch, whose single readings are mostly noise."""
