@@ -114,7 +114,7 @@ def test_what_is_read_writes_nothing_and_what_is_set_is_put_back(resting_robot):
         seen = observe(cell, 0.1)
         told = "; ".join(map(str, seen.differences))
         assert "payload: 1.200 kg in the controller, 0.500 kg in the cell file (set for" in told
-        assert "tool centre point: about (0, 0, 50) mm" in told
+        assert "tool centre point: (0, 0, 50) mm" in told
         assert not seen.implausible(cell) and not seen.program_runs
         state = resting_robot.state
         assert state["program"] == "STOPPED"
