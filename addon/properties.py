@@ -177,9 +177,20 @@ def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
         elif stage.fields[name].kind in ("number", "vector"):
             if not np.array_equal(np.asarray(value, np.float32), np.asarray(before, np.float32)):
                 return True
-        elif value != stage.fields[name].shown(before):
+        elif _numbers(value) != _numbers(stage.fields[name].shown(before)):
             return True
     return False
+
+
+def _numbers(value: Any) -> Any:
+    """Return a list that a panel keeps as text with its numbers as such: 6e+07 is 60000000.0."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return [[float(part) for part in row.replace(",", " ").split()]
+                for row in value.split(";")]
+    except ValueError:
+        return value
 
 
 def has_switch(field: Field) -> bool:

@@ -201,10 +201,12 @@ def _content() -> dict[str, Any]:
 
 
 def number_text(value: Any) -> str:
-    """Return a number as short as its single precision allows: 0.1, not 0.10000000149."""
+    """Return a number as short as its single precision allows: 0.1, not 0.10000000149; 6e+07."""
     if isinstance(value, int):
         return str(value)
-    return str(float(str(np.float32(value))))
+    number = float(str(np.float32(value)))
+    short = f"{number:.6g}"
+    return short if len(short) < len(str(number)) - 2 and float(short) == number else str(number)
 
 
 def _stage(name: str, told: dict[str, Any]) -> Stage:

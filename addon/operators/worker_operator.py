@@ -3,10 +3,13 @@
 import bpy
 
 from .. import jobs, preferences
+from ..lines import wrapped
 from ..plain_words import plain
 from ..worker import WorkerNotFound
 
 _INTERVAL_SECONDS = 0.1
+_POPUP_SHARE = 0.6
+"""Width of an error beside the mouse, of the window's."""
 
 
 class WorkerOperator:
@@ -89,7 +92,7 @@ class WorkerOperator:
             self._job = jobs.add(self.title, command, folder, is_next=self.is_next) if (
                 self._is_beside) else jobs.start(self.title, command, folder)
         except (ValueError, RuntimeError, OSError, WorkerNotFound) as error:
-            self.report({"ERROR"}, str(error))
+            self._complain(context, str(error))
             return False
         return True
 
@@ -104,14 +107,20 @@ class WorkerOperator:
             self.report({"INFO"}, f"{self.title}: {job.message or 'cancelled'}")
             return {"CANCELLED"}
         if job.state is jobs.JobState.FAILED:
-            self.report({"ERROR"}, plain(job.error))
+            self._complain(context, plain(job.error))
             return {"CANCELLED"}
         try:
             self.finish(context, job.result)
         except ValueError as error:
-            self.report({"ERROR"}, str(error))
+            self._complain(context, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
+
+    def _complain(self, context, text: str) -> None:
+        """Report an error; in a window in lines, since one would run past the screen."""
+        if self._is_beside:
+            text = "\n".join(wrapped(text, _POPUP_SHARE * context.window.width))
+        self.report({"ERROR"}, text)
 
     def _remove_timer(self, context) -> None:
         if self._timer is not None:

@@ -7,15 +7,17 @@ import bpy
 
 from .. import branch_folder, branches
 from ..branch_folder import BranchRecord
+from ..lines import draw_text, room, width
 from ..operators import several
 
 _PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy, summed", "energy_sum_nmm", 1.0, "N mm"),
               ("Peak energy", "peak_energy_j", 1e3, "mJ"), ("Peak force", "peak_force_n", 1.0, "N"),
               ("Peak strain", "peak_strain", 1e2, "%"))
 _PLAN = "plan:"
+_FIRST_SHARE = 0.46
 
 
-def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
+def draw_paths(layout: bpy.types.UILayout, context: bpy.types.Context, result: dict[str, Any],
                record: BranchRecord | None, stress_share: float) -> None:
     """Draw the planned path beside the one without energy, proven bounds, and other plans.
 
@@ -27,22 +29,24 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     rows = [["", "Gentle", "Shortest"]]
     rows += [[f"{words} [{unit}]", *(_number(path.get(key), factor) for path in paths)]
              for words, key, factor, unit in _PATH_ROWS]
-    draw_table(layout, rows)
+    draw_table(layout, context, rows)
     saved, longer = result.get("energy_saved_percent"), result.get("length_added_percent")
     if saved is not None and longer is not None:
-        layout.label(text=f"{saved:.0f} % of the energy saved, {abs(longer):.1f} % "
-                     f"{'longer' if longer >= 0 else 'shorter'}")
+        draw_text(layout, context, f"{saved:.0f} % of the energy saved, {abs(longer):.1f} % "
+                  f"{'longer' if longer >= 0 else 'shorter'}")
     strength = result.get("strength") or {}
     is_over = bool(strength.get("over")) or stress_share > 1.0
     gap = (result.get("certificate") or {}).get("gap_percent")
-    layout.label(text="No bound was proven" if gap is None else
-                 f"Proven on the field: at most {gap:.1f} % above the minimum",
-                 icon="QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
+    draw_text(layout, context, "No bound was proven" if gap is None else
+              f"Proven on the field: at most {gap:.1f} % above the minimum",
+              "QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
     if strength.get("over"):
-        layout.label(text=f"Strain {strength['peak_strain'] / strength['median_strain']:.1f} x "
-                     f"the strength ({strength['source']})", icon="ERROR")
+        draw_text(layout, context,
+                  f"Strain {strength['peak_strain'] / strength['median_strain']:.1f} x "
+                  f"the strength ({strength['source']})", "ERROR")
     elif is_over:
-        layout.label(text=f"May break: stress {stress_share:.2g} times the strength", icon="ERROR")
+        draw_text(layout, context, f"May break: stress {stress_share:.2g} times the strength",
+                  "ERROR")
     if legs := result.get("legs"):
         draw_table(layout, [["Leg", "Time [s]", "Force [N]"], *(
             [str(leg["name"]).capitalize(), _number(leg.get("duration_s"), 1.0),
@@ -50,18 +54,19 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (
         record.stages.items() if record else ()) if key.startswith(_PLAN)}
     if len(others) > 1:
-        draw_table(layout, [["Plan", "Sum [N mm]", "Length [mm]"], *(
+        draw_table(layout, context, [["Plan", "Sum [N mm]", "Length [mm]"], *(
             [name, _number((each.get("plan") or {}).get("energy_sum_nmm"), 1.0),
              _number((each.get("plan") or {}).get("length_m"), 1e3)]
             for name, each in others.items())])
 
 
-def draw_moduli(layout: bpy.types.UILayout, result: dict[str, Any]) -> None:
+def draw_moduli(layout: bpy.types.UILayout, context: bpy.types.Context,
+                result: dict[str, Any]) -> None:
     """Draw Young's modulus at the control points with its interval, base first."""
     young = result.get("young_pa") or []
     intervals = result.get("young_interval_pa") or [[None, None]] * len(young)
     if young and len(young) == len(intervals):
-        draw_table(layout, [["E [MPa]", "from", "to (95 %)"], *(
+        draw_table(layout, context, [["E [MPa]", "from", "to (95 %)"], *(
             [f"{number + 1}:  {_number(value, 1e-6)}", _number(low, 1e-6), _number(high, 1e-6)]
             for number, (value, (low, high)) in enumerate(zip(young, intervals, strict=True)))])
 
@@ -72,15 +77,14 @@ def draw_branches(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     surface = branches.find_surface(context.scene)
     chosen = branches.branch_of(surface) if surface is not None else None
     if chosen is not None and several.is_lost(chosen):
-        layout.label(text="The folder has moved or been renamed", icon="ERROR")
+        draw_text(layout, context, "The folder has moved or been renamed", "ERROR")
         layout.operator("limber.relink", icon="FILE_REFRESH")
     if len(shown) < 2:
         return
     for branch in shown:
-        row = layout.row(align=True)
-        row.operator("limber.choose_branch", text=branch.name, depress=branch == chosen,
-                     icon="ERROR" if several.is_lost(branch) else "NONE").branch = branch.name
-        row.label(text=_told(branch))
+        layout.operator("limber.choose_branch", text=branch.name, depress=branch == chosen,
+                        icon="ERROR" if several.is_lost(branch) else "NONE").branch = branch.name
+        draw_text(layout, context, _told(branch), "BLANK1")
     row = layout.row(align=True)
     row.operator("limber.side_by_side", icon="MOD_ARRAY")
     row.operator("limber.side_by_side", text="In Place").back = True
@@ -99,11 +103,16 @@ def _told(branch: bpy.types.Collection) -> str:
     return ", ".join(words) or "E assumed"
 
 
-def draw_table(layout: bpy.types.UILayout, rows: Sequence[Sequence[str]]) -> None:
-    """Draw rows of words under each other, the first as wide as two of the others."""
+def draw_table(layout: bpy.types.UILayout, context: bpy.types.Context,
+               rows: Sequence[Sequence[str]]) -> None:
+    """Draw rows of words under each other, the first as wide as two of the others; above them if it
+    is wider."""
     column = layout.column(align=True)
     for first, *others in rows:
-        row = column.split(factor=0.46, align=True)
+        if width(first) > _FIRST_SHARE * room(context):
+            draw_text(column, context, first)
+            first = ""
+        row = column.split(factor=_FIRST_SHARE, align=True)
         row.label(text=first)
         cells = row.row(align=True)
         for words in others:

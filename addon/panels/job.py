@@ -1,16 +1,15 @@
 """The worker's activity, at the top of the tab while it works or after it failed."""
 
-import textwrap
-
 import bpy
 
 from .. import jobs
+from ..lines import draw_text
 from ..plain_words import plain
 from .sidebar import SidebarPanel
 
-_LETTERS = 40
 _LOG_LINES = 12
-_MODULI_LINES = 8
+_LONGEST_LINE = 400
+_MODULI = 32
 _OPEN = 100.0
 """Factor of uncertainty above which a modulus counts as unknown."""
 
@@ -28,36 +27,31 @@ class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
     def draw(self, context):
         job = jobs.current()
         if job is not None and job.state is jobs.JobState.RUNNING:
-            _draw_running(self.layout, job)
+            _draw_running(self.layout, context, job)
         elif job is not None and job.error:
-            column = self.layout.column(align=True)
-            column.label(text=f"{job.title} failed", icon="ERROR")
-            for line in textwrap.wrap(plain(job.error), _LETTERS)[:12]:
-                column.label(text=line)
+            draw_text(self.layout, context, f"{job.title} failed", "ERROR")
+            draw_text(self.layout, context, plain(job.error))
         if job is not None:
-            _draw_log(self.layout, job)
+            _draw_log(self.layout, context, job)
         for number, waiting in enumerate(jobs.waiting()):
             row = self.layout.row()
             row.label(text=f"Then: {waiting.title}", icon="TIME")
             row.operator("limber.cancel_job", text="", icon="X").waiting = number
 
 
-def _draw_running(layout: bpy.types.UILayout, job: jobs.Job) -> None:
-    layout.label(text=job.title)
+def _draw_running(layout: bpy.types.UILayout, context: bpy.types.Context, job: jobs.Job) -> None:
+    draw_text(layout, context, job.title)
     layout.progress(factor=job.fraction, text=f"{100 * job.fraction:.0f} %")
     column = layout.column(align=True)
-    column.label(text=job.message)
-    column.label(text=time_words(job))
-    for line in number_lines(job.numbers):
-        column.label(text=line)
+    for line in (job.message, time_words(job), *number_lines(job.numbers)):
+        draw_text(column, context, line)
     life, seconds = job.life()
     if life is not jobs.Life.WORKING:
-        for number, line in enumerate(textwrap.wrap(life.value.format(seconds), _LETTERS)):
-            column.label(text=line, icon="BLANK1" if number else "ERROR")
+        draw_text(column, context, life.value.format(seconds), "ERROR")
     layout.operator("limber.cancel_job", icon="X")
 
 
-def _draw_log(layout: bpy.types.UILayout, job: jobs.Job) -> None:
+def _draw_log(layout: bpy.types.UILayout, context: bpy.types.Context, job: jobs.Job) -> None:
     said = [line for line in job.log if line.strip()][-_LOG_LINES:]
     if not said:
         return
@@ -66,8 +60,7 @@ def _draw_log(layout: bpy.types.UILayout, job: jobs.Job) -> None:
     if body is not None:
         column = body.column(align=True)
         for line in said:
-            for part in textwrap.wrap(line, 2 * _LETTERS)[:3]:
-                column.label(text=part)
+            draw_text(column, context, line[:_LONGEST_LINE])
 
 
 def time_words(job: jobs.Job) -> str:
@@ -93,7 +86,8 @@ def number_lines(numbers: dict) -> list[str]:
         values = young.split()
         if isinstance(factor, str) and len(factor.split()) == len(values):
             values = [_with_interval(*pair) for pair in zip(values, factor.split(), strict=True)]
-        lines += textwrap.wrap(f"E {', '.join(values)} MPa", _LETTERS + 8)[:_MODULI_LINES]
+        more = f" and {len(values) - _MODULI} more" if len(values) > _MODULI else ""
+        lines.append(f"E {', '.join(values[:_MODULI])} MPa{more}")
     return lines
 
 

@@ -3,6 +3,7 @@
 import bpy
 
 from .. import branch_folder, branches
+from ..lines import draw_text
 from ..operators.replay import pulls_of
 
 
@@ -29,9 +30,8 @@ def _draw_timeline(layout: bpy.types.UILayout, context: bpy.types.Context, info:
     frames, scene = info["frames"], context.scene
     count = sum(thing.get(branches.SHOWS_KEY) == "observed" for thing in scene.objects)
     column = layout.column(align=True)
-    column.label(text=(f"{(frames['count'] - 1) / frames['rate_hz']:.3g} s, {count} points "
-                       "observed")
-                 if count else "No points were observed", icon="TIME")
+    draw_text(column, context, (f"{(frames['count'] - 1) / frames['rate_hz']:.3g} s, {count} "
+                                "points observed") if count else "No points were observed", "TIME")
     row = column.row(align=True)
     playing = bool(context.screen) and context.screen.is_animation_playing
     row.operator("limber.play", text="", icon="PAUSE" if playing else "PLAY")

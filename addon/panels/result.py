@@ -3,6 +3,7 @@
 import bpy
 
 from .. import branches, compat, preferences, properties, warming
+from ..lines import draw_text
 from ..operators import live_loads, seeing
 from ..overlays import graph as viewport_graph
 from .comparing import draw_branches
@@ -28,7 +29,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
             self.layout.prop(settings, "branch", text="", icon="OUTLINER")
         self.layout.prop(settings, "branch_folder", text="Folder")
         if surface is None and branches.branches(context.scene):
-            self.layout.label(text="Not shown: press Open Result", icon="INFO")
+            draw_text(self.layout, context, "Not shown: press Open Result", "INFO")
         draw_branches(self.layout, context)
         following = next_stage(context.scene)
         if following is not None:
@@ -43,18 +44,18 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         self.layout.prop(settings, "show_expert")
         if not preferences.has_worker():
             column = self.layout.column(align=True)
-            column.label(text="No worker was found.", icon="ERROR")
-            column.label(text="Choose the Python that has limber:")
+            draw_text(column, context, "No worker was found.", "ERROR")
+            draw_text(column, context, "Choose the Python that has limber:")
             column.operator("preferences.addon_show", text="Preferences",
                             icon="PREFERENCES").module = preferences.KEY
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
-            _draw_live(self.layout, settings)
-            _draw_colours(self.layout, surface, settings)
-            _draw_in_sight(self.layout, surface, settings)
+            _draw_live(self.layout, context, settings)
+            _draw_colours(self.layout, context, surface, settings)
+            _draw_in_sight(self.layout, context, surface, settings)
 
 
-def _draw_live(layout: bpy.types.UILayout, settings) -> None:
+def _draw_live(layout: bpy.types.UILayout, context: bpy.types.Context, settings) -> None:
     """Draw the loads on the branch while it is held, and their effect."""
     header, body = layout.panel("limber_live_loads", default_closed=True)
     header.label(text="Live Loads")
@@ -62,7 +63,7 @@ def _draw_live(layout: bpy.types.UILayout, settings) -> None:
         return
     column = body.column(align=True)
     for line in live_loads.lines or ["Grab the branch to see these loads act"]:
-        column.label(text=line)
+        draw_text(column, context, line)
     body.prop(settings, "live_weight")
     body.prop(settings.load, "use_wind")
     if settings.load.use_wind:
@@ -73,7 +74,8 @@ def _draw_live(layout: bpy.types.UILayout, settings) -> None:
     body.prop(settings.load, "cut")
 
 
-def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:
+def _draw_colours(layout: bpy.types.UILayout, context: bpy.types.Context,
+                  surface: bpy.types.Object, settings) -> None:
     """Draw the quantity that colours the branch, with the range of the colours."""
     info = branches.info_of(surface)
     header, body = layout.panel("limber_colours")
@@ -81,14 +83,14 @@ def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, setting
     if body is None:
         return
     for note in info["notes"]:
-        body.label(text=note)
+        draw_text(body, context, note)
     if info.get("frame_scalars"):
         body.prop(settings, "each_frame")
     name = _shown_scalar(surface)
     title, _, rest = _scale(info, settings, name)["title"].partition(" (") if name else ("", "", "")
     body.menu(LIMBER_MT_colours.bl_idname, text=_upper(title) or "Choose", icon="COLOR")
     if name:
-        body.label(text=_span(info["scalars"][name], rest), icon="BLANK1")
+        draw_text(body, context, _span(info["scalars"][name], rest), "BLANK1")
     if "stress_over_strength" in info["scalars"]:
         row = body.row(heading="Strength [Pa]")
         row.prop(settings.scene, "use_strength", text="")
@@ -140,7 +142,8 @@ def _span(scale: dict, rest: str) -> str:
     return f"{span} ({rest}" if rest else span
 
 
-def _draw_in_sight(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:
+def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context,
+                   surface: bpy.types.Object, settings) -> None:
     """Draw the parts of the branch that can be shown and hidden, and the choice of graph."""
     header, body = layout.panel("limber_in_sight", default_closed=True)
     header.label(text="Show")
@@ -160,7 +163,7 @@ def _draw_in_sight(layout: bpy.types.UILayout, surface: bpy.types.Object, settin
     body.prop(settings, "graph", text="")
     if settings.graph != viewport_graph.NONE and (
             settings.graph not in viewport_graph.graphs_of(surface)):
-        body.label(text=_NO_GRAPH[settings.graph], icon="INFO")
+        draw_text(body, context, _NO_GRAPH[settings.graph], "INFO")
 
 
 def register() -> None:

@@ -4,13 +4,16 @@ from typing import Any
 
 import bpy
 
+from ..lines import draw_pair
+
 _UNITS = {"m": "m", "m2": "m²", "m3": "m³", "mm": "mm", "pa": "Pa", "j": "J", "n": "N", "s": "s",
           "percent": "%", "mb": "MB", "hz": "Hz", "kg": "kg", "rad": "rad"}
 _MOST_LINES = 14
 _LONGEST_LIST = 6
 
 
-def draw_results(layout: bpy.types.UILayout, name: str, result: dict[str, Any]) -> None:
+def draw_results(layout: bpy.types.UILayout, context: bpy.types.Context, name: str,
+                 result: dict[str, Any]) -> None:
     """Draw a collapsible section with the numbers of a result."""
     lines = result_lines(result)
     if not lines:
@@ -20,9 +23,7 @@ def draw_results(layout: bpy.types.UILayout, name: str, result: dict[str, Any]) 
     if body is not None:
         column = body.column(align=True)
         for title, value in lines[:_MOST_LINES]:
-            row = column.row()
-            row.label(text=title)
-            row.label(text=value)
+            draw_pair(column, context, title, value)
 
 
 def result_lines(result: dict[str, Any]) -> list[tuple[str, str]]:

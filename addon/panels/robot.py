@@ -5,6 +5,7 @@ from pathlib import Path
 import bpy
 
 from .. import branches, jobs, live_force
+from ..lines import draw_text
 from ..operators.arming import LIMBER_OT_arm, why_not_armed
 from ..operators.worker_operator import redraw_sidebars
 from ..stages import stages
@@ -20,13 +21,13 @@ def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     folder = _folder(context)
     live = live_force.read(folder) if folder is not None else None
     if live is not None:
-        _draw_force(layout, live)
+        _draw_force(layout, context, live)
     if is_ours:
         row = layout.row()
         row.scale_y = 2.0
         row.alert = True
         row.operator("limber.cancel_job", text="Stop Robot", icon="CANCEL")
-        layout.label(text="Not an emergency stop: use the robot's own", icon="INFO")
+        draw_text(layout, context, "Not an emergency stop: use the robot's own", "INFO")
         return
     trouble = why_not_armed(context)
     column = layout.column()
@@ -34,20 +35,21 @@ def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     button.branch_uuid = branches.current_uuid(context.scene)
     if trouble:
         words, _, rest = trouble.partition(": ")
-        column.label(text=words, icon="LOCKED")
-        if rest:
-            column.label(text=rest, icon="BLANK1")
+        draw_text(column, context, words, "LOCKED")
+        draw_text(column, context, rest, "BLANK1")
 
 
-def _draw_force(layout: bpy.types.UILayout, live: live_force.LiveForce) -> None:
+def _draw_force(layout: bpy.types.UILayout, context: bpy.types.Context,
+                live: live_force.LiveForce) -> None:
     column = layout.column(align=True)
-    column.label(text=f"{live.title}: {live.step}" if live.step else live.title, icon="FORCE_FORCE")
+    draw_text(column, context, f"{live.title}: {live.step}" if live.step else live.title,
+              "FORCE_FORCE")
     words = "no reading" if live.force is None else f"{live.force:.2f} N"
     bar = column.row()
     bar.alert = live.share > 1.0
     bar.progress(factor=min(live.share, 1.0), text=f"{words} of {live.limit:.3g} N")
     expected = "" if live.expected is None else f", expected {live.expected:.2f} N"
-    column.label(text=f"Peak {live.peak:.2f} N{expected}")
+    draw_text(column, context, f"Peak {live.peak:.2f} N{expected}")
 
 
 def _moving() -> jobs.Job | None:

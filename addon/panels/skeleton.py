@@ -1,10 +1,9 @@
 """The part of the skeleton's panel that edits its nodes."""
 
-import textwrap
-
 import bpy
 
 from .. import branches
+from ..lines import draw_text
 from ..overlays import skeleton as overlay
 
 _BUTTONS = (("DELETE", "CONFIRM"), ("BRIDGE", "MERGE"), ("SPLIT", "ROOT"), ("RADIUS", "NONE"))
@@ -24,19 +23,19 @@ def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     if thing.mode != "EDIT":
         body.operator("limber.edit_skeleton", icon="EDITMODE_HLT")
     else:
-        body.label(text="Move: G. To bridge, merge or split, select", icon="INFO")
-        body.label(text="the branch, then with Shift the node to attach to", icon="BLANK1")
+        draw_text(body, context, "Move: G. To bridge, merge or split, select the branch, then "
+                  "with Shift the node to attach to", "INFO")
         for pair in _BUTTONS:
             row = body.row(align=True)
             for action in pair:
                 row.operator("limber.edit_node", text=_LABELS[action]).action = action
     column = body.column(align=True)
     for words in overlay.WORDS.values():
-        column.label(text=words, icon="DOT")
+        draw_text(column, context, words, "DOT")
     marks = overlay.marks_in_sight(thing)
     count = marks.edit_count
-    for number, line in enumerate(textwrap.wrap(marks.trouble, 44)):
-        body.label(text=line, icon="BLANK1" if number else "ERROR")
+    if marks.trouble:
+        draw_text(body, context, marks.trouble, "ERROR")
     row = body.row()
     row.enabled = bool(count or marks.trouble)
     row.operator("limber.apply_skeleton", text=f"Apply {count} Edits" if count else "Apply Edits",

@@ -3,6 +3,7 @@
 import bpy
 
 from .. import branches, warming
+from ..lines import draw_text
 from .sidebar import SidebarPanel
 
 
@@ -26,7 +27,7 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
         column.operator("limber.open_example", icon="PLAY")
         column.operator("limber.import_cloud", text="Import a Scan", icon="IMPORT").filepath = ""
         column.operator("limber.open_result", text="Open a Branch Folder", icon="FILE_FOLDER")
-        self.layout.label(text="A scan may also be dropped into the view")
+        draw_text(self.layout, context, "A scan may also be dropped into the view")
         if "Limber" not in bpy.data.workspaces:
             self.layout.operator("limber.workspace", icon="WORKSPACE")
 

@@ -1,13 +1,13 @@
 """One panel per step of the work, drawn from the stages' schema."""
 
 import json
-import textwrap
 from typing import Any
 
 import bpy
 
 from .. import branch_folder, branches, jobs, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
+from ..lines import draw_text, has_room_beside
 from ..plain_words import choice_title, first_sentence, plain
 from ..stages import Field, Stage, stages
 from ..steps import FIRST, PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
@@ -40,9 +40,10 @@ class StepPanel(SidebarPanel):
         layout.use_property_decorate = False
         view = step.view
         if len(branches.branches(context.scene)) > 1:
-            layout.label(text=f"Branch: {branches.current_name(context.scene)}", icon="OUTLINER")
+            draw_text(layout, context, f"Branch: {branches.current_name(context.scene)}",
+                      "OUTLINER")
         if step.hint:
-            layout.label(text=step.hint, icon="INFO")
+            draw_text(layout, context, step.hint, "INFO")
         _draw_fields(layout, context, view, names=step.fields)
         if step.name == "plan":
             layout.operator("limber.place_goal", icon="SPHERE")
@@ -165,22 +166,22 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     if view.stage == "plan" and state is StepState.DONE and stress_share(context.scene) > 1.0:
         state = StepState.OVER_STRENGTH
     if state is not StepState.NOT_RUN:
-        layout.label(text=state.words[0].upper() + state.words[1:], icon=state.icon)
+        draw_text(layout, context, state.words[0].upper() + state.words[1:], state.icon)
     folder = branches.current_folder(context.scene)
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("error"):
         draw_error(layout, context, stage, outcome)
     for warning in outcome.get("warnings", []):
-        _draw_text(layout, plain(warning, stage), "INFO")
+        draw_text(layout, context, plain(warning, stage), "INFO")
     result = outcome.get("result", {}) if entry is None else entry.result
     if view.stage == "plan":
-        draw_paths(layout, result, branch_folder.read_record(folder) if folder else None,
+        draw_paths(layout, context, result, branch_folder.read_record(folder) if folder else None,
                    stress_share(context.scene))
     elif view.stage == "estimate":
-        draw_moduli(layout, result)
+        draw_moduli(layout, context, result)
     if is_primary and view.stage in _GRAPHS and result:
         layout.operator("limber.graph", icon="GRAPH").graph = _GRAPHS[view.stage]
-    draw_results(layout, view.stage, result)
+    draw_results(layout, context, view.stage, result)
 
 
 def _draw_scene_button(layout: bpy.types.UILayout, context: bpy.types.Context, step: Step) -> None:
@@ -232,10 +233,17 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
         field.kind == "vector" and field.length == 3 and field.unit == "m"
         and field.name not in WAYS))
     has_region = stage.name == "plan" and field.name in REGIONS
+    heading = field.label
+    value = getattr(group, field.name) if field.kind in ("list", "rows") else ""
+    if field.kind != "boolean" and not has_room_beside(context, heading, value):
+        # Blender would cut one of them: the title stands above the field.
+        layout = layout.column(align=True)
+        draw_text(layout, context, heading)
+        heading = ""
     if not (field.is_optional and properties.has_switch(field)) and not has_place:
-        layout.prop(group, field.name)
+        layout.prop(group, field.name, **({} if heading else {"text": ""}))
         return
-    row = layout.row(heading=field.label)
+    row = layout.row(heading=heading)
     inner = row
     if field.is_optional:
         row.prop(group, properties.OPEN + field.name, text="")
@@ -254,7 +262,7 @@ def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: St
     """Draw what was seen, a button for each choice, and the full text on demand."""
     text = plain(outcome["error"], stage)
     short = first_sentence(text)
-    _draw_text(layout, short, "ERROR")
+    draw_text(layout, context, short, "ERROR")
     if trouble_mark.of(context.scene, stage) is not None:
         layout.label(text="The place is marked in the view", icon="EMPTY_AXIS")
     for choice in outcome.get("choices") or []:
@@ -268,13 +276,7 @@ def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: St
         header, body = layout.panel(f"limber_error_{stage.name}", default_closed=True)
         header.label(text="Why, and what to do")
         if body is not None:
-            _draw_text(body, text, "NONE")
-
-
-def _draw_text(layout: bpy.types.UILayout, text: str, icon: str) -> None:
-    column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(text, 44)):
-        column.label(text=line, icon=icon if number == 0 else "BLANK1")
+            draw_text(body, context, text)
 
 
 def register() -> None:

@@ -11,6 +11,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -159,6 +160,13 @@ def registered(addon, monkeypatch, worker_python):
     addon.unregister()
 
 
+@pytest.fixture()
+def whole_texts(addon, monkeypatch):
+    """Panels draw each text as one line, however wide: for tests of what they say."""
+    lines = importlib.import_module("limber_addon.lines")
+    monkeypatch.setattr(lines, "wrapped", lambda text, _space: (text,) if text else ())
+
+
 class _Ended:
     """A process that has ended, as a job sees one."""
 
@@ -215,3 +223,35 @@ def extension_zip(tmp_path_factory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "valid according to" in done.stderr
     return Path(done.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def has_worker(extension_zip) -> bool:
+    """Whether the zip brings the worker along, as wheels."""
+    with zipfile.ZipFile(extension_zip) as content:
+        return any(name.endswith(".whl") for name in content.namelist())
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory, worker_python, has_worker) -> dict[str, str]:
+    """An environment whose Blender keeps its settings in a folder of the test, with our worker or
+    with none but the zip's own."""
+    resources = {"BLENDER_USER_RESOURCES": str(tmp_path_factory.mktemp("resources"))}
+    if not has_worker:
+        return os.environ | resources | {"LIMBER_PYTHON": worker_python}
+    return {name: value for name, value in os.environ.items()
+            if name not in ("LIMBER_PYTHON", "PYTHONPATH")} | resources | {
+                "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
+
+
+@pytest.fixture(scope="module")
+def run(blender, environment, extension_zip):
+    """A function that runs Blender with the extension installed and enabled."""
+    def run(*arguments, timeout=120, **extra):
+        return subprocess.run([blender, *map(str, arguments)], check=False, capture_output=True,
+                              text=True, timeout=timeout, env=environment | extra)
+    installed = run("-b", "--command", "extension", "install-file", "-r", "user_default",
+                    "--enable", extension_zip)
+    assert installed.returncode == 0, installed.stdout + installed.stderr
+    assert 'Installed "limber"' in installed.stdout
+    return run

@@ -24,7 +24,7 @@ TOLD = {"status": "failed", "code": "InputError", "place": [1200.0, 2000.0, 300.
 
 
 @pytest.fixture()
-def failing(bpy, registered, tmp_path, monkeypatch):
+def failing(bpy, registered, whole_texts, tmp_path, monkeypatch):
     """A scan in millimetres, far from the origin, that a worker refuses until it is told to take
     the larger plant; what it was called with is written down."""
     scan = tmp_path / "twig.xyz"

@@ -12,6 +12,8 @@ import pytest
 
 from limber.store import Branch
 
+pytestmark = pytest.mark.usefixtures("whole_texts")
+
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 
@@ -247,7 +249,7 @@ def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, str
     """What is proven of its cost stands without a tick, above what is wrong with it."""
     comparing = importlib.import_module("limber_addon.panels.comparing")
     layout, path = Layout(), {"length_m": 0.1, "peak_strain": 0.007}
-    comparing.draw_paths(layout, {
+    comparing.draw_paths(layout, bpy.context, {
         "plan": path, "baseline": path, "certificate": {"gap_percent": 1.0},
         "strength": {"peak_strain": 0.0072, "median_strain": 0.006, "over": over,
                      "source": "green wood"}}, None, stress)

@@ -10,14 +10,11 @@ import os
 import shutil
 import subprocess
 import sys
-import time
-import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.addon.window import colour_count, driven, require_screen
 
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -26,38 +23,6 @@ from limber.store import Branch
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
 FOLDER = Path(__file__).parent
-
-
-@pytest.fixture(scope="module")
-def has_worker(extension_zip) -> bool:
-    """Whether the zip brings the worker along, as wheels."""
-    with zipfile.ZipFile(extension_zip) as content:
-        return any(name.endswith(".whl") for name in content.namelist())
-
-
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory, worker_python, has_worker) -> dict[str, str]:
-    """An environment whose Blender keeps its settings in a folder of the test, with our worker or
-    with none but the zip's own."""
-    resources = {"BLENDER_USER_RESOURCES": str(tmp_path_factory.mktemp("resources"))}
-    if not has_worker:
-        return os.environ | resources | {"LIMBER_PYTHON": worker_python}
-    return {name: value for name, value in os.environ.items()
-            if name not in ("LIMBER_PYTHON", "PYTHONPATH")} | resources | {
-                "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
-
-
-@pytest.fixture(scope="module")
-def run(blender, environment, extension_zip):
-    """A function that runs Blender with the extension installed and enabled."""
-    def run(*arguments, timeout=120, **extra):
-        return subprocess.run([blender, *map(str, arguments)], check=False, capture_output=True,
-                              text=True, timeout=timeout, env=environment | extra)
-    installed = run("-b", "--command", "extension", "install-file", "-r", "user_default",
-                    "--enable", extension_zip)
-    assert installed.returncode == 0, installed.stdout + installed.stderr
-    assert 'Installed "limber"' in installed.stdout
-    return run
 
 
 @pytest.mark.slow
@@ -181,7 +146,7 @@ def test_interface(run, blender, environment, beam, tmp_path):
     assert 1 < seen["frame_after_play"] <= len(beam.frames)
     assert not Path(f"/proc/{seen['left_running']}").exists(), "closing Blender ends the worker"
     for name in ("tab", "job", "opened", "playing"):
-        assert _colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
+        assert colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
 
 
 @pytest.mark.slow
@@ -249,7 +214,7 @@ def test_grab(run, blender, environment, beam, tmp_path):
     assert live["lines"][0].startswith("Sag") and "added 0.02 kg" in live["lines"][2]
     assert seen["after_live"] == ["", "", False]
     for name in ("grab", "loads"):
-        assert _colour_count(tmp_path / f"{name}.png") > 50
+        assert colour_count(tmp_path / f"{name}.png") > 50
 
 
 def test_first_path(run, blender, environment, tmp_path):
@@ -267,7 +232,7 @@ def test_first_path(run, blender, environment, tmp_path):
     assert seen["motion"] and seen["scan_hidden"]
     assert any("path" in name for name in seen["objects"]) and "Goal" in seen["objects"]
     for picture in ("1_empty", "2_scan", "3_branch", "4_path", "5_bent"):
-        assert _colour_count(tmp_path / f"{picture}.png") > 50
+        assert colour_count(tmp_path / f"{picture}.png") > 50
 
 
 def test_manual_pictures(run, blender, environment, tmp_path):
@@ -280,7 +245,7 @@ def test_manual_pictures(run, blender, environment, tmp_path):
     driven("drive_manual.py", blender, environment, tmp_path)
     Path(kept).mkdir(parents=True, exist_ok=True)
     for name in ("start", "stress", "young", "pull"):
-        assert _colour_count(tmp_path / f"{name}.png") > 50
+        assert colour_count(tmp_path / f"{name}.png") > 50
         _cropped(tmp_path / f"{name}.png").save(Path(kept) / f"{name}.png", optimize=True)
 
 
@@ -301,62 +266,4 @@ def test_skeleton(run, blender, environment, tmp_path):
     assert (seen["after_undo"], seen["still_editing"]) == (2, "EDIT")
     assert seen["node_count_after"] < seen["node_count"] and seen["edited"] >= 1
     for name in ("edited", "applied"):
-        assert _colour_count(tmp_path / f"{name}.png") > 50
-
-
-def require_screen() -> None:
-    missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
-    if missing:
-        pytest.skip(f"NO {' AND '.join(missing)}: scripts/provision_blender --gui-test brings it")
-
-
-def driven(script: str, blender: str, environment: dict[str, str], folder: Path) -> dict:
-    """Run a script that drives Blender in a window; return what it has seen."""
-    with virtual_screen() as display:
-        process = subprocess.Popen(
-            [blender, "--enable-event-simulate", "--window-geometry", "0", "0", "1280", "800",
-             "--python", str(FOLDER / script), "--", str(folder)],
-            env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE, text=True)
-        try:
-            _take_pictures(folder, display, process)
-        finally:
-            process.kill()
-    assert (folder / "log.json").is_file(), process.stderr.read()[-2000:]
-    seen = json.loads((folder / "log.json").read_text())
-    assert seen["error"] is None, seen
-    return seen
-
-
-@contextmanager
-def virtual_screen() -> Iterator[str]:
-    """A screen of 1280 x 800 without a monitor; gives its DISPLAY."""
-    read, write = os.pipe()
-    server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
-        pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    os.close(write)
-    try:
-        with os.fdopen(read) as stream:
-            yield f":{stream.readline().strip()}"
-    finally:
-        server.terminate()
-        server.wait(10)
-
-
-def _take_pictures(folder: Path, display: str, process: subprocess.Popen) -> None:
-    """Take a picture of the screen whenever Blender asks for one; return when it has ended."""
-    end = time.monotonic() + 240
-    while process.poll() is None and time.monotonic() < end:
-        for request in folder.glob("*.request"):
-            picture = request.with_suffix(".png")
-            subprocess.run(["import", "-display", display, "-window", "root", str(picture)],
-                           check=True, timeout=30)
-            request.unlink()
-        time.sleep(0.02)
-
-
-def _colour_count(path: Path) -> int:
-    from PIL import Image
-
-    return len(Image.open(path).convert("RGB").getcolors(1 << 24))
+        assert colour_count(tmp_path / f"{name}.png") > 50

@@ -1,0 +1,47 @@
+"""Texts in lines as wide as the sidebar."""
+
+import importlib
+
+import pytest
+
+
+@pytest.fixture()
+def lines(addon):
+    return importlib.import_module("limber_addon.lines")
+
+
+def test_no_line_is_wider_than_there_is_room(lines):
+    """Words stay whole where they fit; one that is too wide is broken; nothing is lost."""
+    text = "The path /home/somebody/branches/an-apple-tree/the-scan-of-a-branch.ply is none."
+    found = lines.wrapped(text, 120.0)
+    assert all(lines.width(line) <= 120.0 for line in found)
+    assert "".join(found).replace(" ", "") == text.replace(" ", "")
+    assert found[0] == "The path"
+    assert lines.wrapped("A few words", 400.0) == ("A few words",)
+    assert lines.wrapped("", 400.0) == ()
+
+
+def test_a_narrow_sidebar_makes_more_lines(bpy, lines):
+    """A sidebar that is dragged wider has longer lines; without one it has its usual width."""
+    region = type("Region", (), {"type": "UI", "width": 600})()
+    wide = type("Context", (), {"region": region, "preferences": bpy.context.preferences})()
+    assert lines.room(wide) > 2 * lines.room(bpy.context) > 0
+    text = "A text of some length that has to be put into several lines"
+    assert len(lines.wrapped(text, lines.room(wide))) < len(
+        lines.wrapped(text, lines.room(bpy.context)))
+
+
+def test_what_does_not_fit_beside_stands_above(bpy, lines):
+    """A title too wide, or a text too wide for its field, leaves the field its own line."""
+    assert lines.has_room_beside(bpy.context, "Poisson", "")
+    assert not lines.has_room_beside(bpy.context, "Interpolated radius", "")
+    assert not lines.has_room_beside(bpy.context, "Young", "6e+07, 4e+07, 2.5e+07, 1.5e+07")
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (60000000.0, "6e+07"), (0.1, "0.1"), (900.0, "900.0"), (123456.0, "123456.0"), (3, "3")])
+def test_numbers_are_short(addon, value, text):
+    """As short as their single precision allows, and the same number again."""
+    number_text = importlib.import_module("limber_addon.stages").number_text
+    assert number_text(value) == text
+    assert float(text) == value

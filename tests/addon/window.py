@@ -1,0 +1,75 @@
+"""A Blender with a window on a screen of its own: driven by a script, its pictures taken."""
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent
+
+
+def require_screen() -> None:
+    missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"NO {' AND '.join(missing)}: scripts/provision_blender --gui-test brings it")
+
+
+def driven(script: str, blender: str, environment: dict[str, str], folder: Path,
+           size: tuple[int, int] = (1280, 800)) -> dict:
+    """Run a script that drives Blender in a window as large as the screen; return what it has seen.
+    """
+    with virtual_screen(size) as display:
+        process = subprocess.Popen(
+            [blender, "--enable-event-simulate", "--window-geometry", "0", "0", *map(str, size),
+             "--python", str(FOLDER / script), "--", str(folder)],
+            env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, text=True)
+        try:
+            _take_pictures(folder, display, process)
+        finally:
+            process.kill()
+    assert (folder / "log.json").is_file(), process.stderr.read()[-2000:]
+    seen = json.loads((folder / "log.json").read_text())
+    assert seen["error"] is None, seen
+    return seen
+
+
+@contextmanager
+def virtual_screen(size: tuple[int, int]) -> Iterator[str]:
+    """A screen of this width and height without a monitor; gives its DISPLAY."""
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "{}x{}x24".format(*size), "-nolisten",
+         "tcp"],
+        pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.close(write)
+    try:
+        with os.fdopen(read) as stream:
+            yield f":{stream.readline().strip()}"
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+def _take_pictures(folder: Path, display: str, process: subprocess.Popen) -> None:
+    """Take a picture of the screen whenever Blender asks for one; return when it has ended."""
+    end = time.monotonic() + 240
+    while process.poll() is None and time.monotonic() < end:
+        for request in folder.glob("*.request"):
+            picture = request.with_suffix(".png")
+            subprocess.run(["import", "-display", display, "-window", "root", str(picture)],
+                           check=True, timeout=30)
+            request.unlink()
+        time.sleep(0.02)
+
+
+def colour_count(path: Path) -> int:
+    from PIL import Image
+
+    return len(Image.open(path).convert("RGB").getcolors(1 << 24))
