@@ -26,6 +26,18 @@ def first_sentence(text: str) -> str:
     return _SENTENCE.split(text.strip(), maxsplit=1)[0]
 
 
+def settings_in(text: str, stage: Stage) -> list[Field]:
+    """Return the settings of ``stage`` that the worker's text names without a value, each once.
+
+    Only the user knows the value. Switches are buttons of their own.
+    """
+    named = [match["name"].replace("-", "_") for match in _OPTION.finditer(text)
+             if not _is_value(stage.fields.get(match["name"].replace("-", "_")), match["value"])]
+    return [stage.fields[name] for name in dict.fromkeys(named)
+            if name in stage.fields and stage.fields[name] in stage.own_fields
+            and stage.fields[name].kind != "boolean"]
+
+
 def choice_title(stage: Stage, option: str, value: object) -> str:
     """Return the button's title of a choice; empty if the stage has no such setting."""
     field = stage.fields.get(option)
@@ -52,9 +64,13 @@ def _setting(match: re.Match, stage: Stage | None) -> str:
             f"{off.title}: off{f' {value}' if value else ''}")
     if not value:
         return field.title
-    is_value = field.kind in ("choice", "number", "integer") and (
-        value.rstrip(".") in field.choices or value[0].isdigit())
-    return f"{field.title}: {value}" if is_value else f"{field.title} {value}"
+    return f"{field.title}: {value}" if _is_value(field, value) else f"{field.title} {value}"
+
+
+def _is_value(field: Field | None, word: str | None) -> bool:
+    """Whether the word after an option is its value; it may as well be the next of the sentence."""
+    return field is not None and bool(word) and field.kind in ("choice", "number", "integer") and (
+        word.rstrip(".") in field.choices or word[0].isdigit())
 
 
 def _field(name: str, stage: Stage | None) -> Field | None:

@@ -8,7 +8,7 @@ import bpy
 from .. import branch_folder, branches, jobs, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
 from ..lines import draw_text, has_room_beside
-from ..plain_words import choice_title, first_sentence, plain
+from ..plain_words import choice_title, first_sentence, plain, settings_in
 from ..stages import Field, Stage, stages
 from ..steps import FIRST, PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
 from ..steps import next_step as step_after
@@ -259,7 +259,7 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
 
 def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
                outcome: dict[str, Any]) -> None:
-    """Draw what was seen, a button for each choice, and the full text on demand."""
+    """Draw what was seen, a button for each choice, the settings named, and the text on demand."""
     text = plain(outcome["error"], stage)
     short = first_sentence(text)
     draw_text(layout, context, short, "ERROR")
@@ -272,6 +272,8 @@ def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: St
             button.stage, button.option = stage.name, choice["option"]
             button.value = json.dumps(choice["value"])
             button.branch_uuid = branches.current_uuid(context.scene)
+    for field in settings_in(outcome["error"], stage):
+        _draw_field(layout, context, stage, field)
     if text != short:
         header, body = layout.panel(f"limber_error_{stage.name}", default_closed=True)
         header.label(text="Why, and what to do")

@@ -64,6 +64,7 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
     assert not [text for text in labels if "--" in text]
     assert ("operator", "limber.take_choice", "Plants: largest") in drawn.calls
     assert drawn.names("operator").count("limber.take_choice") == 1, "what is unknown has no button"
+    assert {"crop_low", "crop_high"} <= set(drawn.names("prop")), "settings without a value"
     result = bpy.ops.limber.take_choice(stage="reconstruct", option="plants", value='"largest"')
     assert result == {"FINISHED"}
     assert "--plants" in json.loads(failing.read_text().splitlines()[-1])
@@ -82,6 +83,15 @@ def test_options_are_told_by_their_titles(addon, stage, text, wanted):
     """As the panels call them; what no panel has stays as it is."""
     words = part("plain_words").plain(text, part("stages").stages()[stage])
     assert words == (text if wanted is None else wanted)
+
+
+def test_settings_without_a_value_are_shown(addon):
+    """Each once, in the text's order: not those with a value, switches, or what no panel keeps."""
+    stage = part("stages").stages()["reconstruct"]
+    found = part("plain_words").settings_in(
+        "Crop it (--crop-low, --crop-high), join (--plants joined), give --root or --crop-low; "
+        "--no-keep-sheets, --output, --such-a-thing.", stage)
+    assert [field.name for field in found] == ["crop_low", "crop_high", "root"]
 
 
 @pytest.mark.slow

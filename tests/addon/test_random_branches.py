@@ -30,6 +30,10 @@ class Run:
         self.written = {}
         for folder in folders:
             self.open(folder)
+        self.library = folders[0].with_name("others.blend")
+        self.kept = [one.name for one in self.shown()]
+        bpy.data.libraries.write(str(self.library), {bpy.data.collections[name]
+                                                     for name in self.kept})
 
     def uuid(self, folder):
         return json.loads((Path(folder) / "branch.json").read_text())["uuid"]
@@ -52,6 +56,13 @@ class Run:
         settings = self.bpy.context.scene.limber
         items = part("properties")._branches_to_choose(settings, None)
         settings.branch = self.chance.choice(items)[0]
+
+    def append(self):
+        """Append a branch's collection from another file, as a user does from a colleague's."""
+        name = self.chance.choice(self.kept)
+        with self.bpy.data.libraries.load(str(self.library)) as (_, taken):
+            taken.collections = [name]
+        self.bpy.context.scene.collection.children.link(taken.collections[0])
 
     def rename(self):
         if self.shown():
@@ -150,9 +161,10 @@ def quick_worker(worker_here, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1])
 def test_random_operators_write_to_the_named_branch_alone(bpy, three, quick_worker, seed):
-    """Opened, clicked, chosen, renamed, deleted, undone, swapped on the disk, written."""
+    """Opened, clicked, chosen, appended, renamed, deleted, undone, swapped on the disk, written."""
     run = Run(bpy, three, seed)
-    kinds = ["open", "switch", "switch", "choose", "rename", "delete", "swap", "target",
+    kinds = ["open", "switch", "switch", "choose", "append", "rename", "delete", "swap",
+             "target",
              "target", "late_target", "undo", "redo"]
     for _ in range(COUNT):
         kind = run.chance.choice(kinds)

@@ -3,7 +3,7 @@
 import pytest
 
 from limber.core.errors import InputError
-from limber.stages.offers import offers
+from limber.stages.offers import offers, position_in
 from limber.stages.registry import stage_schema
 
 
@@ -28,3 +28,15 @@ def test_an_error_says_where_it_is():
     """As three plain numbers, of any array; without one, it has no place."""
     assert InputError("Two plants.").place is None
     assert InputError("Two plants.").at(iter((1, 2.5, 3))).place == (1.0, 2.5, 3.0)
+
+
+@pytest.mark.parametrize(("stage", "text", "wanted"), [
+    ("plan", "The branch is 3 mm inside post at (0.1, -0.2, 3e-1) m.", [0.1, -0.2, 0.3]),
+    ("load", "A point at [ 0.1  0.2 12. ] m is too far.", [0.1, 0.2, 12.0]),
+    ("plan", "Flange at (0.1, 0.2, 0.3) m in the robot's base frame.", None),
+    ("plan", "It is (0.1, 0.2) m wide and weighs (1, 2, 3) kg.", None),
+    ("execute", "The path leaves the workspace at (0.1, 0.2, 0.3) m.", None),
+    ("reconstruct", "Faces cross, one of them at (0.1, 0.2, 0.3) m.", None)])
+def test_a_position_in_the_text_is_the_place(stage, text, wanted):
+    """In metres of the branch's frame alone: not of the robot, nor of the scan's file."""
+    assert position_in(stage_schema(stage), text) == wanted

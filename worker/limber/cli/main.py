@@ -290,7 +290,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
             result = error.result
         outcome |= {"status": error.status, "error": str(error), "fix": error.fix,
                     "code": type(error).__name__, "choices": _choices(name, error),
-                    "place": list(error.place) if error.place else None}
+                    "place": _position(name, error)}
     except KeyboardInterrupt:
         code = 130
         outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}
@@ -314,6 +314,15 @@ def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
     from limber.stages.offers import offers
 
     return offers(stage_schema(name), f"{error.why} {error.fix}")
+
+
+def _position(name: str, error: LimberError) -> list[float] | None:
+    """Return the position of the problem: as the error has it, else as its text names it."""
+    if error.place or name not in stage_summaries():
+        return list(error.place) if error.place else None
+    from limber.stages.offers import position_in
+
+    return position_in(stage_schema(name), error.seen)
 
 
 def _say(text: str) -> None:

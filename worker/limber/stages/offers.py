@@ -1,9 +1,27 @@
-"""Remedies offered in an error's text: options of the stage, with their values."""
+"""What an error's text offers: options of the stage with their values, and a position."""
 
 import re
 from typing import Any
 
 _OPTION = re.compile(r"--(?P<name>[a-z][a-z0-9-]*)(?:[ =](?P<value>[^\s,;:()]+))?")
+
+_NUMBER = r"-?\d+(?:\.\d*)?(?:e[-+]?\d+)?"
+_PLACE = re.compile(rf"[(\[]\s*({_NUMBER})[,\s]\s*({_NUMBER})[,\s]\s*({_NUMBER})\s*[)\]] m\b"
+                    r"(?! in the)")
+
+
+def position_in(schema: dict[str, Any], text: str) -> list[float] | None:
+    """Return the first position that a text names, in the branch's frame [m]; None without.
+
+    Args:
+        schema: Schema of the stage. One that makes a branch has no frame yet, and one that moves a
+            robot may mean the frame of the robot's base: theirs are not taken from the text.
+        text: What the user reads, for example "inside the post at (0.1, 0.2, 0.3) m".
+    """
+    if schema["moves_robot"] or "branch_folder" not in schema["inputs"].get("properties", {}):
+        return None
+    match = _PLACE.search(text)
+    return [float(value) for value in match.groups()] if match else None
 
 
 def offers(schema: dict[str, Any], text: str) -> list[dict[str, Any]]:
