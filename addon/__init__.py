@@ -37,6 +37,7 @@ MODULES = (
     "panels.robot",
     "panels.steps",
     "panels.play",
+    "panels.pie",
     "overlays.skeleton",
     "overlays.legend",
     "overlays.graph",

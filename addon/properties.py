@@ -244,7 +244,7 @@ def _property(field: Field, options: set[str], pattern: str = "") -> Any:
         return bpy.props.BoolProperty(default=bool(field.default), **about)
     if field.kind == "choice":
         items = [(choice, choice.replace("_", " ").capitalize() if len(choice) > 2 else choice,
-                  field.description) for choice in field.choices]
+                  field.about(choice)) for choice in field.choices]
         return bpy.props.EnumProperty(items=items, default=field.default or items[0][0], **about)
     if field.kind == "integer":
         least = -_LARGEST_INTEGER if field.least is None else int(field.least) + field.is_open

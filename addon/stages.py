@@ -7,6 +7,7 @@ packages. No bpy here.
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -70,6 +71,15 @@ class Field:
     def label(self) -> str:
         """The title with the unit."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def about(self, choice: str) -> str:
+        """Return what the description says of a choice, where it has the form "choice: text"; else
+        all of it.
+        """
+        names = "|".join(re.escape(name) for name in self.choices)
+        parts = re.split(rf"(?:^|(?<=[.;:,] ))({names}): ", self.description)
+        told = dict(zip(parts[1::2], parts[2::2], strict=True))
+        return told.get(choice, self.description).rstrip(" ;,")
 
     def typed(self, value: Any) -> list[str]:
         """Return ``value`` as options of a command line; SettingError if it is invalid."""
