@@ -1,7 +1,11 @@
 """What an error's text offers becomes options of the stage with values."""
 
+import json
+from pathlib import Path
+
 import pytest
 
+from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.stages.offers import offers, position_in
 from limber.stages.registry import stage_schema
@@ -40,3 +44,12 @@ def test_an_error_says_where_it_is():
 def test_a_position_in_the_text_is_the_place(stage, text, wanted):
     """In metres of the branch's frame alone: not of the robot, nor of the scan's file."""
     assert position_in(stage_schema(stage), text) == wanted
+
+
+@pytest.mark.slow
+def test_the_place_is_in_the_result(capsys):
+    """A cut beside the branch: the last line says where it was asked for. Slow: loads a branch."""
+    example = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+    assert call(["load", str(example), "--cut", "9", "8", "7", "--json"]) == 2
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["place"] == [9.0, 8.0, 7.0], told["error"]
