@@ -24,14 +24,15 @@ from limber.estimation.fitting.initial_modulus import led_start, scaled_start, s
 from limber.estimation.fitting.large_errors import (
     ROUNDS,
     SMALL_RAD,
-    far_points,
+    FarPoints,
+    FarPointsError,
     fitted_frame,
     put_right,
 )
 from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
-from limber.estimation.forward.forward_model import under_its_weight
+from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.judgement import MISFIT_FACTOR, Estimate, hold_out, judge_fit
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
@@ -90,23 +91,24 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     def in_frame(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
                  log: EvaluationLog) -> Estimate:
         shifts: dict[str, np.ndarray] = {}
-        found = in_place(pulls, branch, chosen, log, shifts)
-        for _ in range(ROUNDS - 1):
-            far = None if found.stopped else far_points(found.cell_errors, shifts)
-            if far is None:
-                break
-            shifts = far
-            found = in_place(pulls, branch, chosen, EvaluationLog(None, ""), shifts)
-        return found
+        near: Values | None = None
+        for rounds_left in reversed(range(ROUNDS)):
+            forwards = forwards_of(pulls, branch, chosen, progress, shifts)
+            try:
+                return of_forwards(forwards, branch, chosen, log, near,
+                                   FarPoints(shifts) if rounds_left else None)
+            except FarPointsError as far:
+                shifts, near, log = far.shifts, far.values, EvaluationLog(None, "")
+        raise AssertionError("the last round looks for no far points")
 
-    def in_place(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
-                 log: EvaluationLog, shifts: dict[str, np.ndarray]) -> Estimate:
-        forwards = forwards_of(pulls, branch, chosen, progress, shifts)
+    def of_forwards(forwards: list[Forward], branch: Subject, chosen: EstimateSettings,
+                    log: EvaluationLog, near: Values | None, far: FarPoints | None) -> Estimate:
         objective = Objective(forwards, parameter_space(branch, forwards, chosen),
                               log=log, force_sigma=[pull.entry.sensor.force_sigma_n
                                                     for pull in pulls], progress=progress,
                               expected_count=20 if chosen.method == "gauss-newton" else 200)
-        return fit_pulls(objective, branch.start, chosen, progress, cache=cache)
+        return fit_pulls(objective, branch.start, chosen, progress, cache=cache, near=near,
+                         far=far)
 
     def fitted(branch: Subject) -> Estimate:
         try:
@@ -195,17 +197,24 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
               progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
-              ) -> Estimate:
+              near: Values | None = None, far: FarPoints | None = None) -> Estimate:
     """Check what the data determine, fit the moduli, and compute their uncertainty.
 
     Args:
+        near: Values near the solution, to start from if they have an equilibrium.
+        far: Ends the fit if it finds points far from where they were simulated.
         cache, digest: Folder of the reduced bases, and digest of their dependencies; see
             :class:`limber.estimation.fitting.reduced_fit.Reduction`.
     """
     require_scale_in_principle(objective.forwards)
     reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"
                  else None)
-    start, first = _standing(objective, start, settings, progress, reduction)
+    first = None if near is None else objective.evaluate(objective.space.pack(near),
+                                                         jacobian=True)
+    if near is not None and first is not None:
+        start = near
+    else:
+        start, first = _standing(objective, start, settings, progress, reduction)
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
@@ -217,6 +226,8 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     except Stopped:
         fit = best_so_far(objective)
     stopped = fit.status is FitStatus.stopped
+    if far is not None and not stopped:
+        far.look(fit.evaluation, objective)
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
         fit = averaged(fit, objective)

@@ -5,20 +5,21 @@ turned back, and a point that is a centimetre off along a bent branch is moved t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from limber.core.numerics.rigid import rotated
 from limber.core.present import present
+from limber.estimation.fitting.nuisances import told
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.parameters import Values
 from limber.recordings.recording import Pull
 
 ROUNDS = 4
 """Most fits. 20 degrees need three."""
 SMALL_RAD = 5e-3
 """Turn below which its square no longer matters: 0.01 mm at half a metre."""
-
-
 FAR_M = 4e-3
 """Distance along the branch beyond which a point is moved: with a radius of curvature of 15 cm its
 square is 0.05 mm.
@@ -60,3 +61,28 @@ def put_right(pull: Pull, shift: np.ndarray, turn: np.ndarray) -> Pull:
     middle = np.nanmean(points, axis=(0, 1))
     back = rotated(-turn, (points - middle).reshape(-1, 3)).reshape(points.shape)
     return replace(pull, observations=replace(seen, positions=middle + back))
+
+
+class FarPointsError(Exception):
+    """Points are far from where they were simulated: the pulls are fitted again there."""
+
+    def __init__(self, shifts: dict[str, np.ndarray], values: Values):
+        super().__init__()
+        self.shifts, self.values = shifts, values
+
+
+@dataclass(frozen=True)
+class FarPoints:
+    """Looks whether a fit has moved points far along the branch from ``shifts`` [m]."""
+
+    shifts: dict[str, np.ndarray]
+
+    def look(self, evaluation: Evaluation, objective: Objective) -> None:
+        """Raise FarPointsError if it has."""
+        if evaluation.errors is None:
+            return
+        size = objective.space.size
+        listed = told(objective.cell_errors.nuisances, evaluation.errors, np.zeros((size, size)))
+        far = far_points(listed, self.shifts)
+        if far is not None:
+            raise FarPointsError(far, objective.space.unpack(evaluation.free))
