@@ -188,5 +188,5 @@ def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress
     if np.nanmax(off) > limit:
         progress.warn(
             f"{pull.name}: at rest, the observed points are up to {np.nanmax(off) * 1e3:.0f} mm "
-            "away from their positions on this branch. Possible causes are another branch, "
-            "another frame of reference, or another order of the markers.")
+            "away from their positions on this branch. Possible causes are a scan whose tip is "
+            "short, another branch, another frame of reference, or another order of the markers.")

@@ -14,6 +14,7 @@ from typing import TypedDict
 import numpy as np
 
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.parameters import YOUNG_BOUNDS_PA
 from limber.estimation.uncertainty.covariance import Uncertainty, inverse_information
 from limber.estimation.uncertainty.model_error import ModelError, total_interval
 from limber.estimation.uncertainty.variance_parts import InformationRows, information_rows
@@ -121,7 +122,9 @@ class Prospects:
         share = then / self._now
         interval = self._middle[:, None] + share[:, None] * (
             self._interval - self._middle[:, None])
-        return {"action": action, "how": how, "young_interval_pa": np.exp(interval).tolist(),
+        # Wider than any modulus means unknown.
+        interval = np.exp(np.clip(interval, *np.log(YOUNG_BOUNDS_PA)))
+        return {"action": action, "how": how, "young_interval_pa": interval.tolist(),
                 "width_share": float(share.mean())}
 
     def _deviation(self, rows: Sequence[InformationRows], pull_count: int | None = None,
