@@ -48,7 +48,7 @@ def draw_paths(layout: bpy.types.UILayout, context: bpy.types.Context, result: d
         draw_text(layout, context, f"May break: stress {stress_share:.2g} times the strength",
                   "ERROR")
     if legs := result.get("legs"):
-        draw_table(layout, [["Leg", "Time [s]", "Force [N]"], *(
+        draw_table(layout, context, [["Leg", "Time [s]", "Force [N]"], *(
             [str(leg["name"]).capitalize(), _number(leg.get("duration_s"), 1.0),
              _number(leg.get("peak_force_n"), 1.0)] for leg in legs)])
     others = {key.removeprefix(_PLAN): entry.result for key, entry in (

@@ -40,8 +40,8 @@ def pages() -> dict[str, str]:
         "reference/commands.md": commands_page(),
         "reference/pull_toml.md": _model_page("pull.toml", PullEntry, (
             "The settings of a recording, in `pulls/NAME/pull.toml`. `limber import-pull` and "
-            "`limber record` write it. `import-pull --pull-toml mine.toml` replaces entries by your "
-            "own. Do not edit the copy in the branch folder: it is compared with its checksum.")),
+            "`limber record` write it. `import-pull --pull-toml mine.toml` replaces entries by "
+            "yours. Do not edit the copy in the branch folder: it is compared with its checksum.")),
         "reference/cell_toml.md": _model_page("The cell file", Cell, (
             "`cell.toml` says which robot stands where, what it holds, and what it must not "
             "exceed. Lengths are in metres, angles in radians, masses in kilograms.")),
