@@ -122,7 +122,7 @@ def test_units_and_experts_are_in_the_schema():
     """A panel finds units, titles, groups and what only experts are shown."""
     properties = stage_schema("simulate")["settings"]["properties"]
     assert properties["young"]["unit"] == "Pa"
-    assert properties["newmark_beta"]["expert"] and not properties["young"]["expert"]
+    assert properties["lumped_mass"]["expert"] and not properties["young"]["expert"]
     assert properties["damping_mass"] | {"title": "Damping mass", "group": "material"} == (
         properties["damping_mass"])
 
@@ -131,9 +131,9 @@ def test_help_shows_what_most_users_choose(capsys):
     """--help leaves other options out and says so; --help-all has them."""
     assert main.call(["simulate", "--help"]) == 0
     short = capsys.readouterr().out
-    assert "--newmark-beta" not in short and "--help-all" in short and "Material:" in short
+    assert "--lumped-mass" not in short and "--help-all" in short and "Material:" in short
     assert main.call(["simulate", "--help-all"]) == 0
-    assert "--newmark-beta" in capsys.readouterr().out
+    assert "--lumped-mass" in capsys.readouterr().out
 
 
 def test_help_shows_about_a_fifth():

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import core_schema
 
 from limber.core.errors import InputError
@@ -131,6 +131,8 @@ class Settings(BaseModel):
             its bases.
         common: Fields that ``--help`` shows besides required ones: those that most users choose.
             ``--help-all`` shows the others too.
+        retired: Former fields that are constants of the class now. A folder, a preset or a job file
+            that states the constant's value is as before; another value is refused.
         results_version: Increased when the same settings on the same input give other results than
             before. Branches then count as out of date, and a batch runs the stage again.
     """
@@ -139,7 +141,24 @@ class Settings(BaseModel):
 
     groups: ClassVar[Groups] = {}
     common: ClassVar[tuple[str, ...]] = ()
+    retired: ClassVar[tuple[str, ...]] = ()
     results_version: ClassVar[int] = 1
+
+    @classmethod
+    def without_retired(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return values by name, without former fields that have the constant's value."""
+        former = cls._former()
+        return {name: value for name, value in values.items()
+                if name not in former or value != getattr(cls, name)}
+
+    @classmethod
+    def _former(cls) -> list[str]:
+        return sorted({name for base in cls.__mro__ for name in vars(base).get("retired", ())})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_retired(cls, values: Any) -> Any:
+        return cls.without_retired(values) if isinstance(values, Mapping) else values
 
     @classmethod
     def group_of(cls, name: str) -> str:
@@ -165,7 +184,7 @@ class Settings(BaseModel):
             content["expert"] = cls.is_expert(name)
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
-        return schema
+        return schema | ({"retired": former} if (former := cls._former()) else {})
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

@@ -26,11 +26,15 @@ class EstimateSettings(Settings):
         "input": ("pull", "drive", "motion", "fractions", "free_frame"),
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping"),
-        "solver": ("method", "forward", "key_frames", "evaluations", "delta_m2", "robust"),
+        "solver": ("method", "forward", "key_frames", "delta_m2", "robust"),
         "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
                         "mesh_check", "shapes"),
     }
     common = ("pull", "fractions")
+    retired = ("evaluations",)
+
+    evaluations: ClassVar[int] = 400
+    """Largest number of forward simulations of all pulls."""
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -72,8 +76,6 @@ class EstimateSettings(Settings):
     key_frames: int = Field(
         12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
         "number is doubled if that changes the result.")
-    evaluations: int = Field(400, ge=1, description="Largest number of forward simulations of "
-        "all pulls.")
     delta_m2: float | None = Field(
         None, gt=0, description="Nelder-Mead stops at this mean squared distance [m^2].")
     robust: bool = Field(True, description="Reduce the weight of outliers (Gauss-Newton).")

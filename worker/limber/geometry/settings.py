@@ -15,9 +15,18 @@ class PreparationSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("crop_low", "crop_high", "camera_at"),
-        "shape": ("flying_angle", "flying_speck", "silhouette_reach", "keep_sheets",
-            "outlier_ratio", "outlier_neighbours", "outlier_radius", "voxel"),
+        "shape": ("flying_angle", "keep_sheets", "outlier_ratio", "outlier_radius", "voxel"),
     }
+    retired = ("flying_speck", "silhouette_reach", "outlier_neighbours")
+
+    flying_speck: ClassVar[int] = 20
+    """Depth camera: groups of fewer pixels are removed as flying pixels."""
+    silhouette_reach: ClassVar[float] = 1.5
+    """Depth camera: a twig is kept if, as seen by the camera, it reaches this many radii of its
+    parent beyond the parent's axis.
+    """
+    outlier_neighbours: ClassVar[int] = 8
+    """Neighbours whose distance or number decides whether a point is an outlier."""
 
     crop_low: tuple[float, float, float] | None = Field(
         None, description="Lower corner of the box to keep, in the file's coordinates.")
@@ -30,22 +39,14 @@ class PreparationSettings(Settings):
         78.0, ge=0, lt=90, description="Depth camera: a step between neighbouring pixels is not "
         "a surface if that surface would be seen at a larger angle than this [degrees]. 0 keeps "
         "flying pixels.")
-    flying_speck: int = Field(
-        20, ge=1, description="Depth camera: groups of fewer pixels are removed as flying "
-        "pixels.")
-    silhouette_reach: float = Field(
-        1.5, ge=0, description="Depth camera: keep a twig if, as seen by the camera, it reaches "
-        "this many radii of its parent beyond the parent's axis. 0 keeps all.")
     keep_sheets: bool = Field(
         False, description="Keep walls and ground. Default: wide flat sheets are removed.")
     outlier_ratio: float = Field(
         5.0, ge=0, description="Remove points whose neighbours are this many times farther than "
         "is usual around them. 0 keeps all.")
-    outlier_neighbours: int = Field(8, ge=2, le=64, description="Number of neighbours for "
-        "--outlier-ratio.")
     outlier_radius: float = Field(
-        0.0, ge=0, description="Remove points with fewer neighbours than --outlier-neighbours "
-        "within this radius [m]. 0: off.")
+        0.0, ge=0, description="Remove points with 8 or fewer neighbours within this radius "
+        "[m]. 0: off.")
     voxel: float = Field(
         0.0, ge=0, description="Keep one point in each cell of this size [m]. 0 keeps all.")
 
@@ -54,9 +55,13 @@ class SkeletonSettings(Settings):
     """Settings of the skeleton."""
 
     groups: ClassVar[Groups] = {
-        "shape": ("contraction_points", "attraction", "gap_factor", "bridge_limit",
-            "prune", "twig_probability", "plants", "radii", "radius_low", "radius_high"),
+        "shape": ("contraction_points", "attraction", "bridge_limit", "prune",
+            "twig_probability", "plants", "radii", "radius_low", "radius_high"),
     }
+    retired = ("gap_factor",)
+
+    gap_factor: ClassVar[float] = 3.0
+    """The paper's gamma: a distance of more than this many median steps is a gap."""
 
     contraction_points: int = Field(
         12_000, ge=50, description="Largest number of points that are contracted; more are "
@@ -64,9 +69,6 @@ class SkeletonSettings(Settings):
     attraction: Literal["constant", "growing"] = Field(
         "constant", description="Attraction of the contraction: constant, or growing with each "
         "iteration as neighbourhoods shrink, as in the paper's source.")
-    gap_factor: float = Field(
-        3.0, gt=1, description="The paper's gamma: a distance of more than this many median "
-            "steps is a gap.")
     bridge_limit: float = Field(
         0.15, ge=0, le=1, description="Bridge gaps up to this fraction of the cloud's diagonal.")
     prune: float = Field(

@@ -23,9 +23,14 @@ class SimulateSettings(Settings):
             "mass_at"),
         "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
             "damping_stiffness"),
-        "solver": ("step", "scheme", "newmark_beta", "newmark_gamma", "lumped_mass"),
+        "solver": ("step", "scheme", "lumped_mass"),
     }
     common = ("name", "move", "grasp_force", "young")
+    retired = ("newmark_beta", "newmark_gamma")
+
+    newmark_beta: ClassVar[float] = 0.25
+    newmark_gamma: ClassVar[float] = 0.5
+    """Newmark's constants for ``scheme``: second order, and no numerical damping."""
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result files: frames/NAME.pc2 and frames/NAME.json.")
@@ -63,11 +68,6 @@ class SimulateSettings(Settings):
     scheme: Literal["energy_momentum", "newmark"] = Field(
         "energy_momentum", description="Time integration (dynamic). energy_momentum: conserves "
         "the energy at any amplitude. newmark: the paper's.")
-    newmark_beta: float = Field(
-        0.25, gt=0, le=0.5, description="Newmark's beta (--scheme newmark).")
-    newmark_gamma: float = Field(
-        0.5, ge=0.5, le=1, description="Newmark's gamma (--scheme newmark); values above 0.5 "
-        "damp fast vibration.")
     lumped_mass: bool = Field(
         False, description="Lump the mass at the nodes instead of using the consistent mass "
             "matrix.")

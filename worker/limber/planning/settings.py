@@ -43,10 +43,14 @@ class PlanSettings(Settings):
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_damage", "max_stress", "workspace_low",
                                "workspace_high", "clearance", "turn_slack", "confidence"),
-        "timing": ("speed", "acceleration", "hold", "inertia", "slowings"),
+        "timing": ("speed", "acceleration", "hold", "inertia"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
+    retired = ("slowings",)
+
+    slowings: ClassVar[int] = 4
+    """Largest number of times that the motion is slowed down until it keeps the limits."""
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "
@@ -122,8 +126,6 @@ class PlanSettings(Settings):
     inertia: bool = Field(True, description=(
         "Also check the limits in motion, with the branch's inertia, and slow the motion down "
         "until they hold. Otherwise they are checked at every pose at rest."))
-    slowings: int = Field(4, ge=0, le=10, description=(
-        "Largest number of times that the motion is slowed down."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
         "eikonal: the least-cost path on a grid, refined; mostly within 1 % of the best possible "
         "path. d-rrt-star: the paper's D-RRT*. Both state a proven lower bound."))

@@ -29,6 +29,7 @@ from limber.core.errors import BranchFolderError
 from limber.core.files.atomic import file_digest
 from limber.core.files.temporary_names import owned_name, sweep
 from limber.core.json_values import plain
+from limber.core.settings import Settings
 from limber.store import journal
 from limber.store.disk import gone, in_words, require_room, require_there
 from limber.store.folder_state import (
@@ -318,7 +319,9 @@ class Branch:
         intact = all(name in self.manifest.files
                      and not self._checker.trouble(name, self.manifest.files[name])
                      for name in entry.writes if self._owner(name) == key)
-        return (intact and entry.reads == wanted and entry.settings == plain(settings or {})
+        stored = (settings.without_retired(entry.settings) if isinstance(settings, Settings)
+                  else entry.settings)
+        return (intact and entry.reads == wanted and stored == plain(settings or {})
                 and entry.programs.get(RESULTS, "1") == _results_version(settings))
 
     @contextmanager
