@@ -12,6 +12,7 @@ from benchmarks.prescribed import solve_prescribed
 from benchmarks.table import Asked, Row, Setting
 from limber.core.numerics.rigid import rotation_matrix
 from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.element_types import quadrature
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import (
     BranchModel,
@@ -204,7 +205,7 @@ def _manufactured_potential(cells: int) -> float:
     mesh = _cube(cells)
     model = BranchModel(mesh, young=1.0, poisson=0.3, density=1.0, gravity=None,
                         fixed=(np.abs(mesh.nodes - 0.5) > 0.5 - 1e-9).any(axis=1))
-    rule = fe.quadrature(5)
+    rule = quadrature(5)
     shape = fe.shape_functions(rule.points, 10)
     corners = mesh.nodes[mesh.tets[:, :4]]
     places = np.einsum("qc,ecx->eqx", rule.points, corners)

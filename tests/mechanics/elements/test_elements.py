@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
+from limber.geometry.tets.element_types import EDGES, quadrature
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements import shapes as elements
 
@@ -14,7 +15,7 @@ from limber.mechanics.elements import shapes as elements
 @pytest.mark.parametrize(("degree", "count"), [(1, 1), (2, 4), (4, 14), (5, 14)])
 def test_quadrature_is_exact_up_to_its_degree(degree, count):
     """Every monomial up to the degree gives its exact integral."""
-    rule = elements.quadrature(degree)
+    rule = quadrature(degree)
     assert len(rule.weights) == count
     for powers in itertools.product(range(degree + 1), repeat=3):
         if sum(powers) <= degree:
@@ -27,7 +28,7 @@ def test_quadrature_is_exact_up_to_its_degree(degree, count):
 def test_shape_functions_are_one_at_their_node_and_gradients_match(node_count):
     """Kronecker property, partition of unity, gradients equal finite differences."""
     corners = np.eye(4)
-    middles = (corners[elements.EDGES[:, 0]] + corners[elements.EDGES[:, 1]]) / 2
+    middles = (corners[EDGES[:, 0]] + corners[EDGES[:, 1]]) / 2
     places = np.vstack([corners, middles])[:node_count]
     assert elements.shape_functions(places, node_count) == pytest.approx(np.eye(node_count))
     at, step = np.array([[0.4, 0.3, 0.2, 0.1]]), 1e-6
@@ -67,4 +68,4 @@ def test_inverted_element_is_named(short_box):
     tets = short_box.tets.copy()
     tets[7, [0, 1]] = tets[7, [1, 0]]
     with pytest.raises(InputError, match="number 7"):
-        elements.element_gradients(TetMesh(short_box.nodes, tets), elements.quadrature(2))
+        elements.element_gradients(TetMesh(short_box.nodes, tets), quadrature(2))

@@ -24,6 +24,7 @@ _PLACES = {
     "mesh_body": "mesh_surface",
     "mesh_branch": "tets.tetrahedra",
     "read_points": "io.clouds",
+    "register_element": "tets.element_types",
     "reconstruct_cloud": "reconstruction",
     "straight_beam": "tets.cylinder_mesh",
 }

@@ -16,7 +16,8 @@ from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.radii.normal_equations import fit_precision
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import tangents
-from limber.geometry.tets.tet_mesh import EDGES, TetMesh
+from limber.geometry.tets.element_types import between_corners
+from limber.geometry.tets.tet_mesh import TetMesh
 
 POINT_LIMIT = 60_000
 """Most points used, as many as in the fit itself: more share their errors."""
@@ -97,7 +98,7 @@ def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
         if not narrow.any():
             break
         going[np.unique(corners[narrow])] *= 0.5
-    if mesh.is_quadratic:
-        nodes[mesh.tets[:, 4:]] = nodes[corners[:, EDGES]].mean(axis=2)
+    if mesh.element.parents:
+        nodes[mesh.tets[:, 4:]] = between_corners(mesh.element, nodes[corners])
     return replace(mesh, nodes=nodes)
 

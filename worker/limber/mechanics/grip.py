@@ -11,7 +11,7 @@ only the remainder bends, in series with it. Its compliance is 1 - p of the mate
 import numpy as np
 
 from limber.core.numerics.rigid import principal_axes
-from limber.geometry.tets.tet_mesh import EDGES, TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh
 
 STIFFEST = 100.0
 """Stiffness factor of elements that are entirely inside: a hundredth of their length bends."""
@@ -42,14 +42,15 @@ def parts_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.nd
 def nodes_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.ndarray:
     """Return the nodes that a gripper holds; arguments as for :func:`parts_between`.
 
-    Midside nodes of an edge with only one end inside are left out: they would hold more of a
+    Nodes between corners of which not all are inside are left out: they would hold more of a
     tetrahedron cut by the gripper's end than its part inside.
     """
     along, is_beside = _placed(mesh, point, half_length)
     held = (np.abs(along) <= half_length) & ~is_beside
-    if mesh.is_quadratic:
-        cut = ~held[mesh.tets[:, EDGES]].all(axis=2)
-        held[mesh.tets[:, 4:][cut]] = False
+    corners = held[mesh.tets[:, :4]]
+    for number, parents in enumerate(mesh.element.parents):
+        cut = ~corners[:, list(parents)].all(axis=1)
+        held[mesh.tets[cut, 4 + number]] = False
     return np.flatnonzero(held)
 
 

@@ -5,6 +5,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from limber.core.errors import InputError
+from limber.geometry.tets.element_types import is_known
 from limber.geometry.tets.tet_mesh import TetMesh
 
 
@@ -36,9 +37,10 @@ def check_mesh(mesh: TetMesh) -> None:
     if not np.isfinite(mesh.nodes).all():
         raise InputError("The mesh has nodes that are not finite.", "Each node needs a position.",
                          "Mesh the surface again.")
-    if mesh.tets.ndim != 2 or mesh.tets.shape[1] not in (4, 10) or not mesh.tet_count:
+    if mesh.tets.ndim != 2 or not is_known(mesh.tets.shape[1]) or not mesh.tet_count:
         raise InputError(f"The tetrahedra have shape {mesh.tets.shape}.",
-                         "Each tetrahedron needs 4 or 10 nodes.", "Mesh the surface again.")
+                         "Each tetrahedron needs 4 or 10 nodes, or those of a registered "
+                         "element.", "Mesh the surface again.")
     used = np.zeros(mesh.node_count, bool)
     used[mesh.tets] = True
     if not used.all():

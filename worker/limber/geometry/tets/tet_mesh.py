@@ -11,9 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
-
-EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
-"""Corners of the six edges of a tetrahedron, in VTK's order of the mid-side nodes."""
+from limber.geometry.tets.element_types import (
+    EDGES,
+    ElementType,
+    element_with,
+    elements_by_cell_type,
+    is_known,
+)
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 """Corners of the four faces, counter-clockwise seen from outside."""
@@ -25,7 +29,8 @@ class TetMesh:
 
     Attributes:
         nodes: Positions [m], shape [node_count, 3].
-        tets: Node indices, shape [tet_count, 4] (linear) or [tet_count, 10] (quadratic).
+        tets: Node indices, shape [tet_count, 4] (linear), [tet_count, 10] (quadratic), or as many
+            as a registered element has.
         cell_data: Name to array of shape [tet_count, ...]: ``young`` [Pa], ``poisson``.
         point_data: Name to array of shape [node_count, ...]: ``fixed`` (0 or 1),
             ``control_point`` (index or -1), ``grasp`` (0 or 1).
@@ -43,6 +48,10 @@ class TetMesh:
     @property
     def tet_count(self) -> int:
         return len(self.tets)
+
+    @property
+    def element(self) -> ElementType:
+        return element_with(self.tets.shape[1])
 
     @property
     def is_quadratic(self) -> bool:
@@ -63,8 +72,7 @@ class TetMesh:
         """Return the mesh with every tetrahedron positively oriented."""
         flip = self.volumes < 0
         tets = self.tets.copy()
-        order = [0, 2, 1, 3] if not self.is_quadratic else [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
-        tets[flip] = tets[flip][:, order]
+        tets[flip] = tets[flip][:, list(self.element.mirrored)]
         return replace(self, tets=tets)
 
     def quadratic(self) -> "TetMesh":
@@ -75,6 +83,8 @@ class TetMesh:
         """
         if self.is_quadratic:
             return self
+        if self.tets.shape[1] > 4:
+            return self.linear().quadratic()
         pairs = np.sort(self.tets[:, EDGES], axis=2).reshape(-1, 2)
         edges, inverse = np.unique(pairs, axis=0, return_inverse=True)
         middle = self.node_count + inverse.reshape(-1, 6)
@@ -86,7 +96,7 @@ class TetMesh:
 
     def linear(self) -> "TetMesh":
         """Return the mesh of the corners alone; unused nodes are dropped."""
-        if not self.is_quadratic:
+        if self.tets.shape[1] == 4:
             return self
         used, inverse = np.unique(self.tets[:, :4], return_inverse=True)
         return replace(self, nodes=self.nodes[used], tets=inverse.reshape(-1, 4),
@@ -127,7 +137,7 @@ class TetMesh:
         trouble = ""
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or not np.isfinite(self.nodes).all():
             trouble = "nodes without a finite position"
-        elif not (self.tet_count and self.tets.ndim == 2 and self.tets.shape[1] in (4, 10)
+        elif not (self.tet_count and self.tets.ndim == 2 and is_known(self.tets.shape[1])
                   and self.tets.min() >= 0 and self.tets.max() < self.node_count):
             trouble = "tetrahedra with nodes that do not exist"
         for name, values in data.items():
@@ -145,11 +155,13 @@ class TetMesh:
         """Write a VTU file that ParaView opens."""
         import meshio
 
-        kind = "tetra10" if self.is_quadratic else "tetra"
+        if not self.element.cell_type:
+            raise InputError(f"VTU files have no cell for the element {self.element.name!r}.",
+                             "The mesh cannot be written.", "Write its linear or quadratic mesh.")
         # meshio converts tetra10 between its own (Gmsh-like) and VTK's node order, but not for VTU,
         # where it keeps the order; test_tet_mesh checks that.
         meshio.write_points_cells(
-            path, self.nodes, [(kind, self.tets)], file_format="vtu",
+            path, self.nodes, [(self.element.cell_type, self.tets)], file_format="vtu",
             point_data=self.point_data,
             cell_data={name: [values] for name, values in self.cell_data.items()})
 
@@ -172,7 +184,7 @@ class TetMesh:
                              "A VTU file with tetrahedra was expected.",
                              "Check the file, or make the mesh again.") from error
         for number, block in enumerate(mesh.cells):
-            if block.type in ("tetra", "tetra10"):
+            if block.type in elements_by_cell_type():
                 cell_data = {name: np.asarray(parts[number])
                              for name, parts in mesh.cell_data.items()}
                 point_data = {name: np.asarray(v) for name, v in mesh.point_data.items()}

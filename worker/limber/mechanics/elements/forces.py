@@ -1,5 +1,7 @@
 """Kernels of internal force, energy, strain and their changes, LANES elements at a time.
 
+An element may have any number of nodes and quadrature points.
+
 All refer to the rest shape: with H = du/dX and F = I + H, the second Piola-Kirchhoff stress S
 follows from the Green-Lagrange strain E = (H + H^T + H^T H) / 2, and the force of node a is the
 integral of F S grad N_a. See :mod:`limber.mechanics.elements.stiffness_pairs` for the memory layout

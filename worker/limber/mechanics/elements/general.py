@@ -18,6 +18,8 @@ def moduli_stiffness(displacement: np.ndarray, gradients: np.ndarray, weights: n
                      lengths: np.ndarray, values: np.ndarray) -> None:
     """Add the integral of B^T C B [N/m] of all elements to ``values``; B gives the strain's change.
 
+    An element may have any number of nodes.
+
     Args:
         moduli: C by rows, 00 11 22 and shear angles 01 02 12 [Pa], shape [batch, q, 36, LANES].
         displacement, gradients, weights, nodes, slots, lengths, values: See

@@ -1,93 +1,47 @@
-"""Tetrahedra with 4 or 10 nodes: shape functions, quadrature, gradients at quadrature points.
+"""Shape functions of a mesh's tetrahedra, and gradients at quadrature points.
 
-Node order is VTK's (:mod:`limber.geometry.tets.tet_mesh`). Everything refers to the rest shape, so
-gradients are computed once; straight and curved sides differ only in the number of quadrature
-points.
+The elements are those of :mod:`limber.geometry.tets.element_types`. Everything refers to the rest
+shape, so gradients are computed once; straight and curved sides differ only in the number of
+quadrature points.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.geometry.tets.tet_mesh import EDGES, TetMesh
+from limber.geometry.tets.element_types import Quadrature, between_corners, element_with
+from limber.geometry.tets.tet_mesh import TetMesh
 
 CURVED_TOLERANCE = 1e-6
 """Relative offset of a middle node from the chord's middle above which a side is curved.
 """
 
 
-@dataclass(frozen=True)
-class Quadrature:
-    """Barycentric points [q, 4] and weights [q] that sum to 1."""
-
-    points: np.ndarray
-    weights: np.ndarray
-
-
-def quadrature(degree: int) -> Quadrature:
-    """Return a rule on the tetrahedron that integrates polynomials of ``degree`` (1 to 5) exactly.
-
-    Degree 4 and 5 are Keast's and Walkington's rules (11 and 14 points).
-    """
-    if degree <= 1:
-        return Quadrature(np.full((1, 4), 0.25), np.ones(1))
-    if degree == 2:
-        a, b = 0.5854101966249685, 0.1381966011250105
-        return Quadrature(np.full((4, 4), b) + (a - b) * np.eye(4), np.full(4, 0.25))
-    first, second = 0.31088591926330060980, 0.092735250310891226402
-    edge = 0.045503704125649649492
-    points = [np.full((4, 4), a) + (1 - 4 * a) * np.eye(4) for a in (first, second)]
-    pairs = np.full((6, 4), edge)
-    for row, (i, j) in enumerate([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
-        pairs[row, [i, j]] = 0.5 - edge
-    weights = np.repeat([0.11268792571801585080, 0.073493043116361949544,
-                         0.042546020777081466438], [4, 4, 6])
-    return Quadrature(np.vstack([*points, pairs]), weights)
-
-
 def shape_functions(barycentric: np.ndarray, node_count: int) -> np.ndarray:
     """Return shape functions at barycentric points [q, 4], shape [q, node_count]."""
-    if node_count == 4:
-        return barycentric.copy()
-    corner = barycentric * (2 * barycentric - 1)
-    return np.hstack([corner, 4 * barycentric[:, EDGES[:, 0]] * barycentric[:, EDGES[:, 1]]])
+    return element_with(node_count).shape_functions(barycentric)
 
 
 def shape_gradients(barycentric: np.ndarray, node_count: int) -> np.ndarray:
     """Return derivatives to the last three barycentric coordinates, shape [q, 3, node_count]."""
     # The first coordinate is 1 minus the others.
     to_local = np.array([[-1.0, 1, 0, 0], [-1.0, 0, 1, 0], [-1.0, 0, 0, 1]])
-    if node_count == 4:
-        return np.repeat(to_local[None], len(barycentric), axis=0)
-    by_barycentric = np.zeros((len(barycentric), 4, 10))
-    for k in range(4):
-        by_barycentric[:, k, k] = 4 * barycentric[:, k] - 1
-    for number, (i, j) in enumerate(EDGES):
-        by_barycentric[:, i, 4 + number] = 4 * barycentric[:, j]
-        by_barycentric[:, j, 4 + number] = 4 * barycentric[:, i]
-    return np.einsum("lk,qkn->qln", to_local, by_barycentric)
+    return np.einsum("lk,qkn->qln", to_local, element_with(node_count).shape_gradients(barycentric))
 
 
 def has_curved_sides(mesh: TetMesh) -> bool:
-    """Whether any middle node of a quadratic mesh is off the middle of its side."""
-    if not mesh.is_quadratic:
+    """Whether any node between the corners is off their mean."""
+    corners, parents = mesh.nodes[mesh.tets[:, :4]], mesh.element.parents
+    if not parents:
         return False
-    ends = mesh.nodes[mesh.tets[:, EDGES]]
-    off = mesh.nodes[mesh.tets[:, 4:]] - ends.mean(axis=2)
-    chord = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
-    return bool((np.linalg.norm(off, axis=2) > CURVED_TOLERANCE * chord).any())
+    off = mesh.nodes[mesh.tets[:, 4:]] - between_corners(mesh.element, corners)
+    chord = np.stack([corners[:, ends[-1]] - corners[:, ends[0]] for ends in parents], axis=1)
+    return bool((np.linalg.norm(off, axis=2)
+                 > CURVED_TOLERANCE * np.linalg.norm(chord, axis=2)).any())
 
 
 def stiffness_quadrature(mesh: TetMesh) -> Quadrature:
-    """Return the rule for forces and stiffness: 1 point linear, 4 straight, 14 curved.
-
-    Four points integrate the linear stiffness of a straight-sided quadratic element exactly, and
-    are used for StVK's energy consistently; on curved sides the gradients are not polynomial.
-    """
-    if not mesh.is_quadratic:
-        return quadrature(1)
-    return quadrature(5 if has_curved_sides(mesh) else 2)
+    """Return the rule for forces and stiffness: 1 point linear, 4 straight, 14 curved."""
+    return mesh.element.stiffness_rule(has_curved_sides(mesh))
 
 
 def element_gradients(mesh: TetMesh, rule: Quadrature) -> tuple[np.ndarray, np.ndarray]:
@@ -134,8 +88,8 @@ def volume_weights(mesh: TetMesh) -> np.ndarray:
 
 
 def _weighted_shapes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return shape functions [q, n] and volume weights [m^3], [tet_count, q], of degree 5."""
-    rule = quadrature(5)
+    """Return shape functions [q, n] and volume weights [m^3], [tet_count, q], for masses."""
+    rule = mesh.element.mass_rule()
     local = shape_gradients(rule.points, mesh.tets.shape[1])
     determinant = np.linalg.det(np.einsum("qla,eax->eqlx", local, mesh.nodes[mesh.tets]))
     return (shape_functions(rule.points, mesh.tets.shape[1]),

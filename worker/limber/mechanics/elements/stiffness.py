@@ -19,6 +19,7 @@ from limber.mechanics.elements.stiffness_pairs import (
     STRAIN_TERMS,
     VOLUME_ROWS,
     VOLUME_TERMS,
+    any_gradient,
     linear_gradient,
     quadratic_gradient,
     scatter_block,
@@ -134,8 +135,10 @@ def gradient(values, gradients, node_count, out):
     """Write the gradient of a nodal field, by rows."""
     if node_count == 10:
         quadratic_gradient(values, gradients, out)
-    else:
+    elif node_count == 4:
         linear_gradient(values, gradients, out)
+    else:
+        any_gradient(values, gradients, node_count, out)
 
 
 @compiled

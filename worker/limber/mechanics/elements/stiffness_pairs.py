@@ -155,6 +155,18 @@ linear_gradient, quadratic_gradient = _nodes_gradient(4), _nodes_gradient(10)
 
 
 @compiled
+def any_gradient(values, gradients, node_count, out):
+    """As ``linear_gradient``, for elements with any number of nodes."""
+    out[:9 * LANES] = 0.0
+    for a in range(node_count):
+        for i in range(3):
+            for j in range(3):
+                for l in range(LANES):
+                    out[(3 * i + j) * LANES + l] += (
+                        values[(3 * a + i) * LANES + l] * gradients[(3 * a + j) * LANES + l])
+
+
+@compiled
 def scatter_block(block, slots, lengths, is_diagonal, values):
     """Add the blocks of one pair of nodes to the lower triangle in compressed columns."""
     if is_diagonal:

@@ -15,7 +15,8 @@ import numpy as np
 from limber.core.errors import ConvergenceError, InputError
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
-from limber.geometry.tets.tet_mesh import EDGES, TetMesh
+from limber.geometry.tets.element_types import between_corners
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
@@ -180,7 +181,7 @@ def _integrated(model: BranchModel, gradient: np.ndarray) -> np.ndarray:
 
 def _straight(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
     """Return a nodal field that is linear between the corners of each tetrahedron."""
-    if mesh.is_quadratic:
+    if mesh.element.parents:
         nodes = nodes.copy()
-        nodes[mesh.tets[:, 4:]] = nodes[mesh.tets[:, EDGES]].mean(axis=2)
+        nodes[mesh.tets[:, 4:]] = between_corners(mesh.element, nodes[mesh.tets[:, :4]])
     return nodes

@@ -2,12 +2,14 @@
 
 import numpy as np
 
+from limber.core.errors import InputError
 from limber.mechanics.model import BranchModel
 from limber.results.exports.elastic import require_elastic
 
 _STEP = 0.005
 """Relative difference of moduli below which they share one material."""
 _A_LINE = 12
+_ELEMENTS = {"linear": "C3D4", "quadratic": "C3D10"}
 
 
 def inp_text(model: BranchModel, name: str, tip: int, load: np.ndarray | None = None,
@@ -25,11 +27,14 @@ def inp_text(model: BranchModel, name: str, tip: int, load: np.ndarray | None = 
         mode_count: Number of frequencies; 0: no frequency step.
 
     Raises:
-        InputError: *ELASTIC does not support the model's material.
+        InputError: *ELASTIC does not support the model's material, or Abaqus its element.
     """
     require_elastic(model.material, "Abaqus' *ELASTIC", at_any_strain=True)
     mesh = model.mesh
-    kind = "C3D10" if mesh.is_quadratic else "C3D4"
+    kind = _ELEMENTS.get(mesh.element.name)
+    if kind is None:
+        raise InputError(f"Abaqus files cannot hold the element {mesh.element.name!r}.",
+                         "They take linear and quadratic tetrahedra.", "Use a mesh of those.")
     lines = ["*HEADING", f"{name}: branch by Limber, units m, kg, s, Pa. The shape is prestressed "
              "by gravity: apply no gravity.", "*NODE, NSET=ALL"]
     lines += [f"{number}, {x:.9g}, {y:.9g}, {z:.9g}"
