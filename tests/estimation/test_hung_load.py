@@ -222,7 +222,8 @@ def test_registration_by_name_by_fit_and_around_a_stray_marker(tmp_path):
         register(points[:2], labels[:2], labels, nominal, "b")
     write_nominal(tmp_path / "n.csv", nominal)
     assert np.allclose(read_nominal(tmp_path / "n.csv")[1], nominal, atol=1e-6)
-    for bad in ("label,x_m,y_m,z_m\na,1,2\n", "label0,0,0.2\nc,0.1,0,0.2\n"):
+    for bad in ("label,x_m,y_m,z_m\na,1,2\n", "label,x_m,y_m,z_m\na,0,0,0\na,0,0,1\n",
+                "label0,0,0.2\nc,0.1,0,0.2\n"):
         (tmp_path / "bad.csv").write_text(bad)
         with pytest.raises(InputError, match="not a table of markers"):
             read_nominal(tmp_path / "bad.csv")

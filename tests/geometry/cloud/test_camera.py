@@ -79,10 +79,10 @@ def test_camera_file_round_trip_and_named_error(tmp_path):
 
 def test_numbers_that_no_camera_has_are_refused(tmp_path):
     """With them a pixel would lie at no finite place; true is none at all."""
-    for line in ("fy = 1e-300", "cx = 1e10", "depth_scale = 1e-12",
-                 "width = true", "fx = true"):
+    for line in ("fy = 1e-300", "cx = 1e10", "depth_scale = 1e-12", "width = true",
+                 "fx = true", "height = 10000000", "pose = [0, 0, 0, 0, 0, 90]"):
         text = {"width": "32", "height": "24", "fx": "40.0", "fy": "40.0", "cx": "15.5",
-                "cy": "11.5"} | dict([line.split(" = ")])
+                "cy": "11.5"} | dict([line.split(" = ", 1)])
         path = tmp_path / "camera.toml"
         path.write_text("".join(f"{name} = {value}\n" for name, value in text.items()))
         with pytest.raises(InputError, match=line.split()[0]):

@@ -1,5 +1,6 @@
 """Fit of a capture system's markers to their nominal positions on the branch at rest."""
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from pathlib import Path
@@ -67,6 +68,8 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
         places = np.array([[float(part) for part in row[1:4]] for row in rows[1:]])
         if places.shape != (len(labels), 3) or not np.isfinite(places).all():
             raise ValueError("each marker needs three numbers")
+        if doubled := [label for label, count in Counter(labels).items() if count > 1]:
+            raise ValueError(f"{doubled[0]!r} has several rows")
     except (IndexError, ValueError) as error:
         raise InputError(f"{path} is not a table of markers ({error}).",
                          "The first line must be label,x_m,y_m,z_m. Each further line is one "

@@ -3,12 +3,13 @@
 Camera axes: x right, y down, z forward, as OpenCV and TUM's RGB-D data have them.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml
@@ -17,6 +18,7 @@ from limber.core.numerics.rigid import rotation_matrix, rotation_vector
 
 _MOST = 1e6
 """Largest number of a camera, whatever its unit; the smallest is one over it."""
+_MOST_PIXELS = 100_000
 _Pixels = Annotated[float, Field(ge=1 / _MOST, le=_MOST)]
 
 
@@ -30,8 +32,8 @@ class Camera(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: int = Field(gt=0, le=_MOST_PIXELS)
+    height: int = Field(gt=0, le=_MOST_PIXELS)
     fx: _Pixels
     fy: _Pixels
     cx: float = Field(ge=-_MOST, le=_MOST)
@@ -40,6 +42,14 @@ class Camera(BaseModel):
     baseline_m: float = Field(0.095, ge=1 / _MOST, le=_MOST)
     disparity_sigma_px: float = Field(0.08, gt=0, le=_MOST)
     pose: tuple[float, float, float, float, float, float] = (0.0,) * 6
+
+    @field_validator("pose")
+    @classmethod
+    def _in_radians(cls, pose: tuple[float, ...]) -> tuple[float, ...]:
+        if (turn := math.hypot(*pose[3:])) > 2 * math.pi + 1e-6:
+            raise ValueError(f"it is turned by {turn:g} rad, more than a whole turn; was the "
+                             "rotation given in degrees?")
+        return pose
 
     @property
     def rotation(self) -> np.ndarray:
