@@ -9,7 +9,7 @@ import pytest
 from benchmarks.scan_cases import one_sided_case
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.leaves import Leaf, _with_rims, find_leaves
+from limber.geometry.cloud.leaves import Leaf, _fills_a_sheet, _with_rims, find_leaves
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
@@ -217,3 +217,13 @@ def test_a_random_cloud_is_refused_plainly(count: int) -> None:
     with pytest.raises(InputError):
         reconstruct_cloud(Cloud(np.random.default_rng(count).random((count, 3))),
                           ReconstructSettings())
+
+
+def test_lines_in_a_plane_fill_no_sheet() -> None:
+    """A comb of sparse twigs in one plane is lines; a blade of as many points is a sheet."""
+    rng = np.random.default_rng(2)
+    foot, along = np.repeat(np.arange(3) * 0.12, 50), rng.uniform(0, 0.3, 150)
+    comb = np.stack([foot + rng.normal(0, 0.002, 150), along, np.zeros(150)], axis=1)
+    assert not _fills_a_sheet(comb)
+    assert _fills_a_sheet(np.stack([rng.uniform(0, 0.24, 150), along, np.zeros(150)], axis=1))
+    assert _fills_a_sheet(_leaf(np.zeros(3), np.array([1.0, 0.2, 0.0]), rng))

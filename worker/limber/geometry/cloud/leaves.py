@@ -36,6 +36,7 @@ _STRETCH, _THICK = 0.5, 0.25
 # Thickness over width, measured on stretches as long as the piece is wide, up to which it is a
 # blade: blades reach 0.26, stretches of branch that only noise makes flat 0.49 and more.
 _BLADE, _ACROSS, _PLACES = 0.4, 0.6, 40
+_FILLS = 33  # a point and its neighbours, by whose distances a piece is a sheet or lines
 _NEAR = 3.0  # spacings, up to which points hang together
 _AGREE = 0.5  # of the neighbours, that make a point one of a leaf
 
@@ -169,7 +170,8 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
         members = np.flatnonzero(label == piece)
         # The median is used: at a leaf's edge, neighbours are missing on one side.
         leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
-    leaves = [leaf for leaf in leaves if _is_blade(points[leaf.points], leaf.area)]
+    leaves = [leaf for leaf in leaves if _is_blade(points[leaf.points], leaf.area)
+              and _fills_a_sheet(points[leaf.points])]
     largest = max((leaf.area for leaf in leaves), default=0.0)
     return [leaf for leaf in leaves if leaf.area > _PATCH * largest and (
         leaf.area > _STRETCH * largest or _thickness(points[leaf.points]) < _THICK)]
@@ -185,6 +187,18 @@ def _is_blade(points: np.ndarray, area: float) -> bool:
     around = tree.query_ball_point(points[::max(len(points) // _PLACES, 1)], reach)
     thick = [_thickness(points[near]) for near in around if len(near) >= _LEAST]
     return not thick or float(np.median(thick)) < _BLADE
+
+
+def _fills_a_sheet(points: np.ndarray) -> bool:
+    """Whether a piece [n, 3] is likelier an evenly covered sheet than lines, as of flat twigs.
+
+    The number of points within a distance grows with its square on a sheet, and with the distance
+    itself on a line: logarithms of the ratios of distances to neighbours follow an exponential law
+    of rate 2 or 1 (Levina and Bickel, 2004).
+    """
+    distance = cKDTree(points).query(points, k=min(_FILLS, len(points)))[0][:, 1:]
+    ratio = distance[:, -1:] / np.maximum(distance[:, :-1], 1e-300)
+    return bool(np.log(np.minimum(ratio, 1e6)).mean() < np.log(2))
 
 
 def _thickness(points: np.ndarray) -> float:
