@@ -8,12 +8,14 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from limber.core.errors import InputError
+from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf, _fills_a_sheet, _with_rims, find_leaves
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
 from limber.geometry.leaf_removal import check_agreed, without_leaves
+from limber.geometry.point_classes import COLOURS, shown_if_refused
 from limber.geometry.reconstruction import _MOSTLY, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -141,6 +143,9 @@ def test_leaves_are_not_cut_off_unasked(seedling, tmp_path) -> None:
     away = np.linalg.norm(moved[on_leaf] - np.array(place, float), axis=1)
     assert away.min() < 0.1
     assert not (tmp_path / "a.branch" / "mesh.vtu").exists()
+    shown = read_cloud(tmp_path / "a_points.ply")
+    assert np.abs(shown.points - moved / 1000).max() < 0.01 or len(shown) < len(moved)
+    assert (shown.attributes["class"] == 1).mean() == pytest.approx(on_leaf.mean(), abs=0.1)
 
 
 def test_few_leaves_need_no_consent() -> None:
@@ -150,6 +155,32 @@ def test_few_leaves_need_no_consent() -> None:
     check_agreed(prepared, [Leaf(np.arange(len(prepared.cloud) // 10), 1e-3)], "m")
     with pytest.raises(InputError, match="11 % of the points look like 1 leaf"):
         check_agreed(prepared, [Leaf(np.arange(110), 1e-3)], "m")
+
+
+def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:
+    """Wood brown, leaves green, the rest red, in the file's coordinates; none after success."""
+    cloud = Cloud(np.random.default_rng(0).random((60, 3)) + 100.0)
+    prepared = prepare(cloud, 1.0, ReconstructSettings(keep_sheets=True))
+    seen: list[Cloud] = []
+    with shown_if_refused(seen.append, prepared, []):
+        pass
+    off = np.arange(len(prepared.cloud) - 10) < 5
+
+    def refuse(raw: Cloud, settings: ReconstructSettings, *, show, **_: object) -> None:
+        with shown_if_refused(show, prepared, [Leaf(np.arange(10), 1e-3)], off):
+            raise InputError("leaves")
+    monkeypatch.setattr("limber.geometry.reconstruction.reconstruct_cloud", refuse)
+    cloud.write_ply(tmp_path / "scan.ply")
+    told: list[str] = []
+    with pytest.raises(InputError, match="leaves"):
+        reconstruct(tmp_path / "scan.ply", tmp_path / "a.branch", progress=Progress(
+            on_warning=told.append))
+    assert any(str(tmp_path / "a_points.ply") in text for text in told)
+    shown = read_cloud(tmp_path / "a_points.ply")
+    assert not seen and np.allclose(shown.points, prepared.cloud.points + prepared.origin)
+    assert shown.attributes["class"].tolist() == [1] * 10 + [2] * 5 + [0] * (len(shown) - 15)
+    assert shown.attributes["color"][0].tolist() == list(COLOURS["leaf"])
+    assert not (tmp_path / "a.branch").exists()
 
 
 def _tube(start, end, radius: float, spacing: float, rng: np.random.Generator,

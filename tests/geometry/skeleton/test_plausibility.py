@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.geometry.skeleton.plausibility import shows_round
+from limber.geometry.skeleton.plausibility import check_explained, shows_round
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
@@ -19,6 +19,21 @@ def test_rods_that_leaves_became_show_nothing_round() -> None:
     assert shows_round(result)
     result.noise = 0.004
     assert not shows_round(result)
+
+
+def test_points_off_all_axes_are_named_with_their_place() -> None:
+    """Their share, a place among them in the file's coordinates, and the options."""
+    axis = np.stack([np.zeros(40), np.zeros(40), np.linspace(0, 0.5, 40)], axis=1)
+    skeleton = Skeleton.from_edges(axis, np.arange(40) - 1, np.full(40, 0.01))
+    points = axis + [0.01, 0.0, 0.0]
+    points[30:, 0] = 0.1
+    result = SimpleNamespace(skeleton=skeleton, node_of_point=np.arange(40), noise=0.001,
+                             residual=points[:, 0] - 0.01, leafy=False)
+    check_explained(result, 0.3, points, lambda place: place)
+    with pytest.raises(InputError, match=r"^25 % of the points.*--crop-low.*--unexplained 1") as no:
+        check_explained(result, 0.2, points, lambda place: 1000 * place + 7)
+    where = (np.array(no.value.place) - 7) / 1000
+    assert where[0] == pytest.approx(0.1) and 0.38 < where[2] <= 0.5
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from limber.geometry.leaf_removal import (
     leaves_text,
     without_leaves,
 )
+from limber.geometry.point_classes import Show, shown_if_refused
 from limber.geometry.pruned_twigs import (
     leave_out_twigs,
     tell_left_out,
@@ -32,7 +33,11 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.checkpoint import FoundSkeleton
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, edited
-from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
+from limber.geometry.skeleton.plausibility import (
+    check_explained,
+    off_axes,
+    unexplained_share,
+)
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import (
     within_silhouette,
@@ -102,7 +107,7 @@ class Reconstruction:
 def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleton | None = None,
                       edits: Sequence[Edit] = (), eye: np.ndarray | None = None,
                       known: FoundSkeleton | None = None, keep: Keep | None = None,
-                      progress: Progress = SILENT) -> Reconstruction:
+                      show: Show | None = None, progress: Progress = SILENT) -> Reconstruction:
     """Make skeleton, surface and tetrahedra of a scan.
 
     Args:
@@ -116,6 +121,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
             further; where it does not fit the scan, it counts as none.
         keep: Receives the alignment, the skeleton and the result of the search as soon as found,
             before later steps that may fail or refuse it; not called for ``known``.
+        show: Receives the points by class if the scan is refused for some of them.
         progress: Called during the work; receives warnings for the user.
 
     Raises:
@@ -131,7 +137,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                       "points. It is searched for again.")
         known = None
     found, wood, leaves = (
-        _searched(prepared, settings, own, progress.part(0.02, 0.55)) if known is None
+        _searched(prepared, settings, own, show, progress.part(0.02, 0.55)) if known is None
         else _found_before(prepared, known, progress))
     whole = found
     if wood.view is not None and own is None:
@@ -142,7 +148,10 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     if keep is not None and known is None:
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     if own is None:
-        check_explained(whole, settings.unexplained)
+        scale = UNIT_METRES[settings.unit]
+        with shown_if_refused(show, prepared, leaves, off_axes(whole)):
+            check_explained(whole, settings.unexplained, wood.cloud.points,
+                            lambda place: (place + wood.origin) / scale)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     told = list(prepared.warnings)
     for text in found.warnings_at(alignment.undo):
@@ -169,7 +178,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
 
 
 def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
-              progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
+              show: Show | None, progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
     """The skeleton, the part of the scan in which it was found, and the leaves removed from it."""
     found = _skeleton(prepared, settings, own, progress)
     if own is not None or settings.leaves == "keep":
@@ -183,7 +192,8 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     else:
         return found, prepared, []
     if settings.leaves == "ask":
-        check_agreed(prepared, leaves, settings.unit)
+        with shown_if_refused(show, prepared, leaves):
+            check_agreed(prepared, leaves, settings.unit)
     return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
         found, prepared, [])
 
@@ -213,11 +223,7 @@ def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: Reconstru
     if found.leafy or (prepared.view is None and unexplained_share(found) > min(
             settings.unexplained, _LEAVES_ASKED)):
         return True
-    try:
-        check_explained(found, settings.unexplained)
-    except InputError:
-        return True
-    return False
+    return float(np.mean(off_axes(found))) > settings.unexplained
 
 
 def _with_leaves(prepared: Prepared, leaves: list[Leaf], alignment: Alignment, skeleton: Skeleton,

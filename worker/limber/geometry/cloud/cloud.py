@@ -3,6 +3,7 @@
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -82,8 +83,8 @@ class Cloud:
         attributes, titles = valid_columns(self.attributes, self.titles, len(self), taken)
         return replace(self, attributes=attributes, titles=titles)
 
-    def write_ply(self, path: Path) -> None:
-        """Write a binary PLY file: positions as double, attributes in their own types.
+    def write_ply(self, path: Path | IO[bytes]) -> None:
+        """Write a binary PLY file, or to a stream: positions as double, attributes in their types.
 
         Attributes get valid names; comments state their names in the scan's file.
         """
@@ -100,5 +101,6 @@ class Cloud:
         titles = [f"column {name}: {title[:_LONGEST_TITLE]!a}"
                   for name, title in valid.titles.items()]
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<",
-                comments=["unit: m", *titles]).write(str(path))
+                comments=["unit: m", *titles]).write(
+                    str(path) if isinstance(path, Path) else path)
 

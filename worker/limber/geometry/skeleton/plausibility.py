@@ -180,33 +180,51 @@ def shows_round(result: Any) -> bool:
 
 def unexplained_share(result: Any) -> float:
     """Fraction of points that belong to no round axis: leaves, flying pixels, a second plant."""
-    # Leaves make the noise look large. A point a whole radius off is on no axis, whatever the
-    # noise.
+    return float(np.mean(_unexplained(result)))
+
+
+def off_axes(result: Any) -> np.ndarray:
+    """Which points count against a scan because they belong to no round axis, shape [m]."""
+    if result.leafy:
+        return _unexplained(result)
+    # A depth camera's scatter is noise, not leaves: only points beyond its reach count.
     radius = result.skeleton.radius[result.node_of_point]
-    return float(np.mean(np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)))
+    return result.residual > np.maximum(radius, 3 * result.noise)
 
 
-def check_explained(result: Any, limit: float) -> None:
+def check_explained(result: Any, limit: float, points: np.ndarray, where: Where) -> None:
     """Refuse a scan with too many points that belong to no round axis.
 
     Args:
         result: The skeleton with the residuals of its points.
         limit: Largest accepted fraction of such points.
+        points: The points [m], shape [m, 3].
+        where: Transforms positions to the user's coordinates.
 
     Raises:
         InputError: the fraction exceeds ``limit``.
     """
-    # A depth camera's scatter is noise, not leaves: only points beyond its reach count.
+    off = off_axes(result)
+    share = float(np.mean(off))
+    if share <= limit:
+        return
+    # The point nearest to the middle of these: the middle itself may be empty.
+    stray = points[off]
+    place = where(stray[np.argmin(np.linalg.norm(stray - np.median(stray, axis=0), axis=1))])
+    raise InputError(
+        f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
+        f"{100 * limit:.0f} %), among them those at {_place(place)} in the scan's coordinates.",
+        "Leaves or a second plant would become rods, and the radii there are unreliable. A pot, a "
+        "stake or a wire counts too.", "Remove these points from the scan (--crop-low, "
+        "--crop-high, or in another program), remove leaves (--leaves cut), or accept the axes as "
+        "they are (--unexplained 1).").at(place)
+
+
+def _unexplained(result: Any) -> np.ndarray:
+    # Leaves make the noise look large. A point a whole radius off is on no axis, whatever the
+    # noise.
     radius = result.skeleton.radius[result.node_of_point]
-    share = unexplained_share(result) if result.leafy else float(np.mean(
-        result.residual > np.maximum(radius, 3 * result.noise)))
-    if share > limit:
-        raise InputError(
-            f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
-            f"{100 * limit:.0f} %).", "Leaves or a second plant would become rods, and the radii "
-            "there are unreliable.", "Remove the leaves from the scan (--crop-low, "
-            "--crop-high, or in another program), or accept the axes as they are (--unexplained "
-            "1).")
+    return np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)
 
 
 def _place(point: np.ndarray) -> str:

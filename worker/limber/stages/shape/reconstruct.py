@@ -13,7 +13,7 @@ from pydantic import Field
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
 from limber.core.errors import Cancelled, InputError, LimberError, WorkError
-from limber.core.files.atomic import file_digest, require_file
+from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.geometry.io.clouds import CLOUDS, read_points, unit_of
@@ -37,6 +37,8 @@ SEARCH = f"{FOUND_SKELETON}.npz"
 """Result of the skeleton search, kept until there is a mesh: a reconstruct that is stopped in
 between continues from it.
 """
+CLASSES = "_points.ply"
+"""End of the file, beside the folder of a refused scan, that shows its points by class."""
 EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
 
@@ -137,13 +139,21 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
             _keep_skeleton(early, alignment, skeleton, settings.unit)
             found.write(early.path(SEARCH))
         is_kept = True
+
+    def show(classes: Cloud) -> None:
+        place = branch.folder.with_name(f"{branch.folder.stem}{CLASSES}")
+        with replacing(place) as file:
+            classes.write_ply(file)
+        progress.warn(f"The points are coloured by class in {place}, in metres: wood brown, leaves "
+                      "green, points on no round axis red.")
     with branch.dropped_if_empty(), branch.stage(
             "reconstruct", settings, digests=digests) as stage:
         own = None if skeleton_path is None else read_skeleton(
             skeleton_path, scale=UNIT_METRES[settings.unit])
         try:
             made = reconstruct_cloud(raw, settings, own=own, edits=edits, eye=_eye(camera_path),
-                                     known=known, keep=keep, progress=progress.keeping(warnings))
+                                     known=known, keep=keep, show=show,
+                                     progress=progress.keeping(warnings))
         except LimberError as error:
             if is_kept and not isinstance(error, Cancelled):
                 progress.warn(

@@ -1,0 +1,46 @@
+"""The classes of a refused scan's points, as a coloured cloud to look at."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from limber.core.errors import InputError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.leaves import Leaf
+from limber.geometry.cloud.preparation import Prepared
+from limber.geometry.leaf_removal import leaf_mask
+
+COLOURS = {"wood": (139, 90, 43), "leaf": (60, 170, 60), "on no round axis": (220, 40, 40)}
+"""Red, green and blue of each class; its place is the value of the column ``class``."""
+
+Show = Callable[[Cloud], None]
+"""Receives the coloured cloud: metres, with the axes and the origin of the scan's file."""
+
+
+@contextmanager
+def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
+                     off_axes: np.ndarray | None = None) -> Iterator[None]:
+    """Show the points by class if what is done meanwhile refuses the scan.
+
+    Args:
+        show: Receives the cloud; None: nobody looks.
+        prepared: The whole scan.
+        leaves: Its leaves.
+        off_axes: Which of the other points are on no round axis, shape [rest]; None: not known.
+    """
+    try:
+        yield
+    except InputError:
+        if show is not None:
+            show(classified(prepared, leaves, off_axes))
+        raise
+
+
+def classified(prepared: Prepared, leaves: list[Leaf], off_axes: np.ndarray | None) -> Cloud:
+    """Return the points with columns ``class`` and ``color``, see :func:`shown_if_refused`."""
+    kind = leaf_mask(leaves, len(prepared.cloud)).astype(np.uint8)
+    if off_axes is not None:
+        kind[np.flatnonzero(kind == 0)[off_axes]] = 2
+    colour = np.array(list(COLOURS.values()), np.uint8)
+    return Cloud(prepared.cloud.points + prepared.origin, {"color": colour[kind], "class": kind})
