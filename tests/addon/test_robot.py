@@ -68,11 +68,12 @@ def test_not_without_a_dry_run_of_the_same(bpy, checked, tmp_path):
     """Other settings, a plan made anew, another folder: it has to be checked again."""
     folder, _ = checked
     arming = part("operators.arming")
-    settings = bpy.context.scene.limber.execute
-    settings.use_speed, settings.speed = True, 0.01
+    given = part("properties").OPEN + "speed"  # left open, it is the plan's own
+    bpy.context.scene.limber.execute.speed = 0.01
+    setattr(bpy.context.scene.limber.execute, given, True)
     assert "settings have changed" in arming.why_not_armed(bpy.context)
     assert not bpy.ops.limber.arm.poll()
-    settings.use_speed = False
+    setattr(bpy.context.scene.limber.execute, given, False)
     assert not arming.why_not_armed(bpy.context)
     with Branch.open(folder).stage("plan:to-goal") as stage:
         stage.path("plans/to-goal.csv").write_text("x_m,y_m,z_m\n0,0,0\n0,0,1\n")
