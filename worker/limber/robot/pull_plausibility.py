@@ -132,7 +132,8 @@ class _Growth:
         """Return the growth per predicted newton since the start, and its standard deviation; None
         over too short a way.
         """
-        if self._farthest < 2 * _FROM_M or not self._sums[0, 0]:
+        # Slack of a millimetre counts little over such a way.
+        if self._farthest < 3 * _FROM_M or not self._sums[0, 0]:
             return None
         return self._whole(self._sums[1:].sum(axis=0))
 
