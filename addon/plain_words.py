@@ -26,6 +26,16 @@ def first_sentence(text: str) -> str:
     return _SENTENCE.split(text.strip(), maxsplit=1)[0]
 
 
+def stages_in(text: str) -> list[Stage]:
+    """Return the stages with a button whose commands the worker's text names, each once.
+
+    One that makes a branch replaces it, and one that moves a robot is started from its own panel.
+    """
+    named = [stages().get(match["name"]) for match in _COMMAND.finditer(text)]
+    return [stage for number, stage in enumerate(named) if stage is not None and stage.step
+            and not stage.makes_branch and not stage.moves_robot and stage not in named[:number]]
+
+
 def settings_in(text: str, stage: Stage) -> list[Field]:
     """Return the settings of ``stage`` that the worker's text names without a value, each once.
 

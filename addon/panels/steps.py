@@ -8,7 +8,7 @@ import bpy
 from .. import branch_folder, branches, jobs, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
 from ..lines import draw_text, has_room_beside
-from ..plain_words import choice_title, first_sentence, plain, settings_in
+from ..plain_words import choice_title, first_sentence, plain, settings_in, stages_in
 from ..stages import Field, Stage, stages
 from ..steps import FIRST, PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
 from ..steps import next_step as step_after
@@ -274,6 +274,10 @@ def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: St
             button.branch_uuid = branches.current_uuid(context.scene)
     for field in settings_in(outcome["error"], stage):
         _draw_field(layout, context, stage, field)
+    for other in stages_in(outcome["error"]):
+        button = layout.operator(f"limber.{properties.attribute_name(other.name)}",
+                                 text=other.label, icon="PLAY")
+        button.branch_uuid = branches.current_uuid(context.scene)
     if text != short:
         header, body = layout.panel(f"limber_error_{stage.name}", default_closed=True)
         header.label(text="Why, and what to do")

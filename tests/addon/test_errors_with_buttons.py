@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.addon.test_panels import _draw_step
+from tests.addon.test_panels import Layout, _draw_step
 
 WORKER = Path(__file__).parents[2] / "worker" / "limber"
 
@@ -92,6 +92,15 @@ def test_settings_without_a_value_are_shown(addon):
         "Crop it (--crop-low, --crop-high), join (--plants joined), give --root or --crop-low; "
         "--no-keep-sheets, --output, --such-a-thing.", stage)
     assert [field.name for field in found] == ["crop_low", "crop_high", "root"]
+
+
+def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):
+    """Each once; not one that would replace the branch or move a robot, nor what is no step."""
+    layout, steps = Layout(), part("panels.steps")
+    steps.draw_error(layout, bpy.context, part("stages").stages()["plan"], {"error": (
+        "There is no field. Run `limber energy b.branch` first, then `limber energy` with `limber "
+        "reconstruct`, `limber execute` or `limber doctor`.")})
+    assert layout.names("operator") == ["limber.energy"]
 
 
 @pytest.mark.slow
