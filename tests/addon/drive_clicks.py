@@ -11,7 +11,7 @@ import bpy
 from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import KEY, draw, drive, override, picture, seen, started, view, waited
+from driving import KEY, draw, drive, picture, seen, started, view, waited
 
 STEP_PIXELS = 9
 seen["clicks"] = 0
@@ -136,6 +136,7 @@ def press():
 def drag():
     at["x"] += 3
     event("MOUSEMOVE")
+    seen["clicks_to_bent"] = seen["clicks"]
     seen["bent_m"] = max(abs(a - b) for a, b in zip(places(), at["before"], strict=True))
     return seen["bent_m"] > 0.01
 
@@ -146,9 +147,13 @@ def let_go():
 
 
 def leave():
-    with override():
+    if "left" not in started:
         event("ESC", "PRESS")
-    return waited(0.5)
+        started["left"] = True
+    if not waited(0.5):
+        return False
+    del started["left"]
+    return True
 
 
 drive([open_sidebar, is_sidebar_open, point_at_tab, click, is_ours, picture("tab"),

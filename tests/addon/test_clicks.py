@@ -12,6 +12,6 @@ def test_four_clicks_to_a_bent_branch(run, blender, environment, tmp_path):
     seen = driven("drive_clicks.py", blender, environment, tmp_path, (1280, 720))
     assert seen["category"] == "Limber"
     assert seen["bent_m"] > 0.01
-    assert seen["clicks"] == 4
+    assert seen["clicks_to_bent"] == 4
     for name in ("tab", "example", "bent"):
         assert colour_count(tmp_path / f"{name}.png") > 50
