@@ -17,6 +17,7 @@ MODULES = (
     "operators.replay",
     "operators.from_cursor",
     "operators.place_goal",
+    "operators.drag_goal",
     "operators.open_report",
     "operators.open_result",
     "operators.play",

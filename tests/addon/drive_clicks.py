@@ -1,4 +1,5 @@
-"""From Blender's factory start-up to a bent branch, by the mouse alone; test_clicks.py starts it.
+"""From Blender's factory start-up to a bent branch and a moved goal, by the mouse alone;
+test_clicks.py starts it.
 
 Buttons are found as an eye finds them: the mouse goes down the sidebar until the button under it is
 the one that is wanted. Clicks are counted; moves, and a key that Blender itself has, are not.
@@ -156,7 +157,36 @@ def leave():
     return True
 
 
+def goal():
+    branch = bpy.data.collections["bending_branch"]
+    return sys.modules[f"{KEY}.goal_ball"].of(branch)
+
+
+def point_at_goal():
+    _, area, region = view()
+    place = view3d_utils.location_3d_to_region_2d(
+        region, area.spaces.active.region_3d, goal().matrix_world.translation)
+    at.update(x=region.x + place.x, y=region.y + place.y, goal=goal().location.copy())
+    event("MOUSEMOVE")
+    return waited(0.3)
+
+
+def drag_goal():
+    at["x"] += 3
+    event("MOUSEMOVE")
+    seen["goal_moved_m"] = (goal().location - at["goal"]).length
+    return seen["goal_moved_m"] > 0.01
+
+
+def is_goal_planned():
+    plan = bpy.context.scene.limber.plan
+    seen["goal"] = [*plan.goal] if plan.use_goal else None
+    seen["ball"] = [*goal().location]
+    return waited(0.3)
+
+
 drive([open_sidebar, is_sidebar_open, point_at_tab, click, is_ours, picture("tab"),
        find("open_example"), click, is_open, picture("example"),
-       find("grab"), click, is_held, point_at_branch, press, drag, picture("bent"), let_go, leave],
+       find("grab"), click, is_held, point_at_branch, press, drag, picture("bent"), let_go, leave,
+       point_at_goal, press, drag_goal, picture("goal"), let_go, is_goal_planned],
       longest=60)

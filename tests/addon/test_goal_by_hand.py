@@ -3,6 +3,7 @@
 import importlib
 import io
 import json
+import math
 
 import pytest
 
@@ -38,6 +39,23 @@ def test_moving_the_ball_moves_the_plans_goal(bpy, ball, monkeypatch):
     stage = part("stages").stages()["plan"]
     assert part("properties").differs(plan, stage, {"goal": [0.1, 0.2, 0.31]})
     assert not part("properties").differs(plan, stage, {"goal": [0.1, 0.2, 0.3]})
+
+
+@pytest.mark.slow
+def test_dragging_the_handle_moves_the_plans_goal(bpy, ball):
+    """By a displacement in the world, also where the branch was put aside and turned."""
+    scene, before = bpy.context.scene, list(ball.location)
+    surface = part("branches").find_surface(scene)
+    surface.delta_rotation_euler = (0.0, 0.0, math.pi / 2)
+    bpy.context.view_layer.update()
+    assert bpy.ops.limber.drag_goal(move=(0.0, 0.1, 0.0)) == {"FINISHED"}
+    wanted = [before[0] + 0.1, before[1], before[2]]
+    assert list(ball.location) == pytest.approx(wanted, abs=1e-6)
+    assert scene.limber.plan.use_goal
+    assert list(scene.limber.plan.goal) == pytest.approx(wanted, abs=1e-6)
+    bpy.data.objects.remove(ball)
+    with pytest.raises(RuntimeError, match="no goal"):
+        bpy.ops.limber.drag_goal(move=(0.0, 0.1, 0.0))
 
 
 @pytest.mark.slow
