@@ -63,6 +63,19 @@ def test_a_simulated_pull_of_ones_own_scan_is_no_truth(stages, tmp_path, own, ca
     assert ("contain the true modulus" in words) != own
 
 
+def test_the_pull_has_the_errors_of_a_cell(stages, tmp_path) -> None:
+    """A generated branch is pulled with a sensor for its small force, a scan's with a robot's own.
+    """
+    assert main.call(["demo", "-o", str(tmp_path / "out")]) == 0
+    told = " ".join(stages["virtual-pull"])
+    assert "--cell-errors realistic" in told and "--force-bias-sigma 0.01" in told
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    assert main.call(["demo", str(scan), "-o", str(tmp_path / "own")]) == 0
+    told = " ".join(stages["virtual-pull"])
+    assert "--cell-errors realistic" in told and "--force-bias-sigma" not in told
+
+
 def test_a_second_demo_keeps_results_and_renders_nothing_again(stages, tmp_path, capsys) -> None:
     """It says so. Once the branch has changed, its scene is made anew."""
     branch, out = Branch.create(tmp_path / "generated.branch"), tmp_path

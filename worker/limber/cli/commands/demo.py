@@ -34,10 +34,9 @@ from limber.version import VERSION
 # recording: green wood that softens towards the tip.
 DEMO_YOUNG = (2.0e9, 1.6e9, 1.2e9, 0.8e9)
 
-_CELL = ("--cell-errors", "realistic", "--force-bias-sigma", 0.01, "--force-drift-sigma", 0.01)
-"""Errors of a real cell. Its force sensor is made for the branch, which bends by a third of a metre
-under 0.2 N: a robot's own sensor, with a zero to 1 N, would tell nothing of it.
-"""
+# The generated branch bends by a third of a metre under 0.2 N: its force sensor is made for that. A
+# robot's own one, with a zero to 1 N, would tell nothing of it.
+_SMALL_SENSOR = ("--force-bias-sigma", "0.01", "--force-drift-sigma", "0.01")
 
 # Fraction of the whole time at which each stage ends, for the bar; measured once, only approximate.
 _ENDS = {"generate": 0.01, "reconstruct": 0.15, "virtual-pull": 0.3, "estimate": 0.5,
@@ -216,19 +215,19 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
         The stages that failed.
     """
     branch = demo.branch
-    truth: list[str] = []
+    truth: tuple[str, ...] = _SMALL_SENSOR
     if cloud is None:
         source = demo.folder / "scan"
         demo.stage("a generated branch, scanned", "generate", source, "--seed", seed)
         cloud = source / "cloud.ply"
     else:
-        truth = ["--young", young]
+        truth = ("--young", young)
     demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *_scan_options(wishes))
     goal = ["--goal", *wishes["goal"]] if wishes.get("goal") else []
     failure = None
     try:
         demo.stage("a simulated pull, with noise and the errors of a cell", "virtual-pull", branch,
-                   "--name", "pull-1", "--seed", seed, *_CELL, *truth)
+                   "--name", "pull-1", "--seed", seed, "--cell-errors", "realistic", *truth)
         demo.stage("Young's modulus from the pull", "estimate", branch)
         demo.stage("a pull with the estimated modulus", "simulate", branch)
         demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
