@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, Field, ValidationError
 
+from limber.core.alignment import Alignment
 from limber.core.errors import InputError
 from limber.core.json_values import number_array, validated
 from limber.core.settings import Settings, checked_settings
@@ -62,3 +63,11 @@ def test_lists_of_numbers():
     """Of any shape, whole ones among them."""
     np.testing.assert_array_equal(number_array([[1, 2.5], [3, 4]]), [[1.0, 2.5], [3.0, 4.0]])
     assert number_array([]).shape == (0,)
+
+
+@pytest.mark.parametrize("content", [{"scale": 1e-300}, {"scale": True}, {"origin": [0, 0, 1e15]}])
+def test_an_alignment_of_no_scan(content):
+    """It could not be undone: its matrix would have no inverse."""
+    with pytest.raises(ValidationError):
+        validated(Alignment, content)
+    assert validated(Alignment, {"scale": 1e-6, "origin": [4e5, 5.8e6, 0]}).scale == 1e-6

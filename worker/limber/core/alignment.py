@@ -1,9 +1,13 @@
 """From the coordinates of the file that a branch was made from to the branch's, and back."""
 
+from typing import Annotated
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 _Row = tuple[float, float, float]
+_Place = Annotated[float, Field(ge=-1e8, le=1e8)]
+"""A coordinate [m]: ten times farther than any on the Earth, and still exact to a micrometre."""
 
 
 class Alignment(BaseModel):
@@ -15,8 +19,8 @@ class Alignment(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    scale: float = Field(1.0, gt=0)
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = Field(1.0, ge=1e-7, le=1e6)
+    origin: tuple[_Place, _Place, _Place] = (0.0, 0.0, 0.0)
     rotation: tuple[_Row, _Row, _Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     @field_validator("rotation")
