@@ -9,6 +9,7 @@ points by their distance from it comes out up to half too thin.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
@@ -18,6 +19,7 @@ _ROUNDS = 3
 _NEAR = 30  # points to each side along the axis, whose spread is one width, at least
 _LONG, _REACH = 2.0, 8.0  # radii to each side, at least and at most
 _LEAST = 8  # points that make a width
+_STRIPS = 9  # neighbouring nodes of which the median width counts
 # Fraction of the points beyond each edge of what is measured: stray ones are there, and a quantile
 # of so many is known to half the radius over the square root of their number.
 _TAIL, _QUANTILE_SIGMA = 0.1, 0.5
@@ -131,6 +133,8 @@ def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleto
         own, here, known = own[within], along[-len(own):][within], known[within]
         told = np.stack([np.interp(here, here[known], column[within][known]) for column in told.T],
                         axis=1)
+        # Where a twig hides part of its carrier, a few widths are of strips.
+        told = median_filter(told, size=(_STRIPS, 1), mode="nearest")
         sight = field.at(skeleton.nodes[own])
         side = np.cross(axis[own], sight)
         side /= np.maximum(np.linalg.norm(side, axis=1), 1e-300)[:, None]
