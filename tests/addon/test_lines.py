@@ -1,6 +1,7 @@
 """Texts in lines as wide as the sidebar."""
 
 import importlib
+from types import SimpleNamespace
 
 import pytest
 
@@ -45,3 +46,18 @@ def test_numbers_are_short(addon, value, text):
     number_text = importlib.import_module("limber_addon.stages").number_text
     assert number_text(value) == text
     assert float(text) == value
+
+
+def test_an_error_beside_the_mouse_fits_the_screen(lines):
+    """In lines in a window; a script gets the worker's text as it is."""
+    operator = importlib.import_module("limber_addon.operators.worker_operator").WorkerOperator
+    text = "The scan contains two plants, and a branch belongs to one plant alone. " * 5
+    context, told = SimpleNamespace(window=SimpleNamespace(width=1280)), []
+    for is_beside in (True, False):
+        pressed = SimpleNamespace(_is_beside=is_beside,
+                                  report=lambda _kind, words: told.append(words))
+        operator._complain(pressed, context, text)
+    wrapped, whole = told
+    assert whole == text
+    assert len(wrapped.splitlines()) > 1 and wrapped.split() == text.split()
+    assert max(map(lines.width, wrapped.splitlines())) < 1280
