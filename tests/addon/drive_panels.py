@@ -149,6 +149,8 @@ def errors():
 
     def draw(layout, context):
         steps, stages = part("panels.steps"), part("stages").stages()
+        # As the panels of the steps have it.
+        layout.use_property_split, layout.use_property_decorate = True, False
         for number, (stage, text) in enumerate(told[:DRAWN_ERRORS]):
             choices = [{"option": field.name, "value": field.choices[0]}
                        for field in stages[stage].fields.values() if field.choices][:1]
