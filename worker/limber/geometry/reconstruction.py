@@ -328,7 +328,7 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
         longest = max(twig["length"] for twig in dropped)
         text = (f"{len(dropped)} twigs (up to {1000 * longest:.0f} mm) were discarded. In the "
                 "depth camera's image they do not extend beyond their parent, so they may be "
-                "depth noise (--silhouette-reach).")
+                "depth noise.")
     return replace(found, skeleton=skeleton, node_of_point=node, residual=residual,
                    pruned=found.pruned + len(dropped)), text
 

@@ -288,7 +288,7 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
         texts.append(f"{flying} of {counts['read']} points were discarded as flying pixels of a "
-                     "depth camera (--flying-angle, --flying-speck).")
+                     "depth camera (--flying-angle).")
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
         texts.append(f"{lost} points were discarded as outliers (--outlier-ratio).")
