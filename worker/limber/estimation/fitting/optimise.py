@@ -311,8 +311,8 @@ class _Settling:
             return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not is_settled:
             return FitStatus.out_of_evaluations, (
-                f"{limit} simulations were not enough: {error} is still falling. Increase "
-                "--evaluations, or use --method gauss-newton")
+                f"{limit} simulations were not enough: {error} is still falling. Use "
+                "--method gauss-newton")
         if self._delta is None:
             return FitStatus.converged, f"{error} settled"
         return FitStatus.misfit, (
