@@ -29,7 +29,7 @@ from .column_titles import (
 
 _COUNTERS = ("id", "index", "idx", "nr", "no", "number", "row", "point", "pointid", "pointnumber")
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
-_COLMAP, _HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
+_COLMAP, _HEAD = "POINT3D_ID", 1000  # characters in which COLMAP's column name is searched
 _COLMAP_TITLES = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 LINES_AT_ONCE = 20_000

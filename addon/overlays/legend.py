@@ -13,7 +13,7 @@ from . import covered_width
 
 _MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
 _BETWEEN, _LINE_LETTERS = 20, 20
-_GAP = 60  # above the lower edge: what Blender writes there stays readable
+_GAP = 60  # above the lower edge: Blender's text there stays readable
 _handle: list = []
 
 

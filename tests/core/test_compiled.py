@@ -14,7 +14,7 @@ from limber.core.errors import DamagedCacheWarning
 from limber.core.files import caches
 from limber.core.numerics import compiled
 from limber.core.processes.pool import Pool
-from limber.core.progress import damage_told_to
+from limber.core.progress import report_damage_to
 
 KERNEL = """
 from limber.core.numerics.compiled import compiled
@@ -87,7 +87,7 @@ def kept(tmp_path, monkeypatch):
 
     def run():
         """Returns the result, whether it was compiled, and what was warned of."""
-        monkeypatch.setattr(compiled, "_damage_told", [])
+        monkeypatch.setattr(compiled, "_reported_damage", [])
         spec = importlib.util.spec_from_file_location("kernel", path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
@@ -172,7 +172,7 @@ def test_a_command_says_it_once_as_its_own_warning():
     """One line, and among the warnings of its result, however many processes warn."""
     said = []
     run = Run(None, said.append)
-    with damage_told_to(run.progress.warn):
+    with report_damage_to(run.progress.warn):
         for number in range(3):
             warnings.warn(f"file {number} was damaged", DamagedCacheWarning, stacklevel=1)
     assert run.warnings == ["file 0 was damaged"] and said == ["warning: file 0 was damaged"]
@@ -187,6 +187,6 @@ def _damaged(number):
 def test_processes_of_a_pool_warn_through_the_command():
     """Two that find damage: one warning."""
     told = []
-    with damage_told_to(told.append), Pool(2) as pool:
+    with report_damage_to(told.append), Pool(2) as pool:
         assert sorted(pool.map(_damaged, [(0,), (1,)])) == [0, 1]
     assert len(told) == 1 and "was damaged" in told[0]

@@ -14,16 +14,16 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.fit_preparation import forwards_of, is_path_observed
 from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.initial_modulus import FALL, led_start, standing_start
+from limber.estimation.fitting.initial_modulus import FALL, prescribed_start, standing_start
 from limber.estimation.fitting.large_errors import far_points, fitted_frame, put_right
-from limber.estimation.fitting.nuisances import eliminated, in_words, told, unlikely
+from limber.estimation.fitting.nuisances import eliminated, in_words, nuisance_records, unlikely
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward import quasi_static
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.path_error import led_by_path, path_error
+from limber.estimation.uncertainty.path_error import path_error, path_prescribed
 from limber.estimation.uncertainty.variance_parts import ADVICE, largest, variance_parts
 from limber.estimation.virtual_cell import marked_points
 from limber.recordings.cell_errors import EXACT, CalibrationEntry, calibration_of
@@ -164,7 +164,7 @@ def test_a_point_that_is_off_along_the_branch_is_told_as_that(small, small_bench
     objective = objective_of(small_bench, replace(pull, entry=entry))
     evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
                                     jacobian=True)
-    listed = {each["name"]: each for each in told(
+    listed = {each["name"]: each for each in nuisance_records(
         objective.cell_errors.nuisances, evaluation.errors, np.zeros((4, 4)))}
     point = listed["position of point 3 along the branch"]
     assert point["value"] == pytest.approx(8e-3, abs=1.5e-3) and point["explains_misfit"]
@@ -345,7 +345,7 @@ def test_a_first_fit_that_explains_nothing_says_so(small_bench, small_pull):
         pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": None}))
         objective = objective_of(small_bench, pull)
         uniform = replace(objective.space.base, young=np.full(4, np.exp(np.log(TRUTH).mean())))
-        _, explains = led_start(objective, uniform)
+        _, explains = prescribed_start(objective, uniform)
         assert explains == is_good
 
 
@@ -363,7 +363,7 @@ def test_a_force_that_misleads_a_first_fit_is_not_followed(small_bench, small_pu
 
     monkeypatch.setattr(Objective, "follow_forces", overshooting)
     uniform = replace(objective.space.base, young=np.full(4, np.exp(np.log(TRUTH).mean())))
-    found, explains = led_start(objective, uniform)
+    found, explains = prescribed_start(objective, uniform)
     assert explains and np.abs(np.log(found.young / TRUTH)).max() < 0.5
     assert np.ptp(np.array(forward._drives) - forward._measured, axis=0) == pytest.approx(
         0.0, abs=0.05 * np.abs(forward._measured).max())
@@ -388,14 +388,14 @@ def test_a_path_that_leads_says_so_and_widens_the_interval(small_bench, small_pu
         objective = small_bench.objective([pull], SETTINGS)
         evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
                                         jacobian=True)
-        return led_by_path(objective.forwards), path_error(evaluation, objective)
+        return path_prescribed(objective.forwards), path_error(evaluation, objective)
 
     led, wide = found(pose_sigma_m=1e-3)
     assert [forward.name for forward in led] == ["pull-1"]
     assert wide.shape == (4,) and wide.max() > 0.1
     assert found(pose_sigma_m=1e-4)[1] == pytest.approx(wide / 10, rel=0.05)
     assert np.all(found(pose_sigma_m=1e-3, pose_sigma_rad=0.02)[1] > wide)
-    assert led_by_path(small_bench.objective([small_pull], SETTINGS).forwards) == []
+    assert path_prescribed(small_bench.objective([small_pull], SETTINGS).forwards) == []
 
 
 def test_an_error_far_beyond_what_the_cell_states_gives_no_result():

@@ -101,7 +101,7 @@ def test_limits_of_a_pull_are_where_the_squares_have_risen(small_bench, small_pu
     assert objective.evaluate(best.free) is before
     assert limits.mean() > best.free[widest]
     others = np.arange(len(best.free)) != widest
-    tried = objective.apart()
+    tried = objective.without_priors()
     for limit in limits:
         def held(rest, limit=limit):
             free = np.empty(len(best.free))

@@ -43,7 +43,7 @@ def test_a_gripper_frame_turns_about_the_grasp():
     exact, errors, seen = drawn(pose_sigma_m=1e-3, pose_sigma_rad=0.02)
     moved = exact.poses[:, :3] - POINT
     np.testing.assert_allclose(
-        seen.poses[:, :3], POINT + errors.gripper_place + rotated(errors.gripper_turn, moved),
+        seen.poses[:, :3], POINT + errors.gripper_offset + rotated(errors.gripper_turn, moved),
         atol=1e-9)
     assert np.linalg.norm(errors.gripper_turn) > 0.005
 
@@ -60,7 +60,7 @@ def test_gain_zero_and_drift_of_the_force():
 
 def test_errors_scatter_as_the_calibration_states():
     places = np.array([CellErrors.drawn(CalibrationEntry(), np.random.default_rng(seed)
-                                        ).gripper_place for seed in range(400)])
+                                        ).gripper_offset for seed in range(400)])
     assert places.std() == pytest.approx(1e-3, rel=0.1)
 
 

@@ -85,7 +85,7 @@ def test_how_the_place_changes_with_the_nodes():
     start = rng.normal(size=6) * 0.3
     steps = [1e-6 * unit for unit in np.eye(6)]
     changes = np.stack([(moved(start + step) - moved(start - step)) / 2e-6 for step in steps], -1)
-    slopes = grasp.place_slopes(mesh.nodes, moved(start), changes)
+    slopes = grasp.position_slopes(mesh.nodes, moved(start), changes)
     wanted = np.stack([(grasp.pose_of(mesh.nodes, moved(start + step))[:3]
                         - grasp.pose_of(mesh.nodes, moved(start - step))[:3]) / 2e-6
                        for step in steps], -1)

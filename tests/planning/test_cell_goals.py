@@ -20,7 +20,7 @@ from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import places_in, require_seen
+from limber.stages.paths.plan_cell import cell_positions, require_seen
 from limber.store import Branch
 
 SETTINGS = PlanSettings(iterations=300, field_error=20.0, inertia=False)
@@ -65,7 +65,7 @@ def test_a_region_of_which_half_does_has_its_border_there(field, small_model):
     assert np.array_equal(everywhere.distance(field, points),
                           TargetGoal.distance(everywhere, field, points))
     stated = everywhere.uncertainty(field, points)
-    assert 0.0 < stated.min() < stated.max() <= field.place_error()
+    assert 0.0 < stated.min() < stated.max() <= field.position_error()
 
     def nowhere(*_):
         raise NoPathError("No.", "", "")
@@ -128,7 +128,7 @@ def test_walking_into_a_large_region_stays_among_the_samples(field):
 
 
 def test_an_obstacle_hides_what_is_behind_it():
-    view = places_in(camera_cell(1.0))["in_view"].region
+    view = cell_positions(camera_cell(1.0))["in_view"].region
     place = np.array([0.1, 0.0, 0.45])
     box = Box("the post", np.full(3, 0.02), np.array([0.05, -0.4, 0.47]), np.eye(3))
     require_seen(view, (), "the tip", place, None)
@@ -151,7 +151,7 @@ def arm_cell(tip):
         middle = 0.5 * (low + high)
         cell = cell_of(second_arm={"model": "ur5", "base_pose": (middle, 0, 0, 0, 0, 0)})
         try:
-            places_in(cell)["second_arm"].require("the tip", tip, None)
+            cell_positions(cell)["second_arm"].require("the tip", tip, None)
             high = middle
         except NoPathError:
             low = middle
@@ -165,7 +165,7 @@ def test_a_target_is_brought_where_it_can_be_taken_or_seen(planned_branch, tmp_p
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     tip = read_plan(folder / "plans/there.json").motion.tips[0]
     cell = arm_cell(tip) if kind == "second_arm" else camera_cell(float(tip[1]) + 0.8 - AWAY)
-    place = places_in(cell)[kind]
+    place = cell_positions(cell)[kind]
     path = tmp_path / "cell.toml"
     write_cell(path, cell.model_copy(update={"branch": Branch.open(folder).uuid}))
     plan_paths(folder, SETTINGS.model_copy(update={kind: True}), name="brought", cell_file=path,

@@ -47,11 +47,12 @@ def test_a_branch_that_is_stiffer_everywhere(small_model, bent):
     assert found.factors["force"] == pytest.approx(np.exp(0.08 * z), rel=1e-3)
     assert found.factors["strain"] == pytest.approx(1.0, abs=1e-3)
     assert found.kept == pytest.approx(norm.cdf(np.log(1.1) / 0.08), abs=2e-3)
-    assert "force" in found.told()[0]
+    assert "force" in found.exceeded_limits()[0]
     tighter = limits.tightened(found.factors)
     assert tighter.force < peak
     wide = replace(limits, force=1.2 * peak)
-    assert not uncertainty_of(small_model, [0.08]).risk(small_model, bent, wide, 0.95).told()
+    assert not uncertainty_of(small_model, [0.08]).risk(small_model, bent, wide,
+                                                        0.95).exceeded_limits()
 
 
 def test_what_is_left_to_a_motion_is_what_the_moduli_leave(small_model, bent):

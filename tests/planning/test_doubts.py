@@ -107,7 +107,7 @@ def test_a_target_may_be_nearer_than_the_field_has_it(rough_field):
     points = rough_field.region.draw(4000, np.random.default_rng(0))
     top = points[np.argmax(rough_field.tip(points)[:, 2])]
     off = float(rough_field.place_errors(None, top[None])[0])
-    assert 0.002 < off <= rough_field.place_error() < 0.02
+    assert 0.002 < off <= rough_field.position_error() < 0.02
     for away, proven in ((0.5 * off, False), (4.0 * off, True)):
         centre = (0.0, 0.0, float(reach[:, 2].max()) + 0.005 + away)
         problem = problem_on(rough_field, Limits(), TargetGoal(Ball(centre, 0.005)))
@@ -129,7 +129,7 @@ def test_a_field_of_an_older_program_opens_and_proves_nothing(rough_field, tmp_p
     assert np.array_equal(new.misplaced, rough_field.misplaced)
     assert judge(problem_on(new, Limits(strain=0.9))).proven
     old, limits = EnergyField.read(tmp_path / "old.npz"), Limits(strain=0.9)
-    assert limits.doubts(old)["strain"] == np.inf and old.place_error() == np.inf
+    assert limits.doubts(old)["strain"] == np.inf and old.position_error() == np.inf
     assert limits.margins(old)["strain"] == pytest.approx(0.27)
     assert not judge(problem_on(old, limits)).proven
     assert (old.place_errors(None, old.samples.positions) == np.inf).all()

@@ -56,7 +56,7 @@ def test_a_fit_is_chosen_for_most_poses_and_not_for_the_stiffest(ridge, monkeypa
         return error_measures(some, (1.0 + off) * some.energies,
                               (1.0 + off[:, None]) * some.forces), np.zeros((len(some.poses), 4))
 
-    monkeypatch.setattr(energy_field, "left_out_errors", left_out)
+    monkeypatch.setattr(energy_field, "cross_validated_errors", left_out)
     assert fit_field(samples).energy_fit.kernel == "quintic"
 
 

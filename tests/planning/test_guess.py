@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.planning.field.grasp_model import Guess
-from limber.planning.field.guess import foretold_by, guess_of, half_way, straight_on
+from limber.planning.field.guess import extrapolated, guess_of, midpoint_blend, straight_on
 from limber.planning.field.solved import taken
 
 ASIDE = np.array([0.03, 0.015, -0.006])
@@ -34,8 +34,8 @@ def guesses(model, states):
     about = [rest, quarter, aside, *others]
     return half, {
         "radial": guess_of(model, about, np.array([one.pose[:3] for one in about]), half.pose[:3]),
-        "half-way": half_way(model, rest, aside, half.pose[:3]),
-        "alone": foretold_by(model, rest, half.pose[:3]),
+        "half-way": midpoint_blend(model, rest, aside, half.pose[:3]),
+        "alone": extrapolated(model, rest, half.pose[:3]),
         "straight on": straight_on(model, rest.displacement, quarter.displacement, half.pose[:3])}
 
 

@@ -15,12 +15,12 @@ from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_fi
 from limber.planning.goals.chosen_pose import default_goal
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
-from limber.planning.planners.easiest import easiest_way
+from limber.planning.planners.easiest import easiest_path
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine
 from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import plan_within
-from limber.planning.undecided_passages import asked_in_doubt
+from limber.planning.undecided_passages import solved_if_undecided
 
 RADIUS = 0.2  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily
@@ -58,7 +58,7 @@ def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_fie
     poses drawn in the goal say of neither that it can be kept."""
     held = np.linalg.norm(shell_field.force(np.array([GOAL.position])))
     wide = problem_on(shell_field, max_force=1.05 * held)
-    way = judge(wide).way
+    way = judge(wide).path
     assert way is not None and np.linalg.norm(way[-1] - GOAL.position) <= GOAL.tolerance
     assert np.linalg.norm(shell_field.force(resample(way, 0.001)), axis=1).max() < 1.1 * held
     found = plan_gentle(wide, enough=1e6)
@@ -81,7 +81,7 @@ def test_a_chord_far_over_a_limit_is_refined_into_the_valley(shell_field, share)
     chord = resample(ends, 0.002)
     assert np.linalg.norm(shell_field.force(chord), axis=1).max() > 10.0 * limit
     path, cost = refine(chord, problem)
-    easy = easiest_way(shell_field, problem.limits, start, GOAL)
+    easy = easiest_path(shell_field, problem.limits, start, GOAL)
     assert cost == problem.cost(path) <= 1.002 * refine(easy.points, problem)[1] < np.inf
 
 
@@ -96,7 +96,7 @@ def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
                        enough=0.1).points
     line = start + np.linspace(0.0, 1.0, 100)[:, None] * (goal.centre(ridge_field) - start)
     limit = 2.0
-    way = easiest_way(ridge_field, ridge_field.limited(max_force=limit), start, goal)
+    way = easiest_path(ridge_field, ridge_field.limited(max_force=limit), start, goal)
 
     def worst(points):
         return np.linalg.norm(ridge_field.force(resample(points, 0.001)), axis=1).max() / limit
@@ -115,12 +115,13 @@ def narrow(planned_branch):
 def test_poses_are_asked_where_the_fields_error_leaves_it_in_doubt(narrow, small_model):
     """Those of the way that comes nearest, by the full model; none where the limit is far off."""
     field, goal, held = narrow
-    found = asked_in_doubt(field, small_model, field.rest, goal,
-                           Limits(force=held * (1.0 + 1e-6)))
-    assert 1 <= len(found.learnt.poses) <= 12 and "N, at (" in found.told
+    found = solved_if_undecided(field, small_model, field.rest, goal,
+                                Limits(force=held * (1.0 + 1e-6)))
+    assert 1 <= len(found.learnt.poses) <= 12 and "N, at (" in found.summary
     again = small_model.follow(found.learnt.poses[:1, :3], small_model.rest.displacement)[0]
     assert np.allclose(again.reaction_force, found.learnt.forces[0], rtol=1e-3, atol=1e-3 * held)
-    assert asked_in_doubt(field, small_model, field.rest, goal, Limits(force=0.1 * held)) is None
+    assert solved_if_undecided(field, small_model, field.rest, goal,
+                               Limits(force=0.1 * held)) is None
 
 
 @pytest.mark.slow

@@ -13,10 +13,10 @@ from limber.planning.plan_file import read_plan
 from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named
-from limber.stages.paths.execute import _told
+from limber.stages.paths.execute import _stated_by_plan
 from limber.stages.paths.execute_path import offsets_along
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import KeptClear, blocked_by, clearance_in, places_in
+from limber.stages.paths.plan_cell import KeptClear, blocked_by, cell_positions, clearance_in
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
@@ -87,7 +87,7 @@ def test_the_gripper_lags_behind_where_it_may_not_turn_with_the_branch(copied, m
     whole = turning["full_model"]
     assert 0.0 < whole["torque_error_nm"] < 0.4 * whole["peak_torque_nm"]  # a large rotation
     assert legs["path"]["peak_torque_nm"] == pytest.approx(turning["peak_torque_nm"], rel=0.2)
-    told = _told(Branch.open(copied), "lagging")["turning"]
+    told = _stated_by_plan(Branch.open(copied), "lagging")["turning"]
     ahead = there.motion.poses[np.array(there.motion.phases) != "return", :3]
     assert np.linalg.norm(offsets_along(told, ahead)[-1]) == pytest.approx(
         turning["largest_rad"], rel=1e-3)
@@ -153,8 +153,8 @@ def test_a_second_arm_reaches_as_far_as_it_can():
     """Its region is a ball about its shoulder that holds all that it takes, with its tool; within
     it inverse kinematics decides."""
     entry = {"model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0)}
-    place, held = (places_in(Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)},
-                                  second_arm=entry | tool))["second_arm"]
+    place, held = (cell_positions(Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)},
+                                       second_arm=entry | tool))["second_arm"]
                    for tool in ({}, {"grasp_pose": (0, 0, 0.1, 0, 0, 0)}))
     region = held.region
     assert region.middle == pytest.approx([1.0, 0.0, 0.15185])

@@ -12,9 +12,9 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.plan_file import (
     limits_of_motion,
+    path_record,
     plan_text,
     read_plan,
-    way_of,
     whole_motion,
 )
 from limber.planning.settings import PlanSettings
@@ -77,7 +77,7 @@ def test_limits_tell_their_margin(path):
 
 
 def written(path, folder):
-    ways = [way_of(path.solved, ("flower", "leaf"), field_energies=np.ones(3))] * 2
+    ways = [path_record(path.solved, ("flower", "leaf"), field_energies=np.ones(3))] * 2
     motion = whole_motion(path, ("flower", "leaf"))
     summary = {"seed": 3, "baseline": {"length_m": 0.1}, "plan": {"length_m": 0.1}}
     file = folder / "plan.json"
@@ -140,7 +140,7 @@ def test_damaged_plans_are_refused(path, tmp_path, spoil, words):
 
 def test_joints_are_carried(path, tmp_path):
     """Where a robot is given its joint angles stand beside the poses."""
-    way = replace(way_of(path.solved), joints=np.ones((3, 6)))
+    way = replace(path_record(path.solved), joints=np.ones((3, 6)))
     summary = {"baseline": {}, "plan": {}}
     file = tmp_path / "plan.json"
     file.write_text(plan_text(summary, way, way, way, {}))

@@ -13,7 +13,7 @@ from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
-from limber.robot.cell.base_calibration import fit_base, touched_place
+from limber.robot.cell.base_calibration import fit_base, touched_point
 from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.cell.controller_settings import differences
 from limber.robot.interface import Sample
@@ -54,7 +54,7 @@ def test_a_touched_place_is_the_controllers_own(tool, tells_it):
     joints = np.array(cell.arm.home) + 0.1
     true = sample_with(GRASP, joints).pose[:3]
     sample = sample_with(tool, joints, tells_it=tells_it)
-    assert touched_place(cell, sample) == pytest.approx(true, abs=1e-9)
+    assert touched_point(cell, sample) == pytest.approx(true, abs=1e-9)
     nominal = (cell.arm.forward(joints) @ matrices(np.array(GRASP)))[:3, 3]
     assert np.linalg.norm(nominal - true) > 2e-3
 
@@ -62,7 +62,7 @@ def test_a_touched_place_is_the_controllers_own(tool, tells_it):
 def test_a_pose_of_another_tool_is_refused():
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"grasp_pose": GRASP})
     with pytest.raises(InputError, match=r"tool.grasp_pose is at \(10, 0, 150\) mm"):
-        touched_place(cell, sample_with((0.0, 0.0, 0.2, 0, 0, 0), np.array(cell.arm.home)))
+        touched_point(cell, sample_with((0.0, 0.0, 0.2, 0, 0, 0), np.array(cell.arm.home)))
 
 
 @pytest.mark.parametrize("on_branch, told", [

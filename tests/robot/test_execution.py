@@ -250,7 +250,7 @@ def test_the_planned_clearance_is_kept_when_executed(planned_folder, tmp_path, m
     near = cell_file(Cell.model_validate(cell.model_dump() | {
         "tool": cell.tool.model_dump() | {"parts": [finger]}, "obstacles": [box]}), tmp_path)
     stated = {"clearance_m": 0.2}
-    monkeypatch.setattr(stage, "_told", lambda *_: stated)
+    monkeypatch.setattr(stage, "_stated_by_plan", lambda *_: stated)
     with pytest.raises(NoPathError, match=r"from shelf, nearer than the clearance of 200.0 mm"):
         execute(planned_folder, "path", near, ExecuteSettings(), ExecuteOptions())
     stated["clearance_m"] = 0.0

@@ -135,7 +135,7 @@ def test_a_slow_robot_is_led_by_a_solution_farther_back(setting, beam):
     solver.grasp(frame(0.0)[:3, 3])
     past = [solver.solve(frame(0.001 * k)) for k in range(10, 6, -1)]
     at = solver.solve(frame(0.011))
-    at.led_by(past, (np.zeros((0, 3)), np.zeros((0, 6, 6))))
+    at.add_predictions(past, (np.zeros((0, 3)), np.zeros((0, 6, 6))))
     assert 0.002 < np.linalg.norm(at.bends[0][0]) < 0.0031
 
 

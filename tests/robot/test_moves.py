@@ -15,7 +15,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.constraints.obstacles import Box
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.joint_planner import joint_way
+from limber.robot.motion.joint_planner import joint_space_path
 from limber.robot.motion.trajectory import along_bounded
 from limber.stages.paths.arm_moves import to_joints
 from limber.stages.paths.arm_surroundings import ArmSurroundings
@@ -58,8 +58,8 @@ def test_a_goal_inside_something_is_refused_and_so_is_a_wall_all_around():
     with pytest.raises(NoPathError, match="beyond its limit"):
         to_joints(CELL, HOME, HOME + [7.0, 0, 0, 0, 0, 0], ArmSurroundings(CELL, (), None))
     with pytest.raises(NoPathError, match="No free way"):
-        joint_way(np.zeros(2), np.ones(2), np.array([[-1.0, 2.0]] * 2),
-                  lambda angles: np.abs(angles.sum(axis=1) - 1.0) > 0.1)
+        joint_space_path(np.zeros(2), np.ones(2), np.array([[-1.0, 2.0]] * 2),
+                         lambda angles: np.abs(angles.sum(axis=1) - 1.0) > 0.1)
 
 
 def test_an_arm_does_not_go_through_itself_or_the_branch():

@@ -24,7 +24,7 @@ from limber.robot.cell.cell import Cell
 from limber.robot.known_arms import arm_named
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.stages.pulls.record import RecordOptions, RecordSettings, record
-from limber.stages.pulls.record_path import suggested_pull, there_and_back, way_on_arc, way_through
+from limber.stages.pulls.record_path import arc_path, suggested_pull, there_and_back, waypoint_path
 from limber.stages.registry import stage_description
 from limber.store import Branch
 from limber.store.loading import load_skeleton
@@ -257,7 +257,7 @@ def test_an_arc_stretches_nothing(branch_folder):
     branch = Branch.open(branch_folder)
     skeleton = load_skeleton(branch)
     point, way = skeleton.point_at(0.9), sideways(branch)
-    frames = way_on_arc(branch, point, way, 0.04, SILENT)
+    frames = arc_path(branch, point, way, 0.04, SILENT)
     assert frames[0] == pytest.approx(np.eye(4), abs=1e-9)
     moved = frames[:, :3, :3] @ point + frames[:, :3, 3]
     away = moved - moved[0]
@@ -287,12 +287,12 @@ def test_way_points_begin_at_the_gripper(tmp_path):
     path = tmp_path / "way.csv"
     gripper = np.array([0.1, 0.0, 0.4, 0.0, 0.0, 0.2])
     path.write_text("x_m,y_m,z_m\n0.101,0,0.4\n0.12,0,0.4\n0.12,0.02,0.39\n")
-    frames = way_through(path, gripper)
+    frames = waypoint_path(path, gripper)
     assert frames[:, :3, 3] == pytest.approx(np.array(
         [[0.1, 0, 0.4], [0.12, 0, 0.4], [0.12, 0.02, 0.39]]))
     assert frames[:, :3, :3] == pytest.approx(np.tile(frames[0, :3, :3], (3, 1, 1)))
     with pytest.raises(InputError, match=r"10\.0 mm away from the gripper"):
-        way_through(path, gripper + np.r_[-9e-3, np.zeros(5)])
+        waypoint_path(path, gripper + np.r_[-9e-3, np.zeros(5)])
 
 
 def test_way_points_out_of_reach_are_refused(tmp_path):
@@ -301,7 +301,7 @@ def test_way_points_out_of_reach_are_refused(tmp_path):
     path.write_text("x_m,y_m,z_m\n0,0,0.5\n0,0,0.55\n-0.9,0,0.55\n")
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
                 tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)})
-    frames = way_through(path, np.array([0.0, 0.0, 0.5, 0, 1.2, 0]))
+    frames = waypoint_path(path, np.array([0.0, 0.0, 0.5, 0, 1.2, 0]))
     with pytest.raises(NoPathError, match=r"out of the arm.s reach.*nearer"):
         there_and_back(cell, frames, speed=0.03, cycles=1, pause=0.5)
 

@@ -9,7 +9,7 @@ from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.cell import Cell
 from limber.robot.interface import Sample
 from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.ur.arms import ARMS
@@ -84,7 +84,7 @@ def test_a_recorded_pull_is_checked_for_the_joints_it_begins_with():
         there_and_back(own, frames, speed=0.02, cycles=1, pause=0.1, start=other_branches()[0])
 
 
-def led(way: WayBack, poses: np.ndarray) -> Sample:
+def led(way: RetreatPath, poses: np.ndarray) -> Sample:
     for pose in poses:
         way.note(sample_at(pose))
     return sample_at(poses[-1])
@@ -98,7 +98,7 @@ def test_the_way_back_leads_straight_to_where_it_began():
     """Half as fast as it came; what was pulled out and let back before is not pulled again."""
     out = line(0.05)
     for poses in (out, np.vstack([out, out[::-1], out]), np.vstack([out, out[:20:-1]])):
-        way = WayBack(ARM.joint_names)
+        way = RetreatPath(ARM.joint_names)
         way.begin(sample_at(POSE), Trajectory(along(poses, 0.03, 0.3), poses))
         here = led(way, poses)
         back = way.from_here(here, 0.3)
@@ -112,7 +112,7 @@ def test_a_way_of_a_fraction_of_a_millimetre_is_gone_back():
     """Against something stiff it is tens of newtons; where nothing moved there is no way."""
     for length in (0.0003, 0.0015, 0.003):
         out = line(length)
-        way = WayBack(ARM.joint_names)
+        way = RetreatPath(ARM.joint_names)
         way.begin(sample_at(POSE), Trajectory(along(out, 0.005, 0.3), out))
         back = way.from_here(led(way, out), 0.3)
         assert back.poses[0] == pytest.approx(out[-1]) and back.poses[-1] == pytest.approx(POSE)
@@ -125,7 +125,7 @@ def test_legs_with_the_same_branch_held_are_one_way():
     """Stopped while the branch is let back, it goes on back; not out again."""
     out = line(0.05)
     path = Trajectory(along(out, 0.03, 0.3), out, ExpectedWrench.nothing(out))
-    way = WayBack(ARM.joint_names)
+    way = RetreatPath(ARM.joint_names)
     way.begin(sample_at(POSE), path)
     here = led(way, out)
     way.begin(here, path.backwards())
@@ -134,7 +134,7 @@ def test_legs_with_the_same_branch_held_are_one_way():
 
 
 def test_an_arm_that_left_its_way_does_not_go_back():
-    way = WayBack(ARM.joint_names)
+    way = RetreatPath(ARM.joint_names)
     with pytest.raises(SafetyStop, match="not followed any path yet"):
         way.from_here(sample_at(POSE), 0.3)
     out = line(0.05)

@@ -22,7 +22,7 @@ from limber.geometry.generated import generate_branch
 from limber.geometry.io.skeletons import read_skeleton, read_swc
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.checkpoint import FoundSkeleton
-from limber.geometry.skeleton.search_result import given_skeleton
+from limber.geometry.skeleton.search_result import result_of_skeleton
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.results.scene.contents import scene_data
 from limber.results.scene.still_objects import EDITED
@@ -185,7 +185,7 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
     skeleton = Skeleton.from_edges(rng.normal(size=(6, 3)), np.arange(6) - 1, rng.random(6) + 0.1)
     place, points = rng.normal(size=3), rng.normal(size=(40, 3))
     found = replace(
-        given_skeleton(skeleton, points), noise=0.1 / 3, loops=[1 / 7], pruned=4, leafy=True,
+        result_of_skeleton(skeleton, points), noise=0.1 / 3, loops=[1 / 7], pruned=4, leafy=True,
         second_base=place, bridges=[{"from": place, "to": -place, "length": 1 / 3, "price": 2.0}],
         split_off=[{"points": 7, "distance": 0.7 / 3, "at": place}],
         unlikely=[{"length": 1e-9 / 3, "at": place, "probability": 0.3}])

@@ -20,7 +20,7 @@ from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.make_plan import plan_motion
 from limber.planning.settings import PlanSettings
 from limber.robot.cell.cell import Cell
-from limber.stages.paths.plan_cell import places_in
+from limber.stages.paths.plan_cell import cell_positions
 
 _KINDS = (0.005, 0.05, 0.3, 1.0, "second_arm", "in_view")
 """Radii of balls [m], and regions that a cell gives."""
@@ -111,8 +111,8 @@ def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
         centre = place + (kind - min(0.5 * kind, 0.01)) * outward
         return PlanSettings(tip_goal=tuple(map(float, centre)), goal_tolerance=kind, **common), {}
     settings = PlanSettings(**{kind: True}, **common)
-    return settings, places_in(_cell(kind, place, generator.uniform(0.0, 2.0 * np.pi),
-                                     generator.uniform(0.75, 1.0)))
+    return settings, cell_positions(_cell(kind, place, generator.uniform(0.0, 2.0 * np.pi),
+                                          generator.uniform(0.75, 1.0)))
 
 
 def _cell(kind: str, place: np.ndarray, turn: float, far: float) -> Cell:
@@ -137,7 +137,7 @@ def _refused(kind: float | str, known: EnergyField, model: GraspModel) -> str:
     place = known.tip(known.rest[None])[0] + [_FAR, 0.0, 0.0]
     settings, cell = _asked(kind, place[None], np.random.default_rng(0))
     if kind == "in_view":
-        cell = places_in(_cell("in_view", place, 0.0, 1.0))
+        cell = cell_positions(_cell("in_view", place, 0.0, 1.0))
     try:
         plan_motion(known, model, settings, cell=cell, workers=1)
     except LimberError as error:

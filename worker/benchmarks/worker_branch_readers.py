@@ -165,10 +165,10 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
     from limber.geometry.io.clouds import read_points
     from limber.geometry.io.skeletons import read_skeleton
     from limber.geometry.skeleton.checkpoint import FoundSkeleton
-    from limber.geometry.skeleton.search_result import given_skeleton
+    from limber.geometry.skeleton.search_result import result_of_skeleton
 
-    found = given_skeleton(read_skeleton(template / "skeleton.csv"),
-                           read_points(template / "cloud.ply").points[::10])
+    found = result_of_skeleton(read_skeleton(template / "skeleton.csv"),
+                               read_points(template / "cloud.ply").points[::10])
     place = np.array([0.1, 0.2, 0.3])
     found = replace(found, loops=[0.1], second_base=place, other_root=place, bridges=[
         {"from": place, "to": 2 * place, "length": 0.1, "price": 1.5}], split_off=[
@@ -200,10 +200,10 @@ def _ringing(branch: Branch) -> Any:
 
 
 def _swing(branch: Branch) -> Any:
-    from limber.results.report.swing_section import along_its_way, read_swing, swing_rows
+    from limber.results.report.swing_section import along_path, read_swing, swing_rows
 
     swing = read_swing(branch.path("swing.json"))
-    return swing_rows(swing), along_its_way(swing)
+    return swing_rows(swing), along_path(swing)
 
 
 _LOAD = {"tip_displacement_m": [0.01, 0, -0.02], "sag_m": 0.02, "sag_interval_m": [0.01, 0.03],

@@ -74,7 +74,7 @@ def test_touched_marks_tell_where_the_base_stands(tmp_path):
 def test_more_poses_are_sampled_where_a_path_is_neither_found_nor_excluded(
         proven, monkeypatch, tmp_path):
     """As the planner advises, once; where it has proven that there is none the loop ends."""
-    wish = SimpleNamespace(place=np.zeros(3), sampled_deflection=0.1, max_force=9.0,
+    wish = SimpleNamespace(target=np.zeros(3), sampled_deflection=0.1, max_force=9.0,
                            limited=lambda cell: cell)
     for name, value in (("Branch", SimpleNamespace(open=lambda _folder: None)),
                         ("load_skeleton", lambda _branch: None),
@@ -96,7 +96,7 @@ def test_more_poses_are_sampled_where_a_path_is_neither_found_nor_excluded(
             ClosedLoop(tmp_path)._planned()
         assert [name for name, _ in parts] == ["estimate", "energy", "plan"]
     else:
-        assert ClosedLoop(tmp_path)._planned().goal is wish.place
+        assert ClosedLoop(tmp_path)._planned().goal is wish.target
         assert parts == [("estimate", False), ("energy", False), ("plan", False),
                          ("energy", True), ("plan", False)]
 
@@ -143,7 +143,7 @@ def test_the_overload_comes_while_the_branch_is_led_and_is_taken_away():
                 break
             watch._ended.wait(0.02)
     assert robot.asked == ["added_wrench", "added_wrench"]
-    assert watch.overloaded.way == pytest.approx(0.0)
+    assert watch.overloaded.travel == pytest.approx(0.0)
 
 
 def test_a_loop_writes_over_nothing(tmp_path):

@@ -52,8 +52,8 @@ def test_workers_fit_cores_memory_and_tasks(monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "8")
     assert worker_count(100) == 8
     assert worker_count(3) == 3
-    assert worker_count(100, wanted=2) == 2
-    assert worker_count(100, wanted=50) == 8
+    assert worker_count(100, requested=2) == 2
+    assert worker_count(100, requested=50) == 8
     assert worker_count(100, memory_mb_each=free_memory_mb() / 2.5) == 2
     assert worker_count(100, memory_mb_each=1e9) == 1
     assert worker_count(0) == 1

@@ -25,12 +25,12 @@ def test_places_are_the_same_digits_for_a_cloud_moved_turned_and_shuffled() -> N
     first = OwnFrame.of(POINTS)
     for changed in (POINTS + [50.0, -80.0, 20.0], POINTS @ turn.T, POINTS[order],
                     1e-3 * (1e3 * POINTS)):
-        np.testing.assert_array_equal(OwnFrame.of(changed).places, first.places)
+        np.testing.assert_array_equal(OwnFrame.of(changed).coordinates, first.coordinates)
 
 
 def test_the_frame_leads_there_and_back() -> None:
     """Places are the points themselves, to a millionth of the cloud's size."""
     own = OwnFrame.of(POINTS)
     size = np.linalg.norm(np.ptp(POINTS, axis=0))
-    np.testing.assert_allclose(own.outside(own.places), POINTS[own.order], atol=1e-6 * size)
+    np.testing.assert_allclose(own.outside(own.coordinates), POINTS[own.order], atol=1e-6 * size)
     np.testing.assert_allclose(own.outside(own.inside(POINTS)), POINTS, atol=1e-12)

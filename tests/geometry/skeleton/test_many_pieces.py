@@ -67,7 +67,7 @@ def test_trials_without_a_bridge_end(monkeypatch):
     without = joining._without
 
     def counted(state, pair, *further):
-        tried.append(sum(past.ways for past in state.rounds[joining._start(state, pair):]))
+        tried.append(sum(past.path_count for past in state.rounds[joining._start(state, pair):]))
         return without(state, pair, *further)
 
     monkeypatch.setattr(joining, "_without", counted)

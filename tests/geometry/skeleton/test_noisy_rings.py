@@ -7,7 +7,7 @@ from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import sides_seen
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.noisy_rings import mean_places, weighted_aims
+from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_aims
 from limber.geometry.skeleton.radii.sides_seen import seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -194,7 +194,7 @@ def test_sides_are_told_apart() -> None:
     camera[:, 0] += np.random.default_rng(1).normal(0, 0.001, len(camera))
     assert seen(camera)[2].along_sight
     # The mean place is shorter the less is known, and never longer than the circle's radius.
-    size = np.linalg.norm(mean_places(out, axis, sharpness, np.full(3000, 36.0), half), axis=1)
+    size = np.linalg.norm(mean_positions(out, axis, sharpness, np.full(3000, 36.0), half), axis=1)
     assert size.max() <= 1 + 1e-9 and size.min() > 0.3
 
 

@@ -8,7 +8,7 @@ from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import sides_seen
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.shared_errors import shared_error
-from limber.geometry.skeleton.radii.sides_seen import side_told, side_uncertainty
+from limber.geometry.skeleton.radii.sides_seen import fit_seen_side, side_uncertainty
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
@@ -35,7 +35,7 @@ def test_view_and_limit_are_told_to_a_degree_or_two(limit: float, noise: float) 
     mean = np.array([1.0, -0.25, 0.15]) / np.linalg.norm([1.0, -0.25, 0.15])
     told = sides_seen._one_side(mean)
     for _ in range(8):
-        told = side_told(out, axis, sharpness, np.ones(len(out)), mean, told)
+        told = fit_seen_side(out, axis, sharpness, np.ones(len(out)), mean, told)
     assert np.degrees(np.arccos(told.view[0])) < 2.5
     assert np.degrees(told.limit) == pytest.approx(limit, abs=1.0)
     # What is told is less in doubt than what is not.

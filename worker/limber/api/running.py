@@ -30,12 +30,13 @@ def stage_of(verb: str) -> str:
     return _STAGES.get(verb, verb.replace("_", "-"))
 
 
-def run_stage(name: str, given: Mapping[str, Any], *, quiet: bool) -> tuple[str, dict[str, Any]]:
+def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[str,
+                                                                                dict[str, Any]]:
     """Run a stage in this process.
 
     Args:
         name: Name of the stage.
-        given: Its inputs, settings and options by name; arrays are accepted for lists.
+        arguments: Its inputs, settings and options by name; arrays are accepted for lists.
         quiet: Show no progress.
 
     Returns:
@@ -45,24 +46,24 @@ def run_stage(name: str, given: Mapping[str, Any], *, quiet: bool) -> tuple[str,
     Raises:
         InputError: a name is not known, or a value is refused. LimberError: as for the stage.
     """
-    told: list[str] = []
+    caught: list[str] = []
     stage = stage_description(name)
     try:
         with in_python_words(), script_run_once(), _sink(name, quiet) as sink:
-            inputs, settings, options = _models(stage, given)
-            result = stage.run(inputs, settings, options, Progress(sink, told.append))
+            inputs, settings, options = _models(stage, arguments)
+            result = stage.run(inputs, settings, options, Progress(sink, caught.append))
     finally:
-        for text in told:
+        for text in caught:
             warnings.warn(_with_python_names(text), stacklevel=_users_level())
-    return stage.entry(inputs, settings), {"warnings": told} | plain(result)
+    return stage.entry(inputs, settings), {"warnings": caught} | plain(result)
 
 
-def _models(stage: StageDescription, given: Mapping[str, Any],
+def _models(stage: StageDescription, arguments: Mapping[str, Any],
             ) -> tuple[Settings, Settings, Settings]:
     try:
         return stage.models(
             {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
-             else value for key, value in given.items()})
+             else value for key, value in arguments.items()})
     except InputError as error:
         error.fix = f"limber.settings({stage.name!r}) lists what it takes."
         raise

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from limber.planning.plan_file import PlanFile
     from limber.recordings.recording import Pull as Recording
 
-_MOST_PRINTED = 7  # values in one line; a notebook's table has them all
+_MOST_PRINTED = 7  # values printed in one line; the notebook's table shows all
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -60,10 +60,10 @@ class Result:
                 for name, value in self.values.items() if isinstance(value, bool | int | float)}
 
     def __repr__(self) -> str:
-        told = [f"{label} {text}" for label, text in self._shown().items()]
-        if len(told) > _MOST_PRINTED:
-            told[_MOST_PRINTED:] = ["..."]
-        return f"{type(self).__name__}({', '.join(told)})"
+        parts = [f"{label} {text}" for label, text in self._shown().items()]
+        if len(parts) > _MOST_PRINTED:
+            parts[_MOST_PRINTED:] = ["..."]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     def _repr_html_(self) -> str:
         rows = "".join(f"<tr><td>{html.escape(label)}</td><td>{html.escape(text)}</td></tr>"
@@ -148,10 +148,10 @@ class Pull(Result):
 
     def _shown(self) -> dict[str, str]:
         force = np.linalg.norm(self.forces, axis=1)
-        way = np.linalg.norm(self.poses[:, :3] - self.poses[0, :3], axis=1).max()
+        travel = np.linalg.norm(self.poses[:, :3] - self.poses[0, :3], axis=1).max()
         peak = f"{np.nanmax(force):.3g} N" if np.isfinite(force).any() else "not measured"
         return {"name": self.name, "frames": str(len(self.times)),
-                "duration": f"{np.ptp(self.times):.3g} s", "way": f"{1e3 * way:.3g} mm",
+                "duration": f"{np.ptp(self.times):.3g} s", "way": f"{1e3 * travel:.3g} mm",
                 "peak force": peak}
 
 
@@ -342,11 +342,11 @@ class Load(Result):
     def _shown(self) -> dict[str, str]:
         low, high = 1e3 * self.sag_interval
         between = "" if np.isnan(low) else f" ({low:.4g} to {high:.4g})"
-        shown = {"sag": f"{1e3 * self.sag:.4g}{between} mm",
+        texts = {"sag": f"{1e3 * self.sag:.4g}{between} mm",
                  "largest strain": f"{self.greatest_strain:.4g}",
                  "fraction of the limit": f"{100 * self.strain_over_limit:.3g} %",
                  "first frequency": f"{self.frequencies[0]:.4g} Hz"}
-        return shown if self.bears_times is None else shown | {
+        return texts if self.bears_times is None else texts | {
             "bears": f"{self.bears_times:.3g} times the loads"}
 
 
@@ -462,9 +462,9 @@ class Plan(Result):
         name = key.partition(":")[2]
         damage = branch.path(f"plans/{name}-damage.csv")
         found = read_plan(branch.path(f"plans/{name}.json"))
-        way, proof = found.plan, values["certificate"]
-        return cls(MappingProxyType({**values}), name, _array(way.poses), _array(way.times),
-                   _array(way.energies), _array(way.forces), _array(way.strains),
+        path, proof = found.plan, values["certificate"]
+        return cls(MappingProxyType({**values}), name, _array(path.poses), _array(path.times),
+                   _array(path.energies), _array(path.forces), _array(path.strains),
                    _array(found.baseline.poses), values["plan"]["energy_integral_jm"],
                    values["energy_saved_percent"], float(_array(proof["upper_bound"])),
                    proof["lower_bound"], proof["gap_percent"], found,
@@ -549,17 +549,17 @@ class Execution(Result):
         Raises:
             InputError: the robot did not move.
         """
-        from limber.results.report.execution_section import force_along_the_way
+        from limber.results.report.execution_section import force_along_path
 
-        return drawn(lambda: force_along_the_way(self._log))
+        return drawn(lambda: force_along_path(self._log))
 
     def _shown(self) -> dict[str, str]:
-        shown = {"plan": self.name, "armed": _yes(self.armed), "reached": _yes(self.reached)}
+        texts = {"plan": self.name, "armed": _yes(self.armed), "reached": _yes(self.reached)}
         if self.stop_reason:
-            shown["stopped"] = self.stop_reason
+            texts["stopped"] = self.stop_reason
         if self.peak_force is not None:
-            shown["peak force"] = f"{self.peak_force:.3g} N"
-        return shown
+            texts["peak force"] = f"{self.peak_force:.3g} N"
+        return texts
 
 
 @dataclass(frozen=True, repr=False, eq=False)

@@ -551,8 +551,8 @@ class Branch:
         return InteractiveSession(self.folder, mode=mode, **settings)
 
     def __repr__(self) -> str:
-        told = "".join(f", {label}: {text}" for label, text in self._shown().items())
-        return f"Branch({str(self.folder)!r}{told})"
+        parts = "".join(f", {label}: {text}" for label, text in self._shown().items())
+        return f"Branch({str(self.folder)!r}{parts})"
 
     def _repr_html_(self) -> str:
         rows = "".join(f"<tr><td>{label}</td><td>{html.escape(text)}</td></tr>"
@@ -594,8 +594,8 @@ def _known_stage(verb: str) -> str:
     return name
 
 
-def _made(stage: str, folder: PathLike, quiet: bool, given: dict[str, Any]) -> Branch:
-    run_stage(stage, {**given, "output": folder}, quiet=quiet)
+def _made(stage: str, folder: PathLike, quiet: bool, arguments: dict[str, Any]) -> Branch:
+    run_stage(stage, {**arguments, "output": folder}, quiet=quiet)
     return Branch(folder)
 
 

@@ -111,25 +111,25 @@ def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     # Several branches may need it.
     with FileLock(target.with_name(f".{target.name}.lock")):
-        mark, told = target.with_name(f".{target.name}.fetched"), _told(found)
-        if told and target.exists() and mark.is_file() and mark.read_text("utf-8") == told:
+        mark, digest = target.with_name(f".{target.name}.fetched"), _digest(found)
+        if digest and target.exists() and mark.is_file() and mark.read_text("utf-8") == digest:
             return
         _require_room(target.parent, address, sum(one.get("size") or 0 for one in found.values()))
         sweep_beside(target)
         mark.unlink(missing_ok=True)
         made = target.with_name(owned_name(target.name))
         try:
-            for place, one in found.items():
-                inner = made / _inside(path, place) if is_folder else made
+            for name, one in found.items():
+                inner = made / _inside(path, name) if is_folder else made
                 inner.parent.mkdir(parents=True, exist_ok=True)
-                with _explained(f"{before}{place}", "read"):
-                    _copy(system, place, inner, one.get("size"), stop)
+                with _explained(f"{before}{name}", "read"):
+                    _copy(system, name, inner, one.get("size"), stop)
             if is_folder:
                 remove(target)
             made.replace(target)
         finally:
             remove(made)
-        write_atomically(mark, told)
+        write_atomically(mark, digest)
 
 
 def copy_here(address: str, target: Path, stop: Callable[[], None]) -> None:
@@ -235,22 +235,22 @@ def _explained(address: str, what: str) -> Iterator[None]:
                         ) from error
 
 
-def _told(found: dict[str, dict[str, Any]]) -> str:
+def _digest(found: dict[str, dict[str, Any]]) -> str:
     """A digest that changes with the files; empty if their system does not report changes."""
     if not all(any(value and str(key).lower() in _TELLING for key, value in one.items())
                for one in found.values()):
         return ""
-    told = sorted((place, sorted(map(repr, one.items()))) for place, one in found.items())
-    return hashlib.sha256(repr(told).encode()).hexdigest()
+    entries = sorted((path, sorted(map(repr, one.items()))) for path, one in found.items())
+    return hashlib.sha256(repr(entries).encode()).hexdigest()
 
 
-def _inside(folder: str, place: str) -> PurePosixPath:
+def _inside(folder: str, path: str) -> PurePosixPath:
     """The relative path of a file in its folder.
 
     Raises:
         InputError: a component of it is not a plain name.
     """
-    inner = PurePosixPath(place).relative_to(PurePosixPath(folder))
+    inner = PurePosixPath(path).relative_to(PurePosixPath(folder))
     for part in inner.parts:
         plain_name(part)
     return inner
@@ -265,10 +265,10 @@ def _require_room(folder: Path, address: str, size: float) -> None:
                         "Make room, or name another disk (`work` in the job file).")
 
 
-def _copy(system: Any, place: str, target: Path, size: int | None,
+def _copy(system: Any, path: str, target: Path, size: int | None,
           stop: Callable[[], None]) -> None:
     count = 0
-    with system.open(place, "rb") as source, open(target, "xb") as sink:
+    with system.open(path, "rb") as source, open(target, "xb") as sink:
         while block := source.read(_BLOCK):
             stop()
             count += len(block)
@@ -276,6 +276,6 @@ def _copy(system: Any, place: str, target: Path, size: int | None,
             if size is not None and count > size:
                 break
     if size is not None and count != size:
-        raise WorkError(f"{place} should have {size} bytes, but {count} were received.",
+        raise WorkError(f"{path} should have {size} bytes, but {count} were received.",
                         "The transfer was interrupted, or the file was written to at the same "
                         "time.", "Run this again.")

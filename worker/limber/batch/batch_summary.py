@@ -95,10 +95,10 @@ def _page(jobs: JobFile, records: Records) -> Iterator[str]:
            "<meta name=viewport content='width=device-width'>"
            f"<title>{title}: Limber batch</title><style>{_STYLE}</style>")
     yield f"<h1>{title}</h1>"
-    told = ", ".join(f"{count} {name}" for name, count in counts(jobs, records).items() if count)
+    totals = ", ".join(f"{count} {name}" for name, count in counts(jobs, records).items() if count)
     seconds = sum(records.of(branch, task).seconds or 0.0
                   for branch in jobs.branches for task in branch.tasks)
-    yield (f"<p>{len(jobs.branches)} branches: {told}. {seconds / 60:.1f} minutes of work. "
+    yield (f"<p>{len(jobs.branches)} branches: {totals}. {seconds / 60:.1f} minutes of work. "
            f"Limber {VERSION}.</p>")
     failed = failures(jobs, records)
     if failed:
@@ -123,38 +123,38 @@ def _branch(branch: BranchJob, records: Records, page: Path) -> Iterator[str]:
         yield (f"<tr><td>{html.escape(task.label)}"
                f"<td style='color:{_COLORS[record.status]}'>{record.status}"
                f"<td>{_number(record.seconds, 1)}<td>{_number(record.memory_mb, 0)}"
-               f"<td>{html.escape(_told(record))}</tr>")
+               f"<td>{html.escape(_messages(record))}</tr>")
     yield "</table></div></section>"
 
 
 def _title(branch: BranchJob, page: Path) -> str:
     """The branch's name, with a link to its report if it has one."""
-    name, way = html.escape(branch.name), _way(branch.folder / "report.html", page)
-    return f"<a href='{way}'>{name}</a>" if way else name
+    name, link = html.escape(branch.name), _relative_link(branch.folder / "report.html", page)
+    return f"<a href='{link}'>{name}</a>" if link else name
 
 
 def _rendered(branch: BranchJob, page: Path) -> str:
     """The branch's pictures that `limber scene` has rendered."""
-    shown = (getattr(task.inputs, kind, None) for task in branch.tasks
-             for kind in ("render", "turntable"))
-    ways = [way for path in shown if path and (way := _way(path, page))]
-    return "".join(f"<a href='{way}'><img src='{way}' alt='rendered' loading=lazy></a>"
-                   for way in ways)
+    images = (getattr(task.inputs, kind, None) for task in branch.tasks
+              for kind in ("render", "turntable"))
+    links = [link for path in images if path and (link := _relative_link(path, page))]
+    return "".join(f"<a href='{link}'><img src='{link}' alt='rendered' loading=lazy></a>"
+                   for link in links)
 
 
-def _way(path: Path, page: Path) -> str:
+def _relative_link(path: Path, page: Path) -> str:
     """The relative link from the page to a file beside it; empty if the file does not exist."""
     if not path.is_file():
         return ""
     try:
-        way = Path(os.path.relpath(path.resolve(), page.resolve().parent)).as_posix()
+        link = Path(os.path.relpath(path.resolve(), page.resolve().parent)).as_posix()
     except ValueError:
         # On another drive (Windows) there is no relative path.
         return ""
-    return html.escape(quote(way))
+    return html.escape(quote(link))
 
 
-def _told(record: Record) -> str:
+def _messages(record: Record) -> str:
     return " ".join(filter(None, (record.error, *record.warnings)))
 
 

@@ -30,14 +30,14 @@ def pictures(folder: Path) -> str:
     except (OSError, LimberError):
         return "<div class=pictures></div>"
     young = _moduli(folder / "mesh.vtu", skeleton)
-    colours, told = [_WOOD] * skeleton.node_count, ""
+    colours, caption = [_WOOD] * skeleton.node_count, ""
     if young is not None:
         scale = colour_scale(young, "Young's modulus", "Pa", "viridis")
         colours = css_colours(young, scale)
-        told = (f"<p class=range>Young's modulus {scale['ticks'][0]} (dark) to "
-                f"{scale['ticks'][-1]} (bright)</p>")
+        caption = (f"<p class=range>Young's modulus {scale['ticks'][0]} (dark) to "
+                   f"{scale['ticks'][-1]} (bright)</p>")
     drawn = "".join(_view(skeleton, colours, label, axis) for label, axis in _VIEWS)
-    return f"<div class=pictures>{drawn}{told}</div>"
+    return f"<div class=pictures>{drawn}{caption}</div>"
 
 
 def _moduli(path: Path, skeleton: Skeleton) -> np.ndarray | None:
@@ -59,20 +59,20 @@ def _view(skeleton: Skeleton, colours: list[str], label: str, axis: int) -> str:
     flat = skeleton.nodes[:, [axis, 2]]
     low, size = flat.min(axis=0), np.maximum(np.ptp(flat, axis=0), 1e-9)
     scale = (HEIGHT - 2 * _EDGE) / max(size[1], size[0] / 2)
-    place = (flat - low) * scale + _EDGE
+    pixels = (flat - low) * scale + _EDGE
     width = size[0] * scale + 2 * _EDGE
-    place[:, 1] = HEIGHT - place[:, 1]
-    lines = "".join(_lines(skeleton, place, colours, scale))
+    pixels[:, 1] = HEIGHT - pixels[:, 1]
+    lines = "".join(_lines(skeleton, pixels, colours, scale))
     return (f"<svg class=sketch viewBox='0 0 {width:.0f} {HEIGHT}' width={width:.0f} "
             f"height={HEIGHT} stroke-linecap=round role=img aria-label='{html.escape(label)}'>"
             f"<title>{html.escape(label)}</title>{lines}</svg>")
 
 
-def _lines(skeleton: Skeleton, place: np.ndarray, colours: list[str], scale: float,
+def _lines(skeleton: Skeleton, pixels: np.ndarray, colours: list[str], scale: float,
            ) -> Iterator[str]:
     thick = np.maximum(2 * skeleton.radius * scale, 0.7)
     for node, up in enumerate(skeleton.parent):
         if up >= 0:
-            yield (f"<line x1='{place[up, 0]:.1f}' y1='{place[up, 1]:.1f}' "
-                   f"x2='{place[node, 0]:.1f}' y2='{place[node, 1]:.1f}' "
+            yield (f"<line x1='{pixels[up, 0]:.1f}' y1='{pixels[up, 1]:.1f}' "
+                   f"x2='{pixels[node, 0]:.1f}' y2='{pixels[node, 1]:.1f}' "
                    f"stroke='{colours[node]}' stroke-width='{thick[node]:.1f}'/>")

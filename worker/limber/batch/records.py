@@ -68,24 +68,24 @@ class Records:
     def end(self, branch: BranchJob, task: StageTask, record: Record) -> None:
         self._append(branch, task, {**vars(record)})
 
-    def _append(self, branch: BranchJob, task: StageTask, told: dict[str, Any]) -> None:
+    def _append(self, branch: BranchJob, task: StageTask, record: dict[str, Any]) -> None:
         line = json.dumps({"branch": branch.name, "stage": task.label,
-                           "task": task.fingerprint, **told})
+                           "task": task.fingerprint, **record})
         present(self._stream, "right to append to the records").append(line)
         self._take(line)
 
     def _take(self, line: str) -> None:
         try:
-            told = json.loads(line)
-            key = (str(told["branch"]), str(told["task"]))
-            status = str(told["status"])
+            entry = json.loads(line)
+            key = (str(entry["branch"]), str(entry["task"]))
+            status = str(entry["status"])
             if status == RUNNING:
-                process, since = told["process"]
+                process, since = entry["process"]
                 record = Record(RUNNING) if is_alive(int(process), int(since)) else Record()
             else:
-                record = Record(status, str(told["error"]), told["seconds"], told["memory_mb"],
-                                tuple(told["warnings"]), dict(told["numbers"]),
-                                str(told.get("content", "")))
+                record = Record(status, str(entry["error"]), entry["seconds"], entry["memory_mb"],
+                                tuple(entry["warnings"]), dict(entry["numbers"]),
+                                str(entry.get("content", "")))
         except (ValueError, KeyError, TypeError, RecursionError):
             # A damaged line is ignored: its task runs again, and its result is kept if it is up to
             # date.
@@ -100,8 +100,8 @@ def _last_of_each(lines: Iterator[str]) -> list[str] | None:
     for line in lines:
         count += 1
         try:
-            told = json.loads(line)
-            last[str(told["branch"]), str(told["task"])] = line
+            entry = json.loads(line)
+            last[str(entry["branch"]), str(entry["task"])] = line
         except (ValueError, KeyError, TypeError, RecursionError):
             # Damaged: ignored, as when it is read.
             continue

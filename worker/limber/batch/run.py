@@ -73,7 +73,7 @@ class _ThisProcess:
     """The pool of this process."""
 
     def __init__(self, jobs: JobFile, workers: int | None):
-        self.count = worker_count(len(jobs.branches), wanted=workers or jobs.workers,
+        self.count = worker_count(len(jobs.branches), requested=workers or jobs.workers,
                                   memory_mb_each=_MEMORY_MB_EACH)
         self._limits = jobs.limits
         self._pool = Pool(self.count, name="a stage of the batch")
@@ -102,7 +102,7 @@ class _Course:
         self.running: dict[Future, tuple[BranchJob, int, float]] = {}
         self.earlier: dict[Future, Record] = {}
         self.ended = 0
-        self.place = _identity(jobs.out)
+        self.identity = _identity(jobs.out)
         # Some are transferred while others are computed.
         self.ahead = AT_ONCE if any(branch.is_moved for branch in jobs.branches) else 0
 
@@ -152,7 +152,7 @@ class _Course:
         if self.is_given_up(branch, number):
             self.ended += 1
             return
-        self.require_place()
+        self.require_same_folder()
         task = branch.tasks[number]
         record = self.records.of(branch, task)
         if record.has_succeeded and is_shown(task, branch.folder, record.content):
@@ -164,10 +164,10 @@ class _Course:
         self.earlier[future] = record
         self.running[future] = branch, number, time.monotonic()
 
-    def require_place(self) -> None:
+    def require_same_folder(self) -> None:
         """Stop if the folder of results was lost: a new one would hide its content."""
         try:
-            is_there = _identity(self.jobs.out) == self.place
+            is_there = _identity(self.jobs.out) == self.identity
         except OSError:
             is_there = False
         if not is_there:
@@ -220,10 +220,10 @@ class _Course:
             if isinstance(error, Cancelled):
                 raise
             task = branch.tasks[0 if number == _FETCH else -1]
-            told = f"{_step(branch, number)}: {error}"
-            self.warn(f"{branch.name} {told}")
+            reason = f"{_step(branch, number)}: {error}"
+            self.warn(f"{branch.name} {reason}")
             if self.records.of(branch, task).status != FAILED:
-                self.records.end(branch, task, Record(FAILED, told, round(seconds, 3)))
+                self.records.end(branch, task, Record(FAILED, reason, round(seconds, 3)))
             self.ended += 1
             return
         if number == _FETCH:
@@ -233,7 +233,7 @@ class _Course:
 
     def outcome(self, future: Future, branch: BranchJob, seconds: float) -> Record:
         try:
-            told = future.result()
+            outcome = future.result()
         except (Cancelled, ClusterLostError):
             raise
         except LimberError as error:
@@ -244,9 +244,10 @@ class _Course:
             notes = " ".join(getattr(error, "__notes__", ()))
             return Record(FAILED, f"internal error: {error!r}; please report it (`limber "
                           f"bug-report {branch.folder}`). {notes}", round(seconds, 3))
-        status = FAILED if told["error"] else KEPT if told["is_kept"] else DONE
-        return Record(status, told["error"], told["seconds"], told["memory_mb"],
-                      tuple(told["warnings"]), numbers_of(told["result"]), told.get("content", ""))
+        status = FAILED if outcome["error"] else KEPT if outcome["is_kept"] else DONE
+        return Record(status, outcome["error"], outcome["seconds"], outcome["memory_mb"],
+                      tuple(outcome["warnings"]), numbers_of(outcome["result"]),
+                      outcome.get("content", ""))
 
 
 def _identity(folder: Path) -> tuple[int, int]:
@@ -269,14 +270,14 @@ def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,
         for task in branch.tasks:
             record = records.of(branch, task)
             if stopped:
-                told = stopped
+                state = stopped
             elif record.status == FAILED and not retry_failed:
-                told, stopped = "not repeated: it failed (--retry-failed)", "not reached"
+                state, stopped = "not repeated: it failed (--retry-failed)", "not reached"
             elif record.status == RUNNING:
-                told = "running"
+                state = "running"
             elif record.has_succeeded:
-                told = "done earlier; runs again if its input has changed"
+                state = "done earlier; runs again if its input has changed"
             else:
-                told = "to run" if record.status != FAILED else "to try again"
-            found.append((branch, task, told))
+                state = "to run" if record.status != FAILED else "to try again"
+            found.append((branch, task, state))
     return found

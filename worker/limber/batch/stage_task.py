@@ -45,10 +45,10 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
         except LimberError as error:
             outcome["error"] = str(error)
         except (OSError, MemoryError) as error:
-            told = machine_error(error, folder)
-            if told is None:
+            translated = machine_error(error, folder)
+            if translated is None:
                 raise
-            outcome["error"] = str(told)
+            outcome["error"] = str(translated)
     after = _finished(task, folder)
     return outcome | {
         "content": _content(task, folder), "warnings": warnings,

@@ -34,7 +34,7 @@ from limber.cli.terminal import (
 from limber.core.errors import LimberError, SafetyStop
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
-from limber.core.progress import BarSink, JsonSink, Progress, Sink, damage_told_to
+from limber.core.progress import BarSink, JsonSink, Progress, Sink, report_damage_to
 from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
 from limber.version import VERSION
 
@@ -53,8 +53,8 @@ def command_summaries() -> dict[str, str]:
     found = {}
     for path in sorted((Path(__file__).parent / "commands").glob("*.py")):
         if path.stem != "__init__":
-            told = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-            found[path.stem.replace("_", "-")] = told.split("\n\n")[0].replace("\n", " ")
+            docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            found[path.stem.replace("_", "-")] = docstring.split("\n\n")[0].replace("\n", " ")
     return stage_summaries() | found
 
 
@@ -84,7 +84,8 @@ class _Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         stages = stage_summaries()
-        others = {name: told for name, told in command_summaries().items() if name not in stages}
+        others = {name: summary for name, summary in command_summaries().items() if name not
+                  in stages}
         for title, commands in (("Stages", stages), ("Other commands", others)):
             with formatter.section(title):
                 formatter.write_dl(list(commands.items()))
@@ -192,10 +193,11 @@ def _close_stage(run: Run, stage: "StageDescription", values: dict[str, Any]) ->
     """
     found = list(found_lines(stage.found, values))
     if found:
-        run.close(*found, where=_place(stage, values), then=command_to_type(stage.then, values))
+        run.close(*found, where=_result_folder(stage, values),
+                  then=command_to_type(stage.then, values))
 
 
-def _place(stage: "StageDescription", values: dict[str, Any]) -> object:
+def _result_folder(stage: "StageDescription", values: dict[str, Any]) -> object:
     """The first file or folder that a stage wrote, if any."""
     folder = values.get("branch_folder")
     if folder is None or "output" in values:
@@ -282,7 +284,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
                 state = Run(bar, bar.say)
             elif lines is not None:
                 around.enter_context(Heartbeat(lines.say))
-            around.enter_context(damage_told_to(state.progress.warn))
+            around.enter_context(report_damage_to(state.progress.warn))
             result = function(state, **options)
     except LimberError as error:
         code = error.exit_code
@@ -295,13 +297,13 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
         code = 130
         outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}
     except Exception as error:
-        told = machine_error(error)
-        code = told.exit_code if told else 3
-        if told is None:
+        translated = machine_error(error)
+        code = translated.exit_code if translated else 3
+        if translated is None:
             # A bug: the traceback goes to standard error, and the last line is JSON all the same.
             traceback.print_exc()
-            told = f"internal error: {error!r}; please report it"
-        outcome |= {"status": "failed", "error": str(told)}
+            translated = f"internal error: {error!r}; please report it"
+        outcome |= {"status": "failed", "error": str(translated)}
     outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
     _print_outcome(outcome, result or {}, style, state.closing)
     return code
@@ -338,9 +340,9 @@ def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,
         _say(f"error: {outcome['error']}")
     elif style != "json":
         # Warnings were printed when they occurred.
-        shown = {k: v for k, v in _plain(result).items() if k != "warnings"}
+        summary = {k: v for k, v in _plain(result).items() if k != "warnings"}
         is_short = bool(closing) and style == "short"
-        for line in closing if is_short else [*result_lines(shown), *closing]:
+        for line in closing if is_short else [*result_lines(summary), *closing]:
             click.echo(_CONTROL.sub("?", line))
         click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s"
                    + (" (--verbose shows all values)" if is_short else ""))

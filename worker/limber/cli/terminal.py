@@ -44,12 +44,12 @@ def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[st
     """Yield the filled-in lines of which all values are present."""
     for line in lines:
         try:
-            told = _FILLED.vformat(line, (), values) if isinstance(line, str) else line(values)
+            text = _FILLED.vformat(line, (), values) if isinstance(line, str) else line(values)
         except (_NotThere, KeyError):
             # A result of an older version may lack it.
             continue
-        if told:
-            yield told
+        if text:
+            yield text
 
 
 def command_to_type(template: str, values: Mapping[str, Any]) -> str:

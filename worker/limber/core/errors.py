@@ -20,9 +20,9 @@ class LimberError(Exception):
         self.seen, self.why, self.fix = seen, why, fix
         super().__init__(" ".join(part for part in (seen, why, fix) if part))
 
-    def at(self, place: Iterable[float]) -> Self:
+    def at(self, position: Iterable[float]) -> Self:
         """Set the position; returns the error itself."""
-        self.place = tuple(float(value) for value in place)
+        self.place = tuple(float(value) for value in position)
         return self
 
 

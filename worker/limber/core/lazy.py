@@ -6,21 +6,21 @@ from operator import attrgetter
 from typing import Any
 
 
-def exports(package: str, places: Mapping[str, str],
+def exports(package: str, modules: Mapping[str, str],
             ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562).
 
     Args:
         package: Name of the package.
-        places: Names, each with the module (relative to the package) that defines it.
+        modules: Names, each with the module (relative to the package) that defines it.
     """
     def get(name: str) -> Any:
-        if name not in places:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{package}.{places[name]}"), name)
+        return getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
 
     def names() -> list[str]:
-        return sorted(places)
+        return sorted(modules)
 
     return get, names
 

@@ -29,12 +29,12 @@ _TOO_LARGE = _codes("EFBIG", "EOVERFLOW")
 _TOO_MANY = _codes("EMFILE", "ENFILE")
 
 
-def machine_error(error: BaseException, place: Path | None = None) -> LimberError | None:
+def machine_error(error: BaseException, path: Path | None = None) -> LimberError | None:
     """Return a readable text for an error of the machine; None for any other error.
 
     Args:
         error: As Python or the system raised it.
-        place: The file or folder in use, if the error does not name one.
+        path: The file or folder in use, if the error does not name one.
     """
     if isinstance(error, MemoryError):
         return WorkError("Out of memory.", "", "Use a coarser mesh or a thinner cloud.")
@@ -42,32 +42,32 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
         return _not_loaded(error)
     if not isinstance(error, OSError):
         return None
-    name = error.filename2 or error.filename or place or "A file"
-    told = error.strerror or str(error) or type(error).__name__
-    if error.errno in _FULL or (error.errno is None and _FULL_IN_WORDS.search(told)):
-        return WorkError(f"{name} cannot be written ({told}).",
+    name = error.filename2 or error.filename or path or "A file"
+    seen = error.strerror or str(error) or type(error).__name__
+    if error.errno in _FULL or (error.errno is None and _FULL_IN_WORDS.search(seen)):
+        return WorkError(f"{name} cannot be written ({seen}).",
                          "The disk is full, or your quota is used up.",
                          "Free some space (`limber cache --clear` helps), and run this again. "
                          "Earlier results are kept.")
     if (error.errno in _LOST or (error.filename and error.errno in _UNREACHABLE)
             or getattr(error, "winerror", None) in _LOST_ON_WINDOWS):
-        return WorkError(f"{name} does not answer ({told}).",
+        return WorkError(f"{name} does not answer ({seen}).",
                          "The connection to its disk or network folder was lost.",
                          "Restore the connection, and run this again. Earlier results are kept.")
     if error.errno in _NO_SUCH_NAME:
-        return InputError(f"{str(name)[:300]} cannot be used ({told}).",
+        return InputError(f"{str(name)[:300]} cannot be used ({seen}).",
                           "No file can have this name or be in this place.",
                           "Give a shorter name, or another place.")
     if error.errno in _TOO_LARGE:
-        return WorkError(f"{name} cannot be written ({told}).",
+        return WorkError(f"{name} cannot be written ({seen}).",
                          "The disk, or a limit of your account (ulimit -f), allows no file of this "
                          "size.", "Raise the limit, or use another disk.")
     if error.errno in _TOO_MANY:
-        return WorkError(f"{name} cannot be opened ({told}).",
+        return WorkError(f"{name} cannot be opened ({seen}).",
                          "Too many files are open on this computer or in this program.",
                          "Close other programs, or raise the limit (ulimit -n).")
     if error.errno in _FORBIDDEN:
-        return InputError(f"{name} cannot be used ({told}).",
+        return InputError(f"{name} cannot be used ({seen}).",
                           "It is read-only, or belongs to another user.",
                           "Change its permissions, or work on a copy.")
     return None

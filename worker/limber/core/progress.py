@@ -146,8 +146,8 @@ class BarSink:
         self._bar.stop()
 
     def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
-        shown = " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
-        self._bar.update(self._task, completed=fraction, description=f"{message} {shown}".strip())
+        figures = " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
+        self._bar.update(self._task, completed=fraction, description=f"{message} {figures}".strip())
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
@@ -190,21 +190,22 @@ def _short(value: Any) -> str:
 
 
 @contextlib.contextmanager
-def damage_told_to(tell: Callable[[str], None]) -> Iterator[None]:
+def report_damage_to(tell: Callable[[str], None]) -> Iterator[None]:
     """Pass the first warning about a damaged cache to ``tell``; it comes from a lower layer.
 
     If one file of a cache is damaged, others usually are too: the user is told once.
     """
-    told: list[str] = []
+    reported: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("always", DamagedCacheWarning)
-        shown = warnings.showwarning
+        default_show = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        def show(message: Warning | str, category: type[Warning], *location: Any,
+                 **more: Any) -> None:
             if not issubclass(category, DamagedCacheWarning):
-                shown(message, category, *place, **more)
-            elif not told:
-                told.append(str(message))
-                tell(told[0])
+                default_show(message, category, *location, **more)
+            elif not reported:
+                reported.append(str(message))
+                tell(reported[0])
         warnings.showwarning = show
         yield

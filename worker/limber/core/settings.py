@@ -38,24 +38,24 @@ MOST_FORCE_N = 1e5
 """Plausible ranges of the properties and loads of a branch or of a model of one."""
 
 
-def possible_young(given: Any) -> Any:
+def possible_young(entered: Any) -> Any:
     """Validate one Young's modulus [Pa], several or None; ValueError names the likely mistake."""
-    for value in _numbers(given):
+    for value in _numbers(entered):
         if not YOUNG_PA[0] <= value <= YOUNG_PA[1]:
             likely = f"; for {value:g} GPa write {value:g}e9" if 1e-2 <= value < 1e3 else ""
             raise ValueError("it is in Pa, and that of a branch is between 1 kPa and 100 GPa"
                              + likely)
-    return given
+    return entered
 
 
-def possible_density(given: Any) -> Any:
+def possible_density(entered: Any) -> Any:
     """Validate a density [kg/m^3] or None, likewise."""
-    for value in _numbers(given):
+    for value in _numbers(entered):
         if not DENSITY_KG_M3[0] <= value <= DENSITY_KG_M3[1]:
             likely = f"; for {value:g} g/cm^3 write {1000 * value:g}" if 0.05 <= value <= 3 else ""
             raise ValueError("it is in kg/m^3, and that of a branch is between 50 and 3000"
                              + likely)
-    return given
+    return entered
 
 
 def possible_time(value: str | None) -> str | None:
@@ -69,17 +69,17 @@ def possible_time(value: str | None) -> str | None:
     return value
 
 
-def possible_force(given: Any) -> Any:
+def possible_force(entered: Any) -> Any:
     """Validate a force [N], its components or None, likewise."""
-    for value in _numbers(given):
+    for value in _numbers(entered):
         if abs(value) > MOST_FORCE_N:
             raise ValueError(f"it is in N, and no branch bears {value:g} N; for {value:g} mN write "
                              f"{value / 1000:g}")
-    return given
+    return entered
 
 
-def _numbers(given: Any) -> tuple[float, ...]:
-    return () if given is None else given if isinstance(given, tuple) else (given,)
+def _numbers(value: Any) -> tuple[float, ...]:
+    return () if value is None else value if isinstance(value, tuple) else (value,)
 
 
 class OneOf:

@@ -29,10 +29,10 @@ def in_unit(value: Any, unit: str) -> Any:
     match = _QUANTITY.match(value) if isinstance(value, str) else None
     if match is None:
         return value
-    number, given = match.groups()
+    number, unit_text = match.groups()
     known = UNITS.get(unit, {unit: 1.0} if unit else {})
-    if given not in known:
-        wanted = (f"It must be in {unit}. Known units: {', '.join(known)}." if unit
+    if unit_text not in known:
+        advice = (f"It must be in {unit}. Known units: {', '.join(known)}." if unit
                   else "This value has no unit.")
-        raise ValueError(f"{value!r} is in {given!r}. {wanted}")
-    return float(number) * known[given]
+        raise ValueError(f"{value!r} is in {unit_text!r}. {advice}")
+    return float(number) * known[unit_text]

@@ -82,9 +82,9 @@ class _Pull(_Told):
 
     @model_validator(mode="after")
     def _of_one_length(self) -> "_Pull":
-        shown, count = len(self.times_s), len(self.all_times_s)
+        shown_count, count = len(self.times_s), len(self.all_times_s)
         widths = {len(frame) for frame in (*self.observed_m, *self.simulated_m)}
-        if {len(self.observed_m), len(self.simulated_m)} != {shown} or len(widths) > 1:
+        if {len(self.observed_m), len(self.simulated_m)} != {shown_count} or len(widths) > 1:
             raise ValueError("the frames have different numbers of points")
         if {len(self.measured_force_n), len(self.simulated_force_n)} != {count}:
             raise ValueError("the numbers of forces and of times differ")
@@ -138,7 +138,7 @@ class _Estimate(_Told):
     @model_validator(mode="after")
     def _of_one_branch(self) -> "_Estimate":
         count = len(self.young_pa)
-        told = self.young_deviation or _Deviation()
+        deviation = self.young_deviation or _Deviation()
         lists = {
             "young_mesh_pa": self.young_mesh_pa, "young_interval_pa": self.young_interval_pa,
             "young_interval_sensor_pa": self.young_interval_sensor_pa,
@@ -146,7 +146,7 @@ class _Estimate(_Told):
             "bending_stiffness_interval_nm2": self.bending_stiffness_interval_nm2,
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
-            **{f"young_deviation.{name}": getattr(told, name)
+            **{f"young_deviation.{name}": getattr(deviation, name)
                for name in ("sensor", "geometry", "mesh", "path", "hung", "grip",
                             "total")}}
         for name, values in lists.items():

@@ -72,7 +72,7 @@ def _reduced_error(found: Estimate) -> dict[str, Any]:
 def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, Any]:
     """Return the content of ``estimate.json`` beside the summary."""
     evaluation, objective = found.fit.evaluation, found.objective
-    told: dict[str, Any] = {
+    content: dict[str, Any] = {
         "control_points_m": subject.control_points,
         "fractions": _fractions(subject), "parameters": objective.space.names,
         "field_form_deviations": ([] if subject.field is None
@@ -90,22 +90,22 @@ def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, A
                     for number, entry in enumerate(objective.log.entries)],
         "pulls": [_pull_details(number, objective, evaluation)
                   for number in range(len(objective.forwards))]}
-    first = told["pulls"][0]
-    told |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
-             "simulated_m": first["simulated_m"]}
+    first = content["pulls"][0]
+    content |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
+                "simulated_m": first["simulated_m"]}
     truth = next((pull.entry.truth for pull in pulls if pull.entry.truth), None)
     if truth:
-        told["truth"] = truth
-    return told
+        content["truth"] = truth
+    return content
 
 
 def _pull_details(number: int, objective: Objective, evaluation: Evaluation) -> dict[str, Any]:
     forward, simulated = objective.forwards[number], evaluation.pulls[number]
     frames = forward.frames
-    shown = np.unique(np.linspace(0, len(frames) - 1, 6).round().astype(int))
+    rows = np.unique(np.linspace(0, len(frames) - 1, 6).round().astype(int))
     points, forces = objective.scored(evaluation)[number]
-    return {"name": forward.name, "times_s": frames.times[shown],
-            "observed_m": frames.positions[shown], "simulated_m": simulated.positions[shown],
+    return {"name": forward.name, "times_s": frames.times[rows],
+            "observed_m": frames.positions[rows], "simulated_m": simulated.positions[rows],
             "measured_force_n": frames.wrenches[:, :3], "simulated_force_n": simulated.forces,
             "all_times_s": frames.times, "point_residual": points, "force_residual": forces}
 

@@ -79,8 +79,8 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
             f"{wrong[0]} of mesh.vtu.", "The initial modulus must be positive.",
             "Give --young, or correct the mesh.")
     young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
-    poisson = _given(settings.poisson, mesh.cell_data["poisson"])
-    density = _given(settings.density, mesh.cell_data["density"])
+    poisson = _or_mean(settings.poisson, mesh.cell_data["poisson"])
+    density = _or_mean(settings.density, mesh.cell_data["density"])
     damping = RayleighDamping()
     model = BranchModel(mesh, young=young, poisson=poisson, density=density,
                         gravity=gravity if settings.gravity else None, point_masses=masses)
@@ -105,5 +105,5 @@ def observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSetti
     return replace(pull, observations=observations).warned(*warnings)
 
 
-def _given(value: float | None, field: np.ndarray) -> float:
+def _or_mean(value: float | None, field: np.ndarray) -> float:
     return float(np.mean(field)) if value is None else value

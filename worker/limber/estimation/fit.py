@@ -20,7 +20,7 @@ from limber.estimation.fit_preparation import (
     require_scale_in_principle,
 )
 from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.initial_modulus import led_start, scaled_start, standing_start
+from limber.estimation.fitting.initial_modulus import prescribed_start, scaled_start, standing_start
 from limber.estimation.fitting.large_errors import (
     ROUNDS,
     SMALL_RAD,
@@ -259,7 +259,7 @@ def _standing(objective: Objective, start: Values, settings: EstimateSettings, p
                 progress.warn(suspicion)
     uniform, explains = start, True
     if settings.method == "gauss-newton" and reduction is None:
-        start, explains = led_start(judged_on, uniform)
+        start, explains = prescribed_start(judged_on, uniform)
     standing = standing_start(judged_on, start, uniform, explains=explains)
     if standing is None:
         raise _without_equilibrium(judged_on)

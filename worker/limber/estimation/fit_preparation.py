@@ -123,9 +123,9 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: Estimat
     within their priors; requested ones (``--fit-poisson``, ``--fit-density``) are free without a
     prior.
     """
-    wanted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
+    fitted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
               "alpha": settings.fit_damping, "beta": settings.fit_damping}
-    chosen = {name for name, is_wanted in wanted.items() if is_wanted}
+    chosen = {name for name, is_fitted in fitted.items() if is_fitted}
     form = subject.field.names if subject.field is not None else ()
     priors = [(name, 0.0, 1.0) for name in form]
     if settings.forward == "full" and settings.method == "gauss-newton":
@@ -137,15 +137,15 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: Estimat
             priors.append(("density", float(np.log(subject.start.density)),
                            settings.density_sigma))
     free = chosen | {name for name, _, _ in priors}
-    extra = (*form, *(name for name in wanted if name in free))
+    extra = (*form, *(name for name in fitted if name in free))
     return ParameterSpace(subject.start, tuple(range(len(subject.start.young))), extra,
                           priors=tuple(priors))
 
 
 def _with_overrides(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> PullEntry:
-    given = {"drive": settings.drive, "motion": settings.motion,
-             "calibration": _with_free_errors(entry, frames, settings)}
-    return entry.model_copy(update={k: v for k, v in given.items() if v is not None})
+    overrides = {"drive": settings.drive, "motion": settings.motion,
+                 "calibration": _with_free_errors(entry, frames, settings)}
+    return entry.model_copy(update={k: v for k, v in overrides.items() if v is not None})
 
 
 def _with_free_errors(entry: PullEntry, frames: Frames, settings: EstimateSettings,
@@ -171,10 +171,10 @@ def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress
     at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
     if not len(rest) or not at_rest.any() or pull.entry.gravity_m_s2 is not None:
         return
-    shown = frames.positions[at_rest]
-    if not np.isfinite(shown).any():
+    at_rest_positions = frames.positions[at_rest]
+    if not np.isfinite(at_rest_positions).any():
         return
-    off = np.linalg.norm(np.nanmedian(shown, axis=0) - rest, axis=1)
+    off = np.linalg.norm(np.nanmedian(at_rest_positions, axis=0) - rest, axis=1)
     size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
     if np.nanmin(off) > max(2 * size, 0.1):
         raise InputError(

@@ -74,29 +74,29 @@ class MotionMade:
     displacements: list[np.ndarray]
 
 
-def moved(model: BranchModel, grasp: Grasp, wanted: MotionWanted, *,
+def moved(model: BranchModel, grasp: Grasp, requested: MotionWanted, *,
           progress: Progress = SILENT) -> MotionMade:
     """Move a branch as requested.
 
     Raises:
         WorkError: no force moves the grasp that far, or the motion cannot be computed.
     """
-    count = len(wanted.times)
-    if wanted.kind == "weight":
+    count = len(requested.times)
+    if requested.kind == "weight":
         share = np.linspace(0.0, 1.0, count)
-        return _slow(model, grasp, wanted, share[:, None] * wanted.weight, progress)
-    if wanted.kind == "release":
-        return _released(model, grasp, wanted, progress)
-    states = WAY_STATES if wanted.kind == "shake" else count
-    directions = sideways_forces(wanted.axis, states, turn=wanted.turn, phase=wanted.phase)
-    size = force_for_travel(model, grasp, directions[-1], wanted.travel)
-    slow = _slow(model, grasp, wanted, size * directions, progress)
-    if wanted.kind == "pull":
+        return _slow(model, grasp, requested, share[:, None] * requested.weight, progress)
+    if requested.kind == "release":
+        return _released(model, grasp, requested, progress)
+    states = WAY_STATES if requested.kind == "shake" else count
+    directions = sideways_forces(requested.axis, states, turn=requested.turn, phase=requested.phase)
+    size = force_for_travel(model, grasp, directions[-1], requested.travel)
+    slow = _slow(model, grasp, requested, size * directions, progress)
+    if requested.kind == "pull":
         return slow
-    if wanted.kind == "shake":
-        return _shaken(model, grasp, wanted, slow, progress)
+    if requested.kind == "shake":
+        return _shaken(model, grasp, requested, slow, progress)
     poses = slow.poses * np.r_[np.ones(3), np.full(3, TURNED_PART)]
-    held = _about_centre(grasp, wanted.point, poses)
+    held = _about_centre(grasp, requested.point, poses)
     results, start = [], None
     for pose in held:
         results.append(solve_static(model, grasp=grasp, pose=pose, start=start,
@@ -107,7 +107,7 @@ def moved(model: BranchModel, grasp: Grasp, wanted: MotionWanted, *,
     return _made(poses, held, forces, torques, [result.displacement for result in results])
 
 
-def _slow(model: BranchModel, grasp: Grasp, wanted: MotionWanted, forces: np.ndarray,
+def _slow(model: BranchModel, grasp: Grasp, requested: MotionWanted, forces: np.ndarray,
           progress: Progress) -> MotionMade:
     """Equilibria under forces of the gripper that exert no torque on the branch."""
     displacements, start = [], None
@@ -116,39 +116,39 @@ def _slow(model: BranchModel, grasp: Grasp, wanted: MotionWanted, forces: np.nda
         start = solve_static(model, grasp=grasp, grasp_force=force, start=start,
                              settings=SETTINGS).require()
         displacements.append(start.displacement)
-    poses, centres = _poses(model, grasp, wanted.point, displacements)
+    poses, centres = _poses(model, grasp, requested.point, displacements)
     return _made(poses, centres, forces, np.zeros_like(forces), displacements)
 
 
-def _shaken(model: BranchModel, grasp: Grasp, wanted: MotionWanted, way: MotionMade,
+def _shaken(model: BranchModel, grasp: Grasp, requested: MotionWanted, path: MotionMade,
             progress: Progress) -> MotionMade:
     """Out within a quarter of the time, back and forth over half the path, then at rest."""
-    share = wanted.times / wanted.times[-1]
+    share = requested.times / requested.times[-1]
     out = np.clip(share / 0.25, 0.0, 1.0)
     swing = np.clip((share - 0.25) / 0.5, 0.0, 1.0)
     along = out**2 * (3 - 2 * out) * (0.75 + 0.25 * np.cos(2 * np.pi * SHAKES * swing))
-    poses = scipy.interpolate.CubicSpline(np.linspace(0.0, 1.0, len(way.poses)), way.poses)(along)
-    held = _about_centre(grasp, wanted.point, poses)
-    result = simulate_dynamics(model, grasp=grasp, poses=held, times=wanted.times,
+    poses = scipy.interpolate.CubicSpline(np.linspace(0.0, 1.0, len(path.poses)), path.poses)(along)
+    held = _about_centre(grasp, requested.point, poses)
+    result = simulate_dynamics(model, grasp=grasp, poses=held, times=requested.times,
                                settings=NewmarkSettings(), progress=progress)
     _require(result)
     return _made(poses, held, result.reaction_force, result.reaction_torque,
                  list(result.displacement))
 
 
-def _released(model: BranchModel, grasp: Grasp, wanted: MotionWanted,
+def _released(model: BranchModel, grasp: Grasp, requested: MotionWanted,
               progress: Progress) -> MotionMade:
     """A force that grows over a third of the time and is removed within a frame."""
-    direction = sideways_forces(wanted.axis, 2, turn=0.0, phase=wanted.phase)[-1]
-    size = force_for_travel(model, grasp, direction, wanted.travel)
-    share = wanted.times / wanted.times[-1]
+    direction = sideways_forces(requested.axis, 2, turn=0.0, phase=requested.phase)[-1]
+    size = force_for_travel(model, grasp, direction, requested.travel)
+    share = requested.times / requested.times[-1]
     ramp = np.clip(share / 0.3, 0.0, 1.0)
     forces = (ramp**2 * (3 - 2 * ramp) * (share < 0.4))[:, None] * size * direction
-    result = simulate_dynamics(model, grasp=grasp, grasp_forces=forces, times=wanted.times,
+    result = simulate_dynamics(model, grasp=grasp, grasp_forces=forces, times=requested.times,
                                settings=NewmarkSettings(), progress=progress)
     _require(result)
     displacements = list(result.displacement)
-    poses, centres = _poses(model, grasp, wanted.point, displacements)
+    poses, centres = _poses(model, grasp, requested.point, displacements)
     return _made(poses, centres, forces, np.zeros_like(forces), displacements)
 
 

@@ -82,8 +82,8 @@ class YoungField:
                   + (self.bumps @ (form[1:, None] * by_young)).T)
         if self.names[0] not in extra:
             return shares
-        apart = self.straight @ np.log(values.young) - np.log(plain)
-        return np.vstack([shares, MIXTURE[1] * apart, (self.bumps * sizes).T])
+        deviation = self.straight @ np.log(values.young) - np.log(plain)
+        return np.vstack([shares, MIXTURE[1] * deviation, (self.bumps * sizes).T])
 
     def deviations(self, values: Values) -> np.ndarray:
         """Change of log E by each bump, with these moduli, shape [B]."""
@@ -94,11 +94,11 @@ class YoungField:
         control points, shape [B + 1, K].
         """
         plain = self.weights @ values.young
-        apart = self.straight @ np.log(values.young) - np.log(plain)
+        deviation = self.straight @ np.log(values.young) - np.log(plain)
         by_young = self.straight - self.weights * values.young / plain[:, None]
         sizes, sizes_by_young = self._sizes(values)
         # For a uniform branch both fields of the mixture are the same.
-        return np.vstack([apart @ by_young / max(float(apart @ apart), 1e-12),
+        return np.vstack([deviation @ by_young / max(float(deviation @ deviation), 1e-12),
                           sizes_by_young / sizes[:, None]])
 
     def same_at_any_step(self) -> "YoungField":
@@ -126,36 +126,36 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
     Args:
         fractions: Positions of the control points on the main path, ascending, shape [K].
     """
-    places = np.asarray(fractions, float)
-    if len(places) < 2 or np.any(np.diff(places) <= 0):
+    positions = np.asarray(fractions, float)
+    if len(positions) < 2 or np.any(np.diff(positions) <= 0):
         return YoungField(weights)
-    along, is_side = _places(mesh, skeleton)
-    straight = _hats(along, places)
-    halfway = (places[1:] + places[:-1]) / 2
-    stations = np.sort(np.r_[places, halfway, *([0.0] if places[0] > 0 else []),
-                             *([1.0] if places[-1] < 1 else [])])
+    along, is_side = _element_positions(mesh, skeleton)
+    straight = _hats(along, positions)
+    halfway = (positions[1:] + positions[:-1]) / 2
+    stations = np.sort(np.r_[positions, halfway, *([0.0] if positions[0] > 0 else []),
+                             *([1.0] if positions[-1] < 1 else [])])
     hats = _hats(along, stations)
     names, bumps, widths, steps = ["form"], [], [], []
     for number, station in enumerate(stations):
-        if np.any(np.isclose(station, places)):
+        if np.any(np.isclose(station, positions)):
             continue
-        inside = places[0] < station < places[-1]
+        inside = positions[0] < station < positions[-1]
         names.append(f"form at {station:.2g}")
         bumps.append(hats[:, number])
         widths.append(BUMP_BETWEEN if inside else BUMP_BEYOND)
-        beside = int(np.clip(np.searchsorted(places, station), 1, len(places) - 1))
+        beside = int(np.clip(np.searchsorted(positions, station), 1, len(positions) - 1))
         steps.append((STEP_BETWEEN if inside else STEP_BEYOND) * (
-            np.eye(len(places))[beside] - np.eye(len(places))[beside - 1]))
+            np.eye(len(positions))[beside] - np.eye(len(positions))[beside - 1]))
     if is_side.any():
         names.append("form of side branches")
         bumps.append(is_side.astype(float))
         widths.append(BUMP_OF_ORDER)
-        steps.append(np.zeros(len(places)))
+        steps.append(np.zeros(len(positions)))
     return YoungField(weights, straight, np.column_stack(bumps), np.array(widths),
                       np.array(steps), tuple(names))
 
 
-def _places(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
     """Position of each tetrahedron on the main path (0 to 1), and whether it is on a side branch.
     """
     path = np.asarray(skeleton.main_path())
@@ -169,15 +169,15 @@ def _places(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
             climbed = skeleton.parent[climbed]
         root[node] = climbed
     arc = skeleton.arc_length
-    middles, place = [skeleton.nodes], [arc[root] / arc[path[-1]]]
+    middles, positions = [skeleton.nodes], [arc[root] / arc[path[-1]]]
     child = np.flatnonzero(skeleton.parent >= 0)
     parent = skeleton.parent[child]
     for share in (0.25, 0.5, 0.75):
         middles.append((1 - share) * skeleton.nodes[parent] + share * skeleton.nodes[child])
-        place.append((1 - share) * place[0][parent] + share * place[0][child])
+        positions.append((1 - share) * positions[0][parent] + share * positions[0][child])
     side = np.concatenate([~on_path, *3 * [~on_path[child]]])
     nearest = cKDTree(np.vstack(middles)).query(mesh.centroids)[1]
-    return np.clip(np.concatenate(place)[nearest], 0.0, 1.0), side[nearest]
+    return np.clip(np.concatenate(positions)[nearest], 0.0, 1.0), side[nearest]
 
 
 def _hats(along: np.ndarray, stations: np.ndarray) -> np.ndarray:

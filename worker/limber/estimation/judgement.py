@@ -10,7 +10,7 @@ from limber.core.errors import WorkError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_preparation import forwards_of
-from limber.estimation.fitting.nuisances import in_words, told, unlikely
+from limber.estimation.fitting.nuisances import in_words, nuisance_records, unlikely
 from limber.estimation.fitting.objective import Objective, held_out, without
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
@@ -32,7 +32,7 @@ from limber.estimation.uncertainty.model_error import (
     steady_loads,
 )
 from limber.estimation.uncertainty.next_actions import Prospects
-from limber.estimation.uncertainty.path_error import led_by_path, path_error
+from limber.estimation.uncertainty.path_error import path_error, path_prescribed
 from limber.estimation.uncertainty.shape_error import hung_error, shape_error
 from limber.estimation.uncertainty.variance_parts import largest, variance_parts
 from limber.recordings.recorded_grasp import grasp_on
@@ -111,8 +111,9 @@ class Estimate:
     def cell_errors(self) -> list[dict[str, Any]]:
         """Each error of cell and sensors with its value and interval."""
         errors = self.fit.evaluation.errors
-        return [] if errors is None else told(self.objective.cell_errors.nuisances, errors,
-                                              self.uncertainty.covariance)
+        return [] if errors is None else nuisance_records(self.objective.cell_errors.nuisances,
+                                                          errors,
+                                                          self.uncertainty.covariance)
 
     @property
     def causes(self) -> dict[str, np.ndarray]:
@@ -287,7 +288,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
 
 def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
     """Error from the gripper's frame if its path is prescribed, with a warning."""
-    led = led_by_path(found.objective.forwards)
+    led = path_prescribed(found.objective.forwards)
     if not led:
         return None
     error = path_error(found.fit.evaluation, found.objective)

@@ -41,12 +41,12 @@ UNKNOWN_SCALE = 1.15
 """Deviation of the common log E before any measurement: a factor of ten within its 95 %."""
 _FIRM = 1e-4
 """Fraction of the variance by which moduli of one group may differ."""
-_PROBE_REACH = 0.15  # of the arc length: at which places and directions are compared
-_REACHES = (0.05, 0.1, 0.25, 0.35)  # then tried for the best of them
+_PROBE_REACH = 0.15  # fraction of the arc length at which positions and directions are compared
+_REACHES = (0.05, 0.1, 0.25, 0.35)  # fractions tried for the best of them
 _DIRECTIONS = 4
-_GOOD = 2  # places and directions that other reaches are tried for
-_FRAMES = 12  # that are simulated, each as sure as all that a recording has in its place
-_RECORDED_FRAMES = 100  # of a recording, where there is none yet
+_GOOD = 2  # positions and directions for which other reaches are tried
+_FRAMES = 12  # simulated; each counts for all frames of a recording at its position
+_RECORDED_FRAMES = 100  # assumed for a recording that does not exist yet
 _SECONDS = 6.0
 
 
@@ -67,8 +67,8 @@ class Known:
         """Before any pull: moduli within a factor of ten, neighbours similar as on branches, the
         form of their field within its deviations.
         """
-        apart = 0.5 * LINK_DEVIATION**2 * np.eye(count)
-        return cls(block_diag(UNKNOWN_SCALE**2 + apart, np.eye(form_count)),
+        link_covariance = 0.5 * LINK_DEVIATION**2 * np.eye(count)
+        return cls(block_diag(UNKNOWN_SCALE**2 + link_covariance, np.eye(form_count)),
                    np.zeros((count, count)))
 
     @classmethod
@@ -76,19 +76,20 @@ class Known:
         """Return the knowledge in an ``estimate.json``; none without finite intervals."""
         groups = list(found["groups"])
         form = [k for k, name in enumerate(found["parameters"]) if name.startswith("form")]
-        wanted, count = groups + form, len(groups)
-        measured = np.array(found["covariance"], float)[np.ix_(wanted, wanted)]
+        indices, count = groups + form, len(groups)
+        measured = np.array(found["covariance"], float)[np.ix_(indices, indices)]
         measured[:count, :count] += _FIRM * np.diag(np.diag(measured)[:count])
         interval, sensor = (np.array(found.get(name) or found["young_interval_pa"], float)
                             for name in ("young_interval_pa", "young_interval_sensor_pa"))
         if not np.isfinite([*measured.ravel(), *interval.ravel(), *sensor.ravel()]).all():
             return cls.nothing(count, len(form))
-        whole, told = (np.log(each[:, 1] / each[:, 0]) / (2 * 1.96) for each in (interval, sensor))
+        whole, from_sensor = (np.log(each[:, 1] / each[:, 0]) / (2 * 1.96) for each
+                              in (interval, sensor))
         # The interval of a soft piece is wider than the covariance states, and a pull can narrow
         # it.
-        wider = np.r_[told / np.sqrt(np.diag(measured)[:count]), np.ones(len(form))]
+        wider = np.r_[from_sensor / np.sqrt(np.diag(measured)[:count]), np.ones(len(form))]
         return cls(measured * np.outer(wider, wider),
-                   np.diag(np.maximum(whole**2 - told**2, 0.0)))
+                   np.diag(np.maximum(whole**2 - from_sensor**2, 0.0)))
 
     @property
     def total(self) -> np.ndarray:
@@ -260,9 +261,9 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
         raise WorkError("The forces of the pull give no valid simulation.",
                         "The branch has no equilibrium under them.",
                         "Choose another pull.")
-    told = evaluation.slopes[:len(evaluation.slopes) - space.own_row_count]
+    slopes = evaluation.slopes[:len(evaluation.slopes) - space.own_row_count]
     form_count = len(known.measured) - space.group_count
-    information = _of_field(np.vstack([told, _own_rows(space, space.group_count + form_count)]),
+    information = _of_field(np.vstack([slopes, _own_rows(space, space.group_count + form_count)]),
                             space.group_count, form_count, cell.calibration.repeat_sigma)
     strain = max(float(np.abs(strain_state(at.model, u).principal_strain).max())
                  for u in displacements)

@@ -223,16 +223,16 @@ class VirtualPullSettings(Settings):
         from limber.recordings.cell_errors import EXACT, CalibrationEntry
 
         begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT
-        given = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
-                 "force_gain_sigma": self.force_gain_sigma,
-                 "force_bias_sigma_n": self.force_bias_sigma,
-                 "force_drift_sigma_n": self.force_drift_sigma,
-                 "torque_bias_sigma_nm": self.torque_bias_sigma,
-                 "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
-                 "point_sigma_m": self.point_sigma,
-                 "clock_sigma_s": self.clock_sigma}
+        sigmas = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
+                  "force_gain_sigma": self.force_gain_sigma,
+                  "force_bias_sigma_n": self.force_bias_sigma,
+                  "force_drift_sigma_n": self.force_drift_sigma,
+                  "torque_bias_sigma_nm": self.torque_bias_sigma,
+                  "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
+                  "point_sigma_m": self.point_sigma,
+                  "clock_sigma_s": self.clock_sigma}
         return begun.model_copy(update={
-            name: value for name, value in given.items() if value is not None})
+            name: value for name, value in sigmas.items() if value is not None})
 
     @property
     def frame_count(self) -> int:

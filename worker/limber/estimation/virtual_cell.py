@@ -20,16 +20,16 @@ class CellErrors:
 
     Attributes:
         calibration: Their standard deviations.
-        gripper_place, gripper_turn: Errors of the gripper's frame [m, rad], shape [3] each.
+        gripper_offset, gripper_turn: Errors of the gripper's frame [m, rad], shape [3] each.
         force_gain: Factor of the force.
-        camera_place, camera_turn: Errors of the observer's frame [m, rad], shape [3] each.
+        camera_offset, camera_turn: Errors of the observer's frame [m, rad], shape [3] each.
     """
 
     calibration: CalibrationEntry
-    gripper_place: np.ndarray
+    gripper_offset: np.ndarray
     gripper_turn: np.ndarray
     force_gain: float
-    camera_place: np.ndarray
+    camera_offset: np.ndarray
     camera_turn: np.ndarray
 
     @classmethod
@@ -44,9 +44,9 @@ class CellErrors:
     @property
     def truth(self) -> dict[str, Any]:
         """The drawn errors, for ``truth`` in ``pull.toml``."""
-        return {"gripper_place_m": self.gripper_place.tolist(),
+        return {"gripper_place_m": self.gripper_offset.tolist(),
                 "gripper_turn_rad": self.gripper_turn.tolist(), "force_gain": self.force_gain,
-                "camera_place_m": self.camera_place.tolist(),
+                "camera_place_m": self.camera_offset.tolist(),
                 "camera_turn_rad": self.camera_turn.tolist()}
 
     def recorded(self, pull: Pull, rng: np.random.Generator) -> Pull:
@@ -62,7 +62,7 @@ class CellErrors:
         point = np.array(pull.entry.grasp.point_m)
         poses = pull.poses.copy()
         moved = rotated(self.gripper_turn, poses[:, :3] - point)
-        poses[:, :3] = (point + self.gripper_place + moved
+        poses[:, :3] = (point + self.gripper_offset + moved
                         + known.pose_noise_m * rng.standard_normal((len(times), 3)))
         poses[:, 3:] = composed(self.gripper_turn, poses[:, 3:])
         late = known.clock_sigma_s * rng.standard_normal()
@@ -86,7 +86,7 @@ class CellErrors:
         spline = scipy.interpolate.CubicSpline(times, positions)
         at = spline(np.clip(times + late, times[0], times[-1]))
         turned = rotated(self.camera_turn, (at - middle).reshape(-1, 3)).reshape(at.shape)
-        return middle + turned + self.camera_place
+        return middle + turned + self.camera_offset
 
 
 def marked_points(skeleton: Skeleton, fractions: Sequence[float],

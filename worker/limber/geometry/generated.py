@@ -55,15 +55,15 @@ def generate_branch(seed: int, **spec: object) -> GeneratedBranch:
     """
     from limber.geometry.surface.tubes import branch_surface
 
-    wanted = checked_settings(BranchSpec, spec)
+    settings = checked_settings(BranchSpec, spec)
     rng = np.random.default_rng(seed)
-    skeleton = _true_skeleton(rng, wanted)
+    skeleton = _true_skeleton(rng, settings)
     count = len(FRACTIONS)
-    young = wanted.young_mean * np.exp(np.linspace(0.4, -0.4, count)
-                                       + rng.uniform(-0.5, 0.5, count))
+    young = settings.young_mean * np.exp(np.linspace(0.4, -0.4, count)
+                                         + rng.uniform(-0.5, 0.5, count))
     return GeneratedBranch(
-        seed, wanted, skeleton, branch_surface(skeleton, sides=20, spacing=1.0), young,
-        control_points(skeleton), FRACTIONS, scan(skeleton, wanted, rng))
+        seed, settings, skeleton, branch_surface(skeleton, sides=20, spacing=1.0), young,
+        control_points(skeleton), FRACTIONS, scan(skeleton, settings, rng))
 
 
 def scan(skeleton: Skeleton, spec: BranchSpec, rng: np.random.Generator) -> Cloud:
@@ -92,11 +92,11 @@ def _true_skeleton(rng: np.random.Generator, spec: BranchSpec) -> Skeleton:
     share = np.linspace(0, 1, len(main))
     radius = [spec.radius_root + (spec.radius_tip - spec.radius_root) * share**1.2]
     turn = rng.uniform(0, 2 * np.pi)
-    places = np.linspace(0.18, 0.78, spec.fork_count + 2)[1:-1] if spec.fork_count else []
+    positions = np.linspace(0.18, 0.78, spec.fork_count + 2)[1:-1] if spec.fork_count else []
     count = len(main)
-    for place in places:
-        at = int(np.clip((place + rng.uniform(-0.03, 0.03)) * len(main), 2, len(main) - 3))
-        turn += 2.4 + rng.uniform(-0.4, 0.4)  # about the golden angle, as buds stand
+    for position in positions:
+        at = int(np.clip((position + rng.uniform(-0.03, 0.03)) * len(main), 2, len(main) - 3))
+        turn += 2.4 + rng.uniform(-0.4, 0.4)  # about the golden angle, as in buds
         twig, thick = _twig(rng, spec, main, radius[0], at, turn)
         nodes.append(twig[1:])
         parent.append(np.concatenate([[at], count + np.arange(len(twig) - 2)]))
@@ -199,8 +199,8 @@ def _unoccluded(points: np.ndarray, spec: BranchSpec, rng: np.random.Generator) 
 def _outside_gaps(skeleton: Skeleton, run: np.ndarray, along: np.ndarray, spec: BranchSpec,
                   rng: np.random.Generator) -> np.ndarray:
     keep = np.ones(len(run), bool)
-    for place in (np.arange(spec.gap_count) + 0.5) / max(spec.gap_count, 1):
-        start = (0.15 + 0.75 * place + rng.uniform(-0.03, 0.03)) * spec.length
+    for middle in (np.arange(spec.gap_count) + 0.5) / max(spec.gap_count, 1):
+        start = (0.15 + 0.75 * middle + rng.uniform(-0.03, 0.03)) * spec.length
         keep &= (run != 0) | (np.abs(along - start) > spec.gap_length / 2)
     return keep
 

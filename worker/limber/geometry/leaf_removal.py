@@ -18,11 +18,11 @@ from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
 UNASKED = 0.1
 """Fraction of the points up to which leaves are removed without the user's consent."""
 
-_LEAST = 0.05  # of the points, that leaves must be to be cut off
+_LEAST = 0.05  # smallest fraction of points that is removed as leaves
 # Distance in radii up to which a point is on a round axis; a filled blade to which a rod was fitted
 # has a third of its points there.
 _ON_AXIS = 0.15
-_MOST = 0.5  # of a piece's points, that decide
+_MOST = 0.5  # fraction of a piece's points that decides
 # Mean of the unit vectors from the axis, for an evenly seen arc of 120 degrees. One view of a stem
 # gives pi/4, since a sensor's points thin out towards the rim; a rod through a blade 0.83 to 0.97.
 _ARC = np.sin(np.pi / 3) / (np.pi / 3)
@@ -94,16 +94,16 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
     # The median point: the middle of a curled blade is not on a point.
     blade = prepared.cloud.points[largest.points]
     nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
-    place = (nearest + prepared.origin) / UNIT_METRES[unit]
+    point = (nearest + prepared.origin) / UNIT_METRES[unit]
     count = f"{len(leaves)} {'leaf' if len(leaves) == 1 else 'leaves'}"
     raise InputError(f"{100 * share:.0f} % of the points look like {count}: they are flat and not "
                      "round. The largest leaf is at "
-                     f"({', '.join(f'{value:.6g}' for value in place)}) and has "
+                     f"({', '.join(f'{value:.6g}' for value in point)}) and has "
                      f"{1e4 * largest.area:.3g} cm2.",
                      "Flat wood may look like a leaf, so Limber removes more than "
                      f"{100 * UNASKED:.0f} % of a scan only on request.",
                      "If these are leaves, remove them and keep their mass (--leaves cut). If they "
-                     "are wood, keep all points (--leaves keep).").at(place)
+                     "are wood, keep all points (--leaves keep).").at(point)
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:

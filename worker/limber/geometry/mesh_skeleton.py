@@ -49,14 +49,14 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
         raise InputError("A root (--root) was given for a cylinder model.",
                          "The model defines its own root.", "Omit --root.")
     scale = UNIT_METRES[settings.unit]
-    given = read_skeleton(path, scale=scale)
-    if (given.radius <= 0).any():
-        raise InputError(f"{int((given.radius <= 0).sum())} of {given.node_count} nodes of {path} "
+    read = read_skeleton(path, scale=scale)
+    if (read.radius <= 0).any():
+        raise InputError(f"{int((read.radius <= 0).sum())} of {read.node_count} nodes of {path} "
                          "have radius 0.", "A branch has a thickness.",
                          "Give each node its radius.")
-    for text in size_doubts(given.nodes, "cylinder model"):
+    for text in size_doubts(read.nodes, "cylinder model"):
         progress.warn(text)
-    alignment, skeleton = _aligned(given, scale, settings)
+    alignment, skeleton = _aligned(read, scale, settings)
     meshed = mesh_skeleton(skeleton, ReconstructSettings(
         young=settings.young, poisson=settings.poisson, density=settings.density,
         grasp_fraction=settings.grasp_fraction, mesh_time_limit=settings.mesh_time_limit,
@@ -66,10 +66,10 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
         "gravity_m_s2": gravity_after(alignment, settings.up)}), meshed.masses
 
 
-def _aligned(given: Skeleton, scale: float, settings: MeshSurfaceSettings,
+def _aligned(skeleton: Skeleton, scale: float, settings: MeshSurfaceSettings,
              ) -> tuple[Alignment, Skeleton]:
-    root = given.nodes[0]
-    turn = upright_rotation(given, np.array(settings.up), settings.upright)
+    root = skeleton.nodes[0]
+    turn = upright_rotation(skeleton, np.array(settings.up), settings.upright)
     return (Alignment(scale=scale, origin=tuple(root.tolist()),
                       rotation=tuple(map(tuple, turn.tolist()))),
-            given.moved((given.nodes - root) @ turn.T))
+            skeleton.moved((skeleton.nodes - root) @ turn.T))

@@ -20,7 +20,7 @@ from limber.geometry.tets.quality import measure_quality
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
 
-_SECTIONS = 24  # that an axis is made of
+_SECTIONS = 24  # cross-sections of an axis
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
         mesh, cached = tetrahedralise(
             surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
             settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
-    except MeshingError as error:  # there are no axes to sweep along here
+    except MeshingError as error:  # there are no axes to sweep along
         raise MeshingError(
             error.seen, error.why, "Raise --mesh-time-limit or --mesh-memory-limit-mb, lower "
             "--elements-across, or simplify the surface.") from error

@@ -10,8 +10,8 @@ from limber.core.progress import Progress
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_NAMED = 3  # branches and places that are named one by one
-_LEFT_OUT_MOST = 0.03  # of the mass, that the mesh may leave out unasked
+_NAMED = 3  # branches and positions named one by one
+_LEFT_OUT_MOST = 0.03  # fraction of the mass that the mesh may omit without asking
 
 
 def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
@@ -47,15 +47,15 @@ def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | N
     while keep is not None and not keep[base]:
         base = skeleton.parent[base]
     up = skeleton.parent[own]
-    way = skeleton.nodes[own] - skeleton.nodes[up]
-    length = np.linalg.norm(way, axis=1)
+    vector = skeleton.nodes[own] - skeleton.nodes[up]
+    length = np.linalg.norm(vector, axis=1)
     part = np.maximum(np.pi * skeleton.radius[own]**2 * length * density, 1e-300)
     middle = (skeleton.nodes[own] + skeleton.nodes[up]) / 2
     centre = np.average(middle, axis=0, weights=part)
     offset = middle - centre
     # Each piece is a slender rod: m (r r^T + l l^T / 12) with its middle r and its length l.
     second = np.einsum("k,ki,kj->ij", part, offset, offset) + np.einsum(
-        "k,ki,kj->ij", part, way, way) / 12
+        "k,ki,kj->ij", part, vector, vector) / 12
     return {"mass_kg": float(part.sum()), "length_m": float(length.sum()),
             "centre_m": centre.tolist(), "attached_m": skeleton.nodes[base].tolist(),
             "inertia_kg_m2": (np.trace(second) * np.eye(3) - second).tolist(), "branch": run}
@@ -109,15 +109,15 @@ def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
         skeleton.nodes[pairs[:, 0]] - skeleton.nodes[pairs[:, 1]], axis=1)
     start = np.array([members[0] for members in skeleton.runs()])
     found: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
-    for place in np.flatnonzero((one != other) & (overlap > 0)):
-        key = tuple(sorted((int(one[place]), int(other[place]))))
-        at = skeleton.nodes[pairs[place]].mean(axis=0)
+    for pair in np.flatnonzero((one != other) & (overlap > 0)):
+        key = tuple(sorted((int(one[pair]), int(other[pair]))))
+        at = skeleton.nodes[pairs[pair]].mean(axis=0)
         # They overlap as expected around the fork that joins them, or from which both start.
         own = 3 * float(skeleton.radius[start[list(key)]].max())
         if np.linalg.norm(skeleton.nodes[start[list(key)]] - at, axis=1).min() < own:
             continue
-        if key not in found or overlap[place] > found[key][0]:
-            found[key] = float(overlap[place]), at
+        if key not in found or overlap[pair] > found[key][0]:
+            found[key] = float(overlap[pair]), at
     return [{"branches": list(key), "at_m": at.tolist()}
             for key, (_, at) in sorted(found.items(), key=lambda item: -item[1][0])]
 
@@ -126,9 +126,9 @@ def touching_texts(handles: int, touching: list[dict[str, Any]]) -> list[str]:
     """Warnings about handles of a surface, where separate branches have merged."""
     if handles == 0:
         return []
-    places = "; ".join(
+    locations = "; ".join(
         f"branches {m['branches'][0]} and {m['branches'][1]} at ("
         + ", ".join(f"{v:.3f}" for v in m["at_m"]) + ")" for m in touching[:_NAMED])
     return [f"surface.ply has {handles} handle{'s' * (handles != 1)}: branches that are separate "
-            f"in the skeleton touch and merge there{': ' + places if places else ''}. The swept "
-            "mesh keeps them separate."]
+            f"in the skeleton touch and merge there{': ' + locations if locations else ''}. The "
+            "swept mesh keeps them separate."]

@@ -44,7 +44,7 @@ from limber.geometry.skeleton.radii.silhouette import (
     without_edges,
     without_hidden_twigs,
 )
-from limber.geometry.skeleton.search_result import SkeletonResult, given_skeleton
+from limber.geometry.skeleton.search_result import SkeletonResult, result_of_skeleton
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.skeleton.upright import upright_rotation
@@ -59,8 +59,8 @@ from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
 Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Receives a skeleton as found, and the full result of the search for it."""
 
-_OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # of cloud.ply, whatever the scan's are
-_LEAVES_ASKED = 0.2  # fraction of points on no round axis, above which leaves are searched for
+_OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # columns of cloud.ply that Limber writes
+_LEAVES_ASKED = 0.2  # fraction of points on no round axis above which leaves are searched for
 # Fraction of flat points from which shape alone shows leaves. Bare branches seen from one side have
 # up to 0.11, leafy seedlings 0.6 and more.
 _MOSTLY = 0.3
@@ -153,9 +153,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
             check_explained(whole, settings.unexplained, wood.cloud.points,
                             lambda place: (place + wood.origin) / scale)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
-    told = list(prepared.warnings)
+    warnings = list(prepared.warnings)
     for text in found.warnings_at(alignment.undo):
-        told.append(text)
+        warnings.append(text)
         progress.warn(text)
     if edits:
         found = _edited(found, [edit.aligned(alignment) for edit in edits], progress)
@@ -167,13 +167,13 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         cloud = _with_leaves(prepared, leaves, alignment, found.skeleton)
         hung = leaf_masses(leaves, cloud.points, found.skeleton, settings.leaf_density)
         meshed = replace(meshed, masses=[*meshed.masses, *hung])
-        told.append(leaves_text(hung, float(cloud.attributes["leaf"].mean())))
-        progress.warn(told[-1])
+        warnings.append(leaves_text(hung, float(cloud.attributes["leaf"].mean())))
+        progress.warn(warnings[-1])
     numbers = meshed.numbers | found.report() | {
         "leaf_count": len(hung), "leaf_mass_kg": sum(leaf["mass_kg"] for leaf in hung),
         "leaf_area_m2": sum(leaf["area_m2"] for leaf in hung),
         "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,
-        "skeleton_warnings": told}
+        "skeleton_warnings": warnings}
     return Reconstruction(alignment, cloud, meshed, gravity, numbers)
 
 
@@ -348,7 +348,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
                              "wide.", "They do not belong together, or have different units.",
                              "Give the skeleton in the coordinates and the unit of the cloud "
                              "(--unit applies to both).")
-        return given_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
+        return result_of_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),

@@ -30,7 +30,7 @@ SLICE, SIDES = 5.0, 8 / 3
 """Length of a slice for one element across, in half the smaller thickness; corners of a section per
 element across.
 """
-_UPWARDS = 0.3  # sine of the angle between axis and up, below which the axis has no upper side
+_UPWARDS = 0.3  # sine of the angle between axis and vertical below which the axis has no upper side
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
     mesh = mark(TetMesh((mesh.nodes - sections.axis[0]) @ turn.T, mesh.tets).quadratic(), skeleton,
                 young=settings.young, poisson=settings.poisson, density=settings.density,
                 fractions=FRACTIONS, grasp_fraction=settings.grasp_fraction)
-    masses = [{"kind": "table", "attached_m": place.tolist(), "mass_kg": float(mass)}
-              for place, mass in zip(skeleton.nodes, sections.mass, strict=True) if mass > 0]
+    masses = [{"kind": "table", "attached_m": node.tolist(), "mass_kg": float(mass)}
+              for node, mass in zip(skeleton.nodes, sections.mass, strict=True) if mass > 0]
     numbers = numbers_of(surface, skeleton, mesh, alignment, settings, "sweep")
     return MeshedBody(alignment, skeleton, surface, mesh, numbers | {
         "hung_mass_kg": float(sections.mass.sum())}), masses

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from limber.geometry.skeleton.confidence import given_carrier
+from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.radii.normal_equations import fit_precision
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -25,7 +25,7 @@ _LEAST, _MOST = 0.5, 2.0
 # Radius of a missing twig over the fitted one: a shape has the same tetrahedra. Results linear in
 # the shape, such as estimates, lose 2 (1 - 0.5), all, of the twig's mass.
 _MISSING = 0.5
-_LEAST_VOLUME = 0.1  # of a tetrahedron's own, below which its corners go half as far
+_LEAST_VOLUME = 0.1  # fraction of a tetrahedron's volume below which its corners move half as far
 _HALVINGS = 30
 
 
@@ -60,19 +60,19 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     radius = np.clip(skeleton.radius + moves[..., 3], _LEAST * skeleton.radius,
                      _MOST * skeleton.radius)
     # Drawn last: where all twigs are certain, shapes are the same as without them.
-    radius = np.where(_there(skeleton, count, rng), radius, _MISSING * skeleton.radius)
+    radius = np.where(_existing(skeleton, count, rng), radius, _MISSING * skeleton.radius)
     return [replace(skeleton, nodes=skeleton.nodes + move, radius=thick)
             for move, thick in zip(across, radius, strict=True)]
 
 
-def _there(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray:
+def _existing(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray:
     """Whether each node's run exists in each draw, shape [count, n]."""
-    chance, runs = given_carrier(skeleton), skeleton.runs()
-    there = np.ones((count, len(runs)), bool)
+    chance, runs = probability_given_carrier(skeleton), skeleton.runs()
+    exists = np.ones((count, len(runs)), bool)
     for run, members in enumerate(runs[1:], start=1):
         carrier = int(skeleton.branch[members[0]])
-        there[:, run] = there[:, carrier] & (rng.uniform(size=count) < chance[run])
-    return there[:, skeleton.branch]
+        exists[:, run] = exists[:, carrier] & (rng.uniform(size=count) < chance[run])
+    return exists[:, skeleton.branch]
 
 
 def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
@@ -89,11 +89,11 @@ def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
         weight = share.reshape(-1, *[1] * (values.ndim - 1))
         return (1 - weight) * values[low] + weight * values[high]
 
-    way = between(moves) + between(growth)[:, None] * offset
+    shift = between(moves) + between(growth)[:, None] * offset
     corners = mesh.tets[:, :4]
-    going = np.ones(len(way))
+    going = np.ones(len(shift))
     for _ in range(_HALVINGS):
-        nodes = mesh.nodes + going[:, None] * way
+        nodes = mesh.nodes + going[:, None] * shift
         narrow = replace(mesh, nodes=nodes).volumes < _LEAST_VOLUME * mesh.volumes
         if not narrow.any():
             break

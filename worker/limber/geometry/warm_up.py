@@ -25,5 +25,5 @@ def warm_up(progress: Progress = SILENT) -> None:
     join_pieces(line, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6], [6, 7]]), np.full(8, 0.01),
                 np.full(8, 20), np.full(8, 0.01), gap=0.03, bridge_limit=0.1,
                 up=np.array([0.0, 0.0, 1.0]), join_plants=False)
-    reach_on_circle(np.zeros(1), np.ones(1), np.ones(1), 1.0, 0.5)  # of one-sided scans alone
+    reach_on_circle(np.zeros(1), np.ones(1), np.ones(1), 1.0, 0.5)  # used by one-sided scans alone
     progress(1.0, "compiling the surface's loops")

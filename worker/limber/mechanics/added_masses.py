@@ -92,8 +92,8 @@ class Tied:
     def moved(self, displacement: np.ndarray) -> PointMass:
         """Return the mass moved by a displacement of the nodes [m], shape [node_count, 3]."""
         local = displacement[self.nodes]
-        way = np.einsum("t,ta,taj->j", self.share, self.centre, local)
-        position = np.array(self.added.position) + way
+        shift = np.einsum("t,ta,taj->j", self.share, self.centre, local)
+        position = np.array(self.added.position) + shift
         if not isinstance(self.added, HungTwig):
             return replace(self.added, position=tuple(position))
         turn = closest_rotation(

@@ -217,8 +217,8 @@ class Grasp:
             mean = mean - turned @ (self.weights @ arm)
         return np.concatenate([mean, rotation_vector(turned)])
 
-    def place_slopes(self, rest: np.ndarray, displacement: np.ndarray, changes: np.ndarray,
-                     ) -> np.ndarray:
+    def position_slopes(self, rest: np.ndarray, displacement: np.ndarray, changes: np.ndarray,
+                        ) -> np.ndarray:
         """Return the change of the pose's position with p changes of the displacement, shape [3,
         p].
 
@@ -265,9 +265,10 @@ def _centred(weights: np.ndarray, offset: np.ndarray) -> np.ndarray:
     # The change of the weights is linear in the position, so their sum stays 1.
     variance, axes = np.linalg.eigh((weights[:, None] * arm).T @ arm)
     along = arm @ axes
-    wanted = -centre @ axes
-    reached = (wanted > _REACHED * along.min(axis=0)) & (wanted < _REACHED * along.max(axis=0))
-    slope = np.where(reached, wanted / np.where(reached, variance, 1.0), 0.0)
+    intercept = -centre @ axes
+    reached = (intercept > _REACHED * along.min(axis=0)) & (intercept < _REACHED
+                                                            * along.max(axis=0))
+    slope = np.where(reached, intercept / np.where(reached, variance, 1.0), 0.0)
     return weights * (1.0 + along @ slope)
 
 

@@ -21,9 +21,9 @@ class MeshData:
     def __init__(self, mesh: TetMesh, fixed: np.ndarray):
         self.fixed = fixed
         self.equations: dict[tuple, Equations] = {}
-        self._place(mesh)
+        self._set_mesh(mesh)
 
-    def _place(self, mesh: TetMesh) -> None:
+    def _set_mesh(self, mesh: TetMesh) -> None:
         self.mesh = mesh
         self.tets = np.ascontiguousarray(mesh.tets, np.int32)
         self.rule = elements.stiffness_quadrature(mesh)
@@ -41,7 +41,7 @@ class MeshData:
     def moved(self, nodes: np.ndarray) -> "MeshData":
         """Return the data of the mesh with other node positions; patterns are shared."""
         other = copy.copy(self)
-        other._place(replace(self.mesh, nodes=nodes))
+        other._set_mesh(replace(self.mesh, nodes=nodes))
         other.equations = {key: equations.placed(other.tets, other.gradients, other.weights)
                            for key, equations in self.equations.items()}
         return other

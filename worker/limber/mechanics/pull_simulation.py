@@ -68,9 +68,9 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
     holds = tuple(patch(point, settings.grasp_mode) for point in settings.hold_at)
     model = model.gripped(grasp, *holds)
     loads = np.zeros_like(model.mesh.nodes)
-    for place in settings.load_at:
-        loaded = patch(place[:3], "pinned")
-        loads[loaded.nodes] += loaded.weights[:, None] * np.array(place[3:])
+    for point in settings.load_at:
+        loaded = patch(point[:3], "pinned")
+        loads[loaded.nodes] += loaded.weights[:, None] * np.array(point[3:])
     follows_pose = along is not None or settings.move is not None or settings.turn is not None
     force = np.array(settings.grasp_force or (0.0, 0.0, 0.0))
     if not (follows_pose or settings.grasp_force is not None or settings.load_at):
@@ -82,12 +82,13 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
         [settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
     first = present(start.pose, "pose of the grasps")[0]
     return LoadCase(model, start, grasp, follows_pose, holds,
-                    _way(first, changes, settings.grasp_mode), force, loads, times, part)
+                    _prescribed_path(first, changes, settings.grasp_mode), force, loads, times,
+                    part)
 
 
 def with_masses(model: BranchModel, settings: SimulateSettings) -> BranchModel:
     """Return the model with the added masses of the settings."""
-    return model.with_point_masses([PointMass(place[:3], place[3]) for place in settings.mass_at])
+    return model.with_point_masses([PointMass(entry[:3], entry[3]) for entry in settings.mass_at])
 
 
 def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> None:
@@ -127,7 +128,7 @@ def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.n
     return times, part**2 * (3 - 2 * part) if settings.kind == "dynamic" else part
 
 
-def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
+def _prescribed_path(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
     """Return the grasp's poses [frames, 6], starting at its pose on the loaded branch."""
     if mode == "pinned":
         pose = np.concatenate([pose[:3], np.zeros(3)])

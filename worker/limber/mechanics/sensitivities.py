@@ -85,12 +85,12 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
         parameters: Names from PARAMETERS; the derivatives to damping are 0.
         is_held: Whether the grasp was held at a pose; False for a force.
     """
-    wanted = ParameterSet(checked_names(parameters), weights, control_young, shares)
+    parameter_set = ParameterSet(checked_names(parameters), weights, control_young, shares)
     grasps = [] if grasp is None else [grasp] if isinstance(grasp, Grasp) else list(grasp)
     equations = model.equations(grasps if is_held else ())
     u = result.displacement
     tangent = equations.exact_tangent(model, u)
-    explicit = explicit_forces(model, wanted, u)
+    explicit = explicit_forces(model, parameter_set, u)
 
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(u, direction)
@@ -104,11 +104,12 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
         forces.append(reactions(grasps, partial + force(change)) if is_held
                       else np.zeros((len(grasps), 3)))
         energies.append(float((internal.force * change).sum()))
-    energies = np.array(energies) + explicit_energies(model, wanted, u)
+    energies = np.array(energies) + explicit_energies(model, parameter_set, u)
     reaction = np.stack(forces, axis=-1) if grasps else np.zeros((1, 3, len(columns)))
     if isinstance(grasp, Grasp) or grasp is None:
         reaction = reaction[0]
-    return StaticSensitivities(wanted.labels(), np.stack(columns, axis=-1), reaction, energies)
+    return StaticSensitivities(parameter_set.labels(), np.stack(columns, axis=-1), reaction,
+                               energies)
 
 
 @dataclass(frozen=True)
@@ -172,14 +173,14 @@ def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
     return solution
 
 
-def lame_changes(model: BranchModel, wanted: ParameterSet,
+def lame_changes(model: BranchModel, parameters: ParameterSet,
                  ) -> list[tuple[np.ndarray, np.ndarray] | None]:
     """Return for each column the derivative of the Lamé coefficients; None if they are constant."""
     changes: list[tuple[np.ndarray, np.ndarray] | None] = []
-    for name in wanted.names:
+    for name in parameters.names:
         if name == "log_young":
             changes += [(model.lame_lambda * part, model.lame_mu * part)
-                        for part in young_shares(model, wanted)]
+                        for part in young_shares(model, parameters)]
         elif name == "poisson":
             changes.append(lame_by_poisson(model.young * model.stiffening, model.poisson))
         else:
@@ -187,24 +188,24 @@ def lame_changes(model: BranchModel, wanted: ParameterSet,
     return changes
 
 
-def young_shares(model: BranchModel, wanted: ParameterSet) -> np.ndarray:
+def young_shares(model: BranchModel, parameters: ParameterSet) -> np.ndarray:
     """Return d log E_tet / d log E_k, shape [K, tet_count]."""
-    if wanted.shares is not None:
-        return wanted.shares
-    if wanted.weights is None:
+    if parameters.shares is not None:
+        return parameters.shares
+    if parameters.weights is None:
         return np.ones((1, model.mesh.tet_count))
-    control = wanted.control_young
+    control = parameters.control_young
     if control is None:
-        control = np.linalg.lstsq(wanted.weights, model.young, rcond=None)[0]
-    mapped = wanted.weights @ control
+        control = np.linalg.lstsq(parameters.weights, model.young, rcond=None)[0]
+    mapped = parameters.weights @ control
     if np.abs(mapped / model.young - 1).max() > 1e-6:
         raise InputError("Young's modulus differs from what the weights give.",
                          "The model's field must be weights @ control_young.",
                          "Create the model with with_young(weights @ control_young).")
-    return (wanted.weights * control).T / mapped
+    return (parameters.weights * control).T / mapped
 
 
-def explicit_forces(model: BranchModel, wanted: ParameterSet, displacement: np.ndarray, *,
+def explicit_forces(model: BranchModel, parameters: ParameterSet, displacement: np.ndarray, *,
                     motion: MotionState | None = None,
                     viscous: Viscous | None = None) -> list[np.ndarray]:
     """Return the derivative of internal and inertial force less load, at fixed motion.
@@ -216,9 +217,9 @@ def explicit_forces(model: BranchModel, wanted: ParameterSet, displacement: np.n
         motion: The instant of a motion; None: equilibrium.
         viscous: The viscous part of that instant.
     """
-    changes, partials = lame_changes(model, wanted), []
+    changes, partials = lame_changes(model, parameters), []
     plain = [name.rsplit("_", 1)[0] if name.startswith("log_young") else name
-             for name in wanted.labels()]
+             for name in parameters.labels()]
     for name, change in zip(plain, changes, strict=True):
         if change is not None:
             partials.append(model.internal(displacement, lame_pair=change,
@@ -262,12 +263,12 @@ def _damping_force(model: BranchModel, name: str, motion: MotionState,
             - model.internal(motion.displacement).force) / model.damping.stiffness
 
 
-def explicit_energies(model: BranchModel, wanted: ParameterSet,
+def explicit_energies(model: BranchModel, parameters: ParameterSet,
                       displacement: np.ndarray) -> np.ndarray:
     """Return the derivative of the strain energy [J per parameter] at a fixed displacement."""
     return np.array([0.0 if change is None
                      else model.internal(displacement, lame_pair=change).strain_energy
-                     for change in lame_changes(model, wanted)])
+                     for change in lame_changes(model, parameters)])
 
 
 def reactions(grasps: Sequence[Grasp], out: np.ndarray) -> np.ndarray:

@@ -90,8 +90,9 @@ class SimulateSettings(Settings):
 
     @field_validator("load_at", "mass_at")
     @classmethod
-    def _possible_loads(cls, given: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
-        for placed in given:
+    def _possible_loads(cls, values: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...],
+                                                                             ...]:
+        for placed in values:
             force = placed[3:] if len(placed) > 4 else (placed[3] * STANDARD_GRAVITY,)
             possible_force(force)
-        return given
+        return values

@@ -10,7 +10,7 @@ from limber.mechanics.model import BranchModel
 
 ALL = slice(None)
 _NEAR_STRAIN = 0.57
-_NEAR_STRESS = 0.3  # less: the norm is taken of the stress before it is turned and stretched
+_NEAR_STRESS = 0.3  # lower, because the norm is taken before the stress is rotated and stretched
 
 
 @dataclass(frozen=True)

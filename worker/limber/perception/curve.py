@@ -50,8 +50,8 @@ class RestCurve:
         radius = np.interp(arc, along, skeleton.radius[path])
         middle = (arc[1:] + arc[:-1]) / 2
         # No knot at the base: the branch is rooted there and does not turn.
-        places = np.linspace(0.0, along[-1], knot_count + 1)
-        hats = np.column_stack([np.interp(middle, places, row)
+        knots = np.linspace(0.0, along[-1], knot_count + 1)
+        hats = np.column_stack([np.interp(middle, knots, row)
                                 for row in np.eye(knot_count + 1)[1:]])
         side = np.setdiff1d(np.arange(skeleton.node_count), path)
         root = _fork_arc(skeleton, path)[side]

@@ -273,9 +273,9 @@ def _across(curve: BentCurve, arcs: np.ndarray, view: np.ndarray,
 
 def _interpolated(curve: BentCurve, arcs: np.ndarray) -> np.ndarray:
     jacobian = curve.jacobian()
-    place = np.clip(arcs / curve.rest.arc[1], 0, len(curve.rest.arc) - 1 - 1e-9)
-    low = place.astype(int)
-    share = (place - low)[:, None, None, None]
+    position = np.clip(arcs / curve.rest.arc[1], 0, len(curve.rest.arc) - 1 - 1e-9)
+    low = position.astype(int)
+    share = (position - low)[:, None, None, None]
     return (1 - share) * jacobian[low] + share * jacobian[low + 1]
 
 

@@ -25,8 +25,8 @@ from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.path_problem import UNPROVEN, NoWayError
 from limber.planning.planners.easiest import EasiestWay
 
-_STATES = 12  # of the branch that are solved
-_APART = 0.01  # [m] between them, and between them and known samples
+_STATES = 12  # solved states of the branch
+_APART = 0.01  # [m] between them and from known samples
 _LEARNT_APART = 0.5 * _APART
 
 
@@ -55,11 +55,11 @@ def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, no
     nothing is confirmed.
     """
     wall = _chosen(none.wall)
-    places = np.concatenate([wall, _chosen(none.nearest)])
-    if not len(places):
+    points = np.concatenate([wall, _chosen(none.nearest)])
+    if not len(points):
         return WallCheck(0, True)
     with SolverPool(grasp_model, workers) as solvers:
-        good, _ = solve_branch(solvers, places, progress=progress)
+        good, _ = solve_branch(solvers, points, progress=progress)
     states = good[1:]
     if not states:
         return WallCheck(0, False)
@@ -81,11 +81,11 @@ def _chosen(wall: np.ndarray) -> np.ndarray:
     of them the earliest ones, half those far from all before.
     """
     chosen: list[np.ndarray] = []
-    for place in wall:
+    for cell in wall:
         if len(chosen) == _STATES // 2:
             break
-        if all(np.linalg.norm(place - other) > _APART for other in chosen):
-            chosen.append(place)
+        if all(np.linalg.norm(cell - other) > _APART for other in chosen):
+            chosen.append(cell)
     while chosen and len(chosen) < _STATES:
         away = np.linalg.norm(wall[:, None] - np.array(chosen)[None], axis=2).min(axis=1)
         if away.max() <= _APART:

@@ -30,15 +30,15 @@ from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_sid
 from limber.planning.path_problem import NoWayError
 from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
-from limber.planning.planners.easiest import easiest_way
+from limber.planning.planners.easiest import easiest_path
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace
 from limber.planning.two_paths import PathPair, plan_within
-from limber.planning.undecided_passages import Passages, asked_in_doubt, said_after
+from limber.planning.undecided_passages import Passages, solved_if_undecided, with_added_poses
 
-_RESERVE = 1.01  # on what limits are tightened by: the risk changes a little with the path
+_RESERVE = 1.01  # factor on the tightening of limits: the risk changes a little with the path
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class _Rounds:
             plans missed them by.
         pair: The last paths on the field; ``plan`` and ``baseline`` on the full model.
         risks, moving: Of the plans so far: their risks, and the last one's motion in time.
-        told: One row per round.
+        round_records: One row per round.
     """
 
     grasp_model: GraspModel
@@ -138,7 +138,7 @@ class _Rounds:
     risks: list[Risk] = fresh(default_factory=list)
     passages: list[Passages] = fresh(default_factory=list)
     moving: MotionCheck | None = None
-    told: list[dict[str, Any]] = fresh(default_factory=list)
+    round_records: list[dict[str, Any]] = fresh(default_factory=list)
 
     def plan_once(self, ahead: Progress, is_last: bool) -> bool:
         """Plan and check; return whether the plan may be passed on. If not, samples were added."""
@@ -148,14 +148,14 @@ class _Rounds:
             return False
         planned, self.pair = perf_counter(), pair
         stopped = pair.certificate.stopped
-        if stopped:  # the best so far is checked all the same: else it could not be kept
+        if stopped:  # the best path so far is checked too: otherwise it could not be kept
             ahead, self.progress = ahead.to_the_end(), self.progress.to_the_end()
         plan = self.plan = self._solved(before, pair, ahead)
         is_last = is_last or stopped
         off = field_error(self.field, plan.solved)
         is_near = is_last or pair.stays or off <= self.settings.field_error / 100.0
         broken = self._broken(plan, is_near, ahead)
-        self.told.append({
+        self.round_records.append({
             "broken": broken, "sample_count": len(self.field.samples.poses),
             "margins": pair.margins, "field_energy_error": off,
             "plan_seconds": planned - began, "check_seconds": perf_counter() - planned})
@@ -181,7 +181,7 @@ class _Rounds:
                                self.planned_limits, asked=self.limits, asked_goal=self.goal,
                                before=self.pair, progress=ahead.part(0.0, 0.3))
         except NoWayError as none:
-            found = None if is_last else asked_in_doubt(
+            found = None if is_last else solved_if_undecided(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
                 ahead.part(0.3, 1.0))
             if found is None:
@@ -189,7 +189,7 @@ class _Rounds:
             self.passages.append(found)
             self.progress.warn(
                 f"{none.seen} The energy field's error makes this uncertain, so poses are added: "
-                f"{found.told}.")
+                f"{found.summary}.")
             self.field = refit(self.field, found.learnt)
             return None
 
@@ -210,10 +210,10 @@ class _Rounds:
                 self.field = refit(self.field, check.learnt)
                 return
             none = confirmed(none, check) if check.bears_out else not_confirmed(
-                self.limits, easiest_way(self.field, self.limits.on(self.field), self.start,
-                                         self.goal))
+                self.limits, easiest_path(self.field, self.limits.on(self.field), self.start,
+                                          self.goal))
         if self.passages:
-            none = said_after(none, len(self.passages), self.passages[-1].told)
+            none = with_added_poses(none, len(self.passages), self.passages[-1].summary)
         raise none
 
     def _solved(self, before: PathPair | None, pair: PathPair, ahead: Progress) -> ResolvedPath:
@@ -242,7 +242,7 @@ class _Rounds:
                 self.grasp_model, plan, self.limits, self.settings.confidence
             )
             self.risks.append(risk)
-            broken = risk.told()
+            broken = risk.exceeded_limits()
             self._tighten(risk.excess)
         if self.settings.inertia and not broken and is_near and self.limits.asked():
             limits = self.risks[-1].left(self.limits, plan) if self.risks else self.limits
@@ -272,7 +272,7 @@ class _Rounds:
         self.goal.require_end(self.grasp_model, plan.solved)
         summary = summary_of(self.field, self.goal, self.start, pair, baseline, plan,
                              self.settings)
-        summary |= {"rounds": self.told, "stopped": pair.certificate.stopped,
+        summary |= {"rounds": self.round_records, "stopped": pair.certificate.stopped,
                     **self.goal.describe_end(plan.solved)}
         if self.risks:
             summary["confidence"] = {

@@ -13,8 +13,8 @@ from limber.planning.field.energy_field import LOADS
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.guess import straight_on
 
-_APPROACH_STEP = 0.02  # [m] between poses on the way from rest to the start
-_MOST_UNSOLVED = 0.1  # share of a path's poses
+_APPROACH_STEP = 0.02  # [m] between poses on the path from rest to the start
+_MOST_UNSOLVED = 0.1  # fraction of a path's poses
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class SolvedPoses:
     def of(cls, grasp_model: GraspModel, results: list[StaticResult]) -> "SolvedPoses":
         """Return the states of solutions."""
         moved = [result.displacement for result in results]
-        strains, places, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
+        strains, positions, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
         return cls(
             poses=np.array([grasp_model.pose(u) for u in moved]),
             energies=np.array([grasp_model.energy(result) for result in results]),
             forces=np.array([result.reaction_force for result in results]),
             torques=np.array([result.reaction_torque for result in results]),
-            strains=np.array(strains), strain_places=np.array(places),
+            strains=np.array(strains), strain_places=np.array(positions),
             stresses=np.array(stresses),
             min_det_f=np.array([float(result.min_det_f) for result in results]),
             tips=np.array([grasp_model.tip(u) for u in moved]),

@@ -127,7 +127,7 @@ def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:
     return (" at most " + " and ".join(kept)) if kept else ""
 
 
-def no_way(problem: GentleProblem, proof: str) -> NoWayError:
+def no_path_error(problem: GentleProblem, proof: str) -> NoWayError:
     """Return the error for a goal that no path reaches, with the ``proof``."""
     counted = _in_words(problem, problem.sure_limits)
     if counted:

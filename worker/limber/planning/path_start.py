@@ -53,10 +53,10 @@ def check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> N
     """Raise InputError if the start [3] is not allowed, with the reason."""
     if allowed_points(start[None], limits)[0]:
         return
-    place = ", ".join(f"{value:.3f}" for value in start)
+    position = ", ".join(f"{value:.3f}" for value in start)
     if not field.region.contains(start)[0]:
         away = float(np.linalg.norm(start - field.rest))
-        raise InputError(f"The start ({place}) m lies outside the sampled region"
+        raise InputError(f"The start ({position}) m lies outside the sampled region"
                          f"{unit_uncertainty(away, field)}.",
                          "The branch's energy is not known there.",
                          "Choose a start nearer to rest, or sample farther (`limber energy "

@@ -246,9 +246,10 @@ class PlanFile:
     motion: Way | None
 
 
-def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
-           pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
-           field_energies: np.ndarray | None = None, phases: tuple[str, ...] | None = None) -> Way:
+def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
+                pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
+                field_energies: np.ndarray | None = None,
+                phases: tuple[str, ...] | None = None) -> Way:
     """Return the path of solved poses, as fast as ``pace`` allows, at standstill at ``stops``.
 
     Args:
@@ -273,8 +274,8 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
     back = np.arange(len(ahead.poses) - 1)[::-1]
     phases = (("approach",) * (len(ahead.poses) - on_path) + ("path",) * on_path
               + ("return",) * len(back))
-    return way_of(ahead.joined(ahead.take(back)), targets, pace=pace,
-                  stops=(len(ahead.poses) - 1,), phases=phases)
+    return path_record(ahead.joined(ahead.take(back)), targets, pace=pace,
+                       stops=(len(ahead.poses) - 1,), phases=phases)
 
 
 def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]:
@@ -323,13 +324,13 @@ def read_plan(path: Path) -> PlanFile:
         raise InputError(f"{path} is a plan in format {version}.",
                          f"This program reads formats 1 and {FORMAT}.", "Update Limber.")
     try:
-        ways = {name: _way(content[name]) for name in _WAYS}
-        motion = _way(content["motion"]) if version > 1 else None
+        paths = {name: _path_from(content[name]) for name in _WAYS}
+        motion = _path_from(content["motion"]) if version > 1 else None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _not_a_plan(path, f"{type(error).__name__}: {error}") from error
     checked_as(path, PlanSummary, content, "a plan", strict=True)
     kept = {name: value for name, value in content.items() if name != "motion"}
-    return PlanFile(version, kept, ways["baseline"], ways["plan"], motion)
+    return PlanFile(version, kept, paths["baseline"], paths["plan"], motion)
 
 
 def read_plan_summary(path: Path) -> dict[str, Any]:
@@ -343,14 +344,14 @@ def read_plan_summary(path: Path) -> dict[str, Any]:
     return content
 
 
-def _columns(way: Way) -> dict[str, Any]:
-    found = {column: getattr(way, name) for name, column in _COLUMNS.items()
-             if getattr(way, name) is not None}
-    found |= {"forces_n": way.forces, "targets_m": way.targets}
-    return found if way.phases is None else found | {"phases": way.phases}
+def _columns(path: Way) -> dict[str, Any]:
+    found = {column: getattr(path, name) for name, column in _COLUMNS.items()
+             if getattr(path, name) is not None}
+    found |= {"forces_n": path.forces, "targets_m": path.targets}
+    return found if path.phases is None else found | {"phases": path.phases}
 
 
-def _way(content: dict[str, Any]) -> Way:
+def _path_from(content: dict[str, Any]) -> Way:
     values = {name: number_array(content[column]) for name, column in _COLUMNS.items()
               if content.get(column) is not None}
     count = len(values["poses"])

@@ -17,8 +17,8 @@ from limber.planning.settings import PlanSettings
 from limber.planning.two_paths import PathPair
 
 _CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
-_STILL = 1e-9  # [m] a path that is no longer has no length
-_WIDE_GAP = 5.0  # percent, above which a warning says so
+_STILL = 1e-9  # [m] a path that is not longer has no length
+_WIDE_GAP = 5.0  # percent above which there is a warning
 _LONGER = 1.05  # a smoothed gentle path may be a little shorter than an unsmoothed RRT* path
 
 

@@ -43,8 +43,8 @@ class CostToGo:
 
         nearest = distance_transform_edt(np.isnan(self.costs), return_distances=False,
                                          return_indices=True)
-        places = ((points - self.origin) @ self.axes.T) / self.spacing - 0.5
-        return map_coordinates(self.costs[tuple(nearest)], places.T, order=1, cval=np.nan)
+        indices = ((points - self.origin) @ self.axes.T) / self.spacing - 0.5
+        return map_coordinates(self.costs[tuple(nearest)], indices.T, order=1, cval=np.nan)
 
     def write(self, path: Path) -> None:
         """Write it as plain arrays; -1 where it is not known."""

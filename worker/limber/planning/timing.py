@@ -13,8 +13,8 @@ import numpy as np
 
 from limber.core.numerics.rigid import rotations_at
 
-_SHARE = np.sqrt(0.5)  # of the acceleration, each along and across
-_PIECES = 16  # an edge is cut into, so that speeds change within it
+_SHARE = np.sqrt(0.5)  # fraction of the acceleration, along and across
+_PIECES = 16  # pieces of an edge, so that speed changes within it
 _STILL = 1e-9  # [m] below which two poses are one
 
 
@@ -123,21 +123,21 @@ def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
         if len(passed) < 2 or not here.any():
             found[here] = poses[first]
             continue
-        places, asked = knots[passed], np.clip(along[here], knots[first], knots[passed[-1]])
+        distances, asked = knots[passed], np.clip(along[here], knots[first], knots[passed[-1]])
         found[here, :3] = (
-            Akima1DInterpolator(places, poses[passed, :3], method="makima")(asked)
+            Akima1DInterpolator(distances, poses[passed, :3], method="makima")(asked)
             if len(passed) > 2 else poses[first, :3] + np.outer(
-                (asked - places[0]) / (places[1] - places[0]),
+                (asked - distances[0]) / (distances[1] - distances[0]),
                 poses[passed[1], :3] - poses[first, :3]))
-        found[here, 3:] = rotations_at(places, poses[passed, 3:], asked)
+        found[here, 3:] = rotations_at(distances, poses[passed, 3:], asked)
     return found
 
 
 def _at_corners(positions: np.ndarray, edges: np.ndarray, pace: Pace) -> np.ndarray:
     """Return the speed at each point that its curvature allows [m/s], shape [n]."""
     fastest = np.full(len(positions), pace.speed)
-    way = np.diff(positions, axis=0) / np.maximum(edges, 1e-12)[:, None]
-    turn = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    direction = np.diff(positions, axis=0) / np.maximum(edges, 1e-12)[:, None]
+    turn = np.linalg.norm(np.diff(direction, axis=0), axis=1)
     curvature = turn / np.maximum(0.5 * (edges[1:] + edges[:-1]), 1e-12)
     with np.errstate(divide="ignore"):
         fastest[1:-1] = np.minimum(pace.speed, np.sqrt(_SHARE * pace.acceleration / curvature))

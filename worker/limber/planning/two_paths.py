@@ -32,12 +32,12 @@ from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
 from limber.planning.settings import PlanSettings
 
-_SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
-_AT_START = 1e-4  # [m] the approach ends that near
+_SHARES = (1.0, 0.5, 0.2)  # fractions of the margins that are tried
+_AT_START = 1e-4  # [m] distance at which the approach ends
 NOTHING_ASKED = "none"
 """The engine of paths that stay where they are."""
-_FEW_CELLS = 30_000  # a limit that is far too low is proven with them, in a second or two
-_ANY = 1e6  # gap: any path will do
+_FEW_CELLS = 30_000  # they prove in a second or two that a limit is far too low
+_ANY = 1e6  # gap: any path suffices
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     """
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
-    _check_any_way(field, start, goal, limits, asked or limits)
+    _check_any_path(field, start, goal, limits, asked or limits)
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
@@ -106,7 +106,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
             if isinstance(error, NoWayError) and error.is_proven:
                 raise  # by the limits and the field's error alone: without margins as well
             progress.warn("No path keeps the limits with margins for the energy field's error "
-                          f"({_told(part)}). The path is planned without margins. The full "
+                          f"({_margin_text(part)}). The path is planned without margins. The full "
                           "model decides whether it is allowed.")
     try:
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
@@ -118,8 +118,8 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     return replace(found, margins=none)
 
 
-def _check_any_way(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
-                   asked: Limits) -> None:
+def _check_any_path(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
+                    asked: Limits) -> None:
     """Raise NoWayError if cells prove at once that no path keeps the limits, before any search for
     one.
     """
@@ -152,8 +152,8 @@ def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goa
         raise none
     options["progress"].warn(
         "No path keeps the limits on the energy field, but one may exist. The path is planned "
-        f"with limits extended by the field's error ({_told(doubts)}). The full model decides "
-        "whether it is allowed.")
+        f"with limits extended by the field's error ({_margin_text(doubts)}). The full model "
+        "decides whether it is allowed.")
     try:
         return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
                          **options)
@@ -161,7 +161,7 @@ def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goa
         raise none from None
 
 
-def _told(margins: dict[str, float]) -> str:
+def _margin_text(margins: dict[str, float]) -> str:
     return ", ".join(f"{name.replace('_', ' ')} " + (
         f"{value:.2g} {UNITS.get(name, '')}".rstrip() if value < np.inf else "not known")
         for name, value in margins.items() if value)
@@ -323,19 +323,19 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
         return field.rest[None]
     cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
                                deformation=max(settings.deformation_weight, 1.0))
-    there = near(start, _AT_START)
-    way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there,
-                        beyond=problem.beyond, errors=problem.errors)
+    goal = near(start, _AT_START)
+    path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
+                         beyond=problem.beyond, errors=problem.errors)
     line = np.linspace(field.rest, start, 40)
-    points, least = refine(line, way)
+    points, least = refine(line, path)
     if not np.isfinite(least):
         try:
             rough = plan_path(PathProblem(
                 field, problem.limits, cost.weights, field.rest, near(start, 1e-9),
                 goals=start[None]), Search(iterations=1500, seed=settings.seed)).points
-            points, _ = refine(rough, way)
+            points, _ = refine(rough, path)
         except NoPathError:
             # A tree that misses a narrow passage is not conclusive: the grid finds it, or states
             # why not.
-            points = plan_gentle(way, enough=_ANY).points
+            points = plan_gentle(path, enough=_ANY).points
     return np.concatenate([points, start[None]])

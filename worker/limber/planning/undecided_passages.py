@@ -15,42 +15,42 @@ from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path
 from limber.planning.path_problem import NoWayError
-from limber.planning.planners.easiest import easiest_way
+from limber.planning.planners.easiest import easiest_path
 
 
 @dataclass(frozen=True)
 class Passages:
     """The easiest path to the goal on the full model: the states ``learnt`` there, and in words
-    ``told`` what it takes.
+    ``summary`` what it takes.
     """
 
     learnt: GraspSamples
-    told: str
+    summary: str
 
 
-def asked_in_doubt(field: EnergyField, grasp_model: GraspModel, start: np.ndarray, goal: Goal,
-                   limits: Limits, progress: Progress = SILENT) -> Passages | None:
+def solved_if_undecided(field: EnergyField, grasp_model: GraspModel, start: np.ndarray, goal: Goal,
+                        limits: Limits, progress: Progress = SILENT) -> Passages | None:
     """Solve the branch along the path that exceeds the limits least; None if the field's error
     leaves no doubt that it exceeds them, or nothing new can be learnt there.
     """
-    way = easiest_way(field, limits.on(field), start, goal)
+    path = easiest_path(field, limits.on(field), start, goal)
     asked, margins = limits.asked(), limits.margins(field)
     reserve = max((margins[name] / limit for name, limit in asked.items()), default=0.0)
-    if way is None or way.worst > 1.0 + reserve:
+    if path is None or path.worst > 1.0 + reserve:
         return None
     approach = field.rest[None]
     if np.linalg.norm(start - field.rest) >= STEP:
-        there = easiest_way(field, limits.on(field), field.rest.copy(),
-                            near(start, STEP))
-        approach = approach if there is None else np.concatenate([there.points, start[None]])
-    solved = resolve_path(grasp_model, resample(way.points, STEP), approach, progress)
+        to_start = easiest_path(field, limits.on(field), field.rest.copy(),
+                                near(start, STEP))
+        approach = approach if to_start is None else np.concatenate([to_start.points, start[None]])
+    solved = resolve_path(grasp_model, resample(path.points, STEP), approach, progress)
     found = learnt(field, grasp_model, solved, limits)
     if not len(found.poses) and not len(found.rejected_poses):
         return None
-    return Passages(found, _told(solved, limits))
+    return Passages(found, _demand_text(solved, limits))
 
 
-def _told(solved: ResolvedPath, limits: Limits) -> str:
+def _demand_text(solved: ResolvedPath, limits: Limits) -> str:
     if not solved.is_whole:
         return "the branch cannot follow the easiest path on the full model"
     values = sizes(solved.solved)
@@ -60,13 +60,13 @@ def _told(solved: ResolvedPath, limits: Limits) -> str:
         return "the easiest path was solved on the full model"
     name = max(shares, key=shares.__getitem__)
     peak = int(values[name].argmax())
-    place = ", ".join(f"{x:.3f}" for x in solved.solved.poses[peak, :3])
+    position = ", ".join(f"{x:.3f}" for x in solved.solved.poses[peak, :3])
     return (f"on the full model the easiest path needs a {name.replace('_', ' ')} of "
-            f"{values[name][peak]:.3g} {UNITS[name]}".rstrip() + f", at ({place}) m")
+            f"{values[name][peak]:.3g} {UNITS[name]}".rstrip() + f", at ({position}) m")
 
 
-def said_after(none: NoWayError, asked: int, told: str) -> NoWayError:
+def with_added_poses(none: NoWayError, count: int, summary: str) -> NoWayError:
     """Return the error, stating which poses were solved on the full model before."""
-    times = "once" if asked == 1 else f"{asked} times"
+    times = "once" if count == 1 else f"{count} times"
     return NoWayError(none.seen, f"{none.why} The field's error made this uncertain, so poses "
-                      f"were added {times}: {told}.", none.fix)
+                      f"were added {times}: {summary}.", none.fix)

@@ -117,7 +117,7 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
     messages = list(warnings)
     moved, force = _in_range(np.asarray(displacement, float), np.asarray(force, float), messages)
     moved, force = _oriented(moved, force, messages)
-    out, back = _ways(moved)
+    out, back = _strokes(moved)
     x, y = _sorted(moved[out], force[out])
     contact, baseline, obstacle = _first_contact(x, y)
     loaded = (x > contact) & (y > baseline + NOISE_FLOOR_N) & (x <= obstacle)
@@ -163,14 +163,14 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
         warnings=tuple(messages))
 
 
-def _column(table: Table, name: str, units: dict[str, float], given: str | None,
+def _column(table: Table, name: str, units: dict[str, float], requested: str | None,
             ) -> tuple[int, float]:
     for index, text in enumerate(table.titles):
         title = split_title(text)
         if not re.search(name, title.name, re.IGNORECASE):
             continue
-        if given is not None:
-            return index, units[given]
+        if requested is not None:
+            return index, units[requested]
         if title.unit is None:
             raise InputError(
                 f"{table.path}: the column {text!r} does not state a unit. Known units: "
@@ -190,7 +190,7 @@ def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
     if limited.any() and limited.sum() < 0.8 * len(force):
         messages.append(f"{int(limited.sum())} readings at {np.abs(force[limited]).max():.3g} N "
                         "are identical: the load cell is saturated there. They were discarded, at "
-                        f"{_shown_places(moved[limited])}.")
+                        f"{_position_text(moved[limited])}.")
         moved, force = moved[~limited], force[~limited]
     # One sample far from both neighbours, on the same side. After a slip readings stay at the new
     # level.
@@ -201,16 +201,16 @@ def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
         np.zeros(len(force), bool))
     if stray.any():
         messages.append(f"{int(stray.sum())} spike(s) in the force were discarded, at "
-                        f"{_shown_places(moved[stray])}.")
+                        f"{_position_text(moved[stray])}.")
     return moved[~stray], force[~stray]
 
 
-def _shown_places(moved: np.ndarray) -> str:
+def _position_text(moved: np.ndarray) -> str:
     """Displacements [m] of samples in words."""
-    places = [f"{value * 1e3:.1f}" for value in np.sort(moved)]
-    if len(places) > 8:
-        return f"{places[0]} to {places[-1]} mm"
-    return f"{', '.join(places)} mm"
+    positions = [f"{value * 1e3:.1f}" for value in np.sort(moved)]
+    if len(positions) > 8:
+        return f"{positions[0]} to {positions[-1]} mm"
+    return f"{', '.join(positions)} mm"
 
 
 def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
@@ -232,7 +232,7 @@ def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
     return moved, force
 
 
-def _ways(moved: np.ndarray) -> tuple[slice, slice]:
+def _strokes(moved: np.ndarray) -> tuple[slice, slice]:
     """The outward path, up to the farthest sample, and the return path."""
     far = int(np.argmax(moved))
     # A hold at the end is no return path.
@@ -275,20 +275,20 @@ def _return(moved: np.ndarray, force: np.ndarray, moved_out: np.ndarray, force_o
         over = np.maximum(y - baseline, 0.0)
         shared = x >= max(contact, moved.min())
         return float(np.sum((over[shared][1:] + over[shared][:-1]) / 2 * np.diff(x[shared])))
-    given = work(moved_out, force_out)
-    return slope, float(1 - work(moved, force) / given) if given > 0 else None
+    outward = work(moved_out, force_out)
+    return slope, float(1 - work(moved, force) / outward) if outward > 0 else None
 
 
 def _contact(moved: np.ndarray, force: np.ndarray) -> tuple[float, float]:
     """Displacement and reading at the bend of constant-then-quadratic, by search over samples."""
     best = (np.inf, moved[0], force[0])
-    for place in moved[: max(len(moved) - 4, 1)]:
-        beyond = np.maximum(moved - place, 0.0)
+    for position in moved[: max(len(moved) - 4, 1)]:
+        beyond = np.maximum(moved - position, 0.0)
         features = np.column_stack([np.ones(len(moved)), beyond, beyond**2])
         solved, *_ = np.linalg.lstsq(features, force, rcond=None)
         cost = np.sum((force - features @ solved)**2)
         if cost < best[0]:
-            best = (cost, place, solved[0])
+            best = (cost, position, solved[0])
     return best[1], best[2]
 
 

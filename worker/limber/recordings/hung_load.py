@@ -137,8 +137,8 @@ def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]
         last = _mean(seen.positions[-max(len(seen.times) // 20, 3):])
         return _mean(seen.positions[:_still_frames(seen.positions, last, noise)]), noise
     last = seen.positions[-max(len(seen.times) // 10, 5):]
-    way = np.nanmax(np.ptp(seen.positions[:, whole], axis=0))
-    if np.nanmax(np.ptp(last[:, whole], axis=0)) > 0.05 * way + 6 * noise:
+    travel = np.nanmax(np.ptp(seen.positions[:, whole], axis=0))
+    if np.nanmax(np.ptp(last[:, whole], axis=0)) > 0.05 * travel + 6 * noise:
         raise InputError(f"{name}: the recording ends while the branch still swings.",
                          "Its rest position without the load is not known then.",
                          "Record until the branch has settled.")
@@ -191,11 +191,11 @@ def _settled_frame(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noi
 def _course(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noise: float,
             ) -> tuple[np.ndarray, float]:
     """Return the progress of all markers from rest, 0, to end, 1, shape [t], and its deviation."""
-    way = end - rest
-    whole = np.isfinite(way).all(axis=1)
-    length = float(np.linalg.norm(way[whole])) or noise
+    vector = end - rest
+    whole = np.isfinite(vector).all(axis=1)
+    length = float(np.linalg.norm(vector[whole])) or noise
     off = np.where(np.isfinite(positions), positions - rest, 0.0)[:, whole]
-    return np.einsum("tma,ma->t", off, way[whole]) / length**2, noise / length
+    return np.einsum("tma,ma->t", off, vector[whole]) / length**2, noise / length
 
 
 def _smoothed(course: np.ndarray, width: int) -> np.ndarray:

@@ -103,8 +103,8 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
     """
     present, warnings = _depth_images(source, settings)
     camera = _camera(source, present[0][1])
-    camera, told = _placed(camera, source, present[0][0], present[-1][0])
-    warnings += told
+    camera, messages = _placed(camera, source, present[0][0], present[-1][0])
+    warnings += messages
     write_camera(folder / "camera.toml", camera)
     masks = _masks(source, [stamp for stamp, _ in present], settings)
     (folder / "depth").mkdir(parents=True, exist_ok=True)
@@ -115,10 +115,10 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
             _write_mask(masks[index], folder / "mask" / f"{stamp:.6f}.png")
     if (source / "background.png").is_file():
         shutil.copyfile(source / "background.png", folder / "background.png")
-    given = sum(mask is not None for mask in masks)
-    if 0 < given < len(present):
-        warnings.append(f"{len(present) - given} of {len(present)} frames have no mask. In those "
-                        "frames the branch is segmented by depth alone.")
+    mask_count = sum(mask is not None for mask in masks)
+    if 0 < mask_count < len(present):
+        warnings.append(f"{len(present) - mask_count} of {len(present)} frames have no mask. In "
+                        "those frames the branch is segmented by depth alone.")
     return warnings
 
 
@@ -280,12 +280,12 @@ def _masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
     return [_nearest(listed, stamp, stamps) for stamp in stamps]
 
 
-def _nearest(listed: list[tuple[float, Path]], wanted: float, stamps: list[float],
+def _nearest(listed: list[tuple[float, Path]], target: float, stamps: list[float],
              ) -> Path | None:
     """The file nearest in time, if it is nearer than half a frame."""
-    stamp, file = min(listed, key=lambda entry: abs(entry[0] - wanted))
+    stamp, file = min(listed, key=lambda entry: abs(entry[0] - target))
     reach = 0.5 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
-    return file if abs(stamp - wanted) <= reach and file.is_file() else None
+    return file if abs(stamp - target) <= reach and file.is_file() else None
 
 
 def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:

@@ -239,8 +239,8 @@ def _checked(content: dict[str, Any], where: str) -> PullEntry:
         return validated(PullEntry, content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{where}: {place}: {first['msg']}.",
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{where}: {key}: {first['msg']}.",
                          "The pull cannot be read without a valid entry.",
                          "Correct the entry.") from error
 

@@ -65,8 +65,8 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
             raise ValueError("its first line does not have three columns of positions")
         scale = [scale_of(title, LENGTH_UNITS_M, "m", path) for title in titles]
         labels = [row[0] for row in rows[1:]]
-        places = np.array([[float(part) for part in row[1:4]] for row in rows[1:]])
-        if places.shape != (len(labels), 3) or not np.isfinite(places).all():
+        points = np.array([[float(part) for part in row[1:4]] for row in rows[1:]])
+        if points.shape != (len(labels), 3) or not np.isfinite(points).all():
             raise ValueError("each marker needs three numbers")
         if doubled := [label for label, count in Counter(labels).items() if count > 1]:
             raise ValueError(f"{doubled[0]!r} has several rows")
@@ -75,7 +75,7 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
                          "The first line must be label,x_m,y_m,z_m. Each further line is one "
                          "marker.",
                          "Correct the file.") from error
-    return labels, places * scale
+    return labels, points * scale
 
 
 def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
@@ -101,8 +101,8 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
              if same_label(label, known) and np.isfinite(points[k]).all()]
     messages = []
     if len(pairs) < 3 and len(labels) == len(nominal_labels) and np.isfinite(points).all():
-        pairs, told = _paired_by_fit(points, nominal)
-        messages.append(f"{name}: the markers' names do not match the nominal names; {told}.")
+        pairs, pairing = _paired_by_fit(points, nominal)
+        messages.append(f"{name}: the markers' names do not match the nominal names; {pairing}.")
     if len(pairs) < 3:
         raise InputError(
             f"{name}: the recording has the markers {', '.join(labels)}. Nominal positions are "
@@ -205,12 +205,12 @@ def _consistent(points: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _paired_by_fit(points: np.ndarray, nominal: np.ndarray) -> tuple[list[tuple[int, int]], str]:
     order = tuple(range(len(points)))
     rms = float(np.sqrt(np.mean(_residuals(points, nominal)**2)))
-    told = "they were paired in order"
+    pairing = "they were paired in order"
     if rms > POOR_FIT_M and len(points) <= _MOST_FOR_PERMUTATION:
         found = min(permutations(order), key=lambda p: float(
             np.sum(_residuals(points, nominal[list(p)])**2)))
         better = float(np.sqrt(np.mean(_residuals(points, nominal[list(found)])**2)))
         if better < rms / 3:
             order, rms = found, better
-            told = "they were paired by the best fit"
-    return [(k, order[k]) for k in range(len(points))], f"{told} ({rms * 1e3:.1f} mm RMS)"
+            pairing = "they were paired by the best fit"
+    return [(k, order[k]) for k in range(len(points))], f"{pairing} ({rms * 1e3:.1f} mm RMS)"

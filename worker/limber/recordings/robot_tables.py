@@ -87,8 +87,8 @@ def _known(titles: list[Title]) -> list[Title]:
     if {"tx", "ty", "tz", "qx", "qy", "qz", "qw"} <= set(plain) and not (
             set(_ALIASES["x_m"]) & set(plain)):
         # TUM's translation; without a quaternion it is a torque.
-        places = {f"t{a}": f"p{a}" for a in "xyz"}
-        return [Title(places.get(title.plain, title.name), title.unit) for title in titles]
+        positions = {f"t{a}": f"p{a}" for a in "xyz"}
+        return [Title(positions.get(title.plain, title.name), title.unit) for title in titles]
     renamed = list(titles)
     for name, aliases in _ALIASES.items():
         end = _IN_TOPICS.get(name)
@@ -96,10 +96,10 @@ def _known(titles: list[Title]) -> list[Title]:
             at = next((k for k, letters in enumerate(plain) if letters.endswith(end)), None)
             if at is not None:
                 renamed[at] = Title(aliases[0], titles[at].unit)
-    for ours, end in _QUATERNION.items():
+    for part, end in _QUATERNION.items():
         at = next((k for k, letters in enumerate(plain) if letters.endswith(end)), None)
-        if at is not None and ours not in plain:
-            renamed[at] = Title(ours, None)
+        if at is not None and part not in plain:
+            renamed[at] = Title(part, None)
     return renamed
 
 

@@ -128,18 +128,18 @@ def _quadratic_features(poses: np.ndarray) -> np.ndarray:
     return np.column_stack([np.ones(len(poses)), along, *pairs])
 
 
-def _mean_wrenches(pull: Pull, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mean_wrenches(pull: Pull, at_times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     measured = np.isfinite(pull.wrenches[:, :3]).all(axis=1)
-    wrenches = np.full((len(wanted), 6), np.nan)
-    counts = np.zeros(len(wanted), int)
+    wrenches = np.full((len(at_times), 6), np.nan)
+    counts = np.zeros(len(at_times), int)
     if not measured.any():
         return wrenches, counts
     times, values = pull.times[measured], pull.wrenches[measured]
     unknown = ~np.isfinite(values).all(axis=0)
     values = np.nan_to_num(values)
-    half = 0.5 * np.median(np.diff(wanted)) if len(wanted) > 1 else 0.0
+    half = 0.5 * np.median(np.diff(at_times)) if len(at_times) > 1 else 0.0
     step = np.median(np.diff(pull.times))
-    for row, moment in enumerate(wanted):
+    for row, moment in enumerate(at_times):
         near = np.flatnonzero(np.abs(times - moment) <= half)
         if half > 2 * step and len(near) > 2:
             # A mean over a window about the instant is unbiased for values that vary linearly in

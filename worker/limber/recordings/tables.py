@@ -233,8 +233,8 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     """
     table = read_table(path)
     stream = time_stream(table, rate_hz)
-    places = _places(stream.columns)
-    whole = {label: at for label, at in places.items() if set(at) == set("xyz")}
+    columns = _column_indices(stream.columns)
+    whole = {label: at for label, at in columns.items() if set(at) == set("xyz")}
     if not whole:
         raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
                          "No marker has x, y and z columns.",
@@ -243,8 +243,8 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     scales = [LENGTH_UNITS_M[unit] if unit else
               scale_of(split_title(stream.columns[k]), LENGTH_UNITS_M, table.unit or "m",
                        Path(path)) for k in used]
-    halves = [k for label, at in places.items() if label not in whole for k in at.values()]
-    named = {k for at in places.values() for k in at.values()}
+    halves = [k for label, at in columns.items() if label not in whole for k in at.values()]
+    named = {k for at in columns.values() for k in at.values()}
     ignored = [title for k, title in enumerate(stream.columns) if k not in named]
     ignored += [stream.columns[k] for k in halves]
     warnings = list(stream.warnings)
@@ -256,15 +256,15 @@ def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | No
     return marker_tracks(stream.times, positions, warnings), list(whole)
 
 
-def _places(titles: Sequence[str]) -> dict[str, dict[str, int]]:
+def _column_indices(titles: Sequence[str]) -> dict[str, dict[str, int]]:
     """The columns of each marker's coordinates, by its label and by x, y and z."""
-    places: dict[str, dict[str, int]] = {}
+    indices: dict[str, dict[str, int]] = {}
     for column, title in enumerate(titles):
         name = split_title(title).name
         match = re.fullmatch(r"(.*?)[\s_.:\-]*([xyz])", name, re.IGNORECASE)
         if match and not re.search(r"rot|quat|angle", name, re.IGNORECASE):
-            places.setdefault(match.group(1).strip() or "m0", {})[match.group(2).lower()] = column
-    return places
+            indices.setdefault(match.group(1).strip() or "m0", {})[match.group(2).lower()] = column
+    return indices
 
 
 def marker_tracks(times: np.ndarray, positions: np.ndarray, warnings: Sequence[str] = (),

@@ -108,11 +108,11 @@ def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> 
     padded = np.pad(values, ((half_window, half_window), (0, 0)), mode="reflect",
                     reflect_type="odd")
     windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=0)
-    place = np.arange(width) - half_window
+    offset = np.arange(width) - half_window
     first, second = np.triu_indices(width, 1)
     slope = np.median((windows[..., second] - windows[..., first])
-                      / (place[second] - place[first]), axis=2)
-    expected = np.median(windows - slope[..., None] * place, axis=2)
+                      / (offset[second] - offset[first]), axis=2)
+    expected = np.median(windows - slope[..., None] * offset, axis=2)
     residual = np.abs(values - expected)
     # One scale for all axes: a sensor's noise is similar in all of them, and an axis that hardly
     # moves does not show it.

@@ -137,23 +137,23 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     values, vectors = np.linalg.eigh((gram + gram.T) / 2)
     values, vectors = values[::-1], vectors[:, ::-1]
     available = int(np.count_nonzero(values > 1e-12 * values[0]))
-    wanted = min(size - count - vibration_count, available)
-    if wanted <= 0:
+    count_left = min(size - count - vibration_count, available)
+    if count_left <= 0:
         raise InputError(f"The reduced model has {size} coordinates.",
                          f"The grasp needs {count} of them and vibrations need {vibration_count}; "
                          f"{len(snapshots)} snapshots provide {available}.",
                          "Use more training grasps, or a larger model.")
-    modes = np.tensordot(vectors[:, :wanted] / np.sqrt(values[:wanted]), columns, (0, 0))
-    own = heavy[:len(rest)].reshape(len(rest), -1) @ modes.reshape(wanted, -1).T
+    modes = np.tensordot(vectors[:, :count_left] / np.sqrt(values[:count_left]), columns, (0, 0))
+    own = heavy[:len(rest)].reshape(len(rest), -1) @ modes.reshape(count_left, -1).T
     vibrations = _let_go(grasp, lifts, snapshots.vibrations.astype(float))
     beside = _beside(metric, modes, vibrations, vibration_count)
     states = np.hstack([held, own, np.zeros((len(held), len(beside)))])
     flat = heavy.reshape(len(columns), -1)[len(columns) - len(swung):]
-    swinging = flat @ modes.reshape(wanted, -1).T / SWING_SHARE
+    swinging = flat @ modes.reshape(count_left, -1).T / SWING_SHARE
     reach = np.abs(states).max(axis=0)
-    reach[count:count + wanted] = np.abs(np.vstack([own, swinging])).max(axis=0)
+    reach[count:count + count_left] = np.abs(np.vstack([own, swinging])).max(axis=0)
     return Basis(np.concatenate([lifts, modes, beside]), count, states,
-                 float(values[:wanted].sum() / values[values > 0].sum()), reach)
+                 float(values[:count_left].sum() / values[values > 0].sum()), reach)
 
 
 def _let_go(grasp: Grasp, lifts: np.ndarray, fields: np.ndarray) -> np.ndarray:

@@ -77,7 +77,7 @@ class ReducedCache:
     def __init__(self, folder: Path, *, limit_bytes: int = LIMIT_BYTES,
                  progress: Progress = SILENT):
         self.folder, self.limit_bytes, self._progress = Path(folder), limit_bytes, progress
-        self._is_told = False
+        self._is_reported = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -85,8 +85,8 @@ class ReducedCache:
 
     def tell(self, error: OSError) -> None:
         """Warn, once, that models cannot be kept."""
-        if not self._is_told:
-            self._is_told = True
+        if not self._is_reported:
+            self._is_reported = True
             self._progress.warn(f"Reduced models cannot be stored in {self.folder} "
                                 f"({error.strerror or error}). They are trained again each time.")
 
@@ -114,7 +114,7 @@ class ReducedCache:
                 path.unlink()
             return None
         with contextlib.suppress(OSError):
-            os.utime(path)  # used now: others go before it
+            os.utime(path)  # used now: others are evicted before it
         return found
 
     def store(self, key: str, reduced: ReducedModel, snapshots: Snapshots) -> Path:
@@ -154,7 +154,7 @@ class ReducedCache:
     def _make_room(self, newest: Path) -> None:
         now, models = time.time(), []
         for path in self.folder.iterdir():
-            with contextlib.suppress(OSError):  # another process may just have removed it
+            with contextlib.suppress(OSError):  # another process may have just removed it
                 about = path.stat()
                 if path.suffix == ".npz" and path != newest:
                     models.append((about.st_mtime, about.st_size, path))
@@ -203,7 +203,7 @@ def learnt_model(model: BranchModel, grasp: Grasp, weights: np.ndarray,
             return LearntModel(*known, was_known=True)
         try:
             with cache.learning(key):
-                known = cache.load(key)  # the one that was waited for
+                known = cache.load(key)  # the one that another process made
                 if known is not None:
                     return LearntModel(*known, was_known=True)
                 made = build_reduced(model, grasp, weights, control_young, settings, progress)

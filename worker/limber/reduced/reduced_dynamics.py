@@ -110,9 +110,9 @@ class ReducedStepper:
         by_mass = 1 / (settings.beta * step**2)
         # Without the acceleration: that of the stiff coordinates swings from step to step.
         q = old.coordinates + step * old.velocity
-        way = held - q[:count]
-        jump: np.ndarray | None = way
-        if not foresee or np.abs(way).max() <= _JUMP * model.extent:
+        shift = held - q[:count]
+        jump: np.ndarray | None = shift
+        if not foresee or np.abs(shift).max() <= _JUMP * model.extent:
             q[:count], jump = held, None
         viscous, massive = model.damping.stiffness, model.damping.mass
         mass_part = (by_mass + massive * by_rate) * model.mass[free, free]

@@ -219,7 +219,7 @@ class ReducedModel:
                                  settings.iteration_limit - iterations)
             iterations += found.iterations
             if best is not None and found.agrees(best):
-                break  # the same from two starts: unusual, but no accident of the way there
+                break  # equal from two starts: unusual, but no accident of the path
             if best is None or (found.ranking(settings) < best.ranking(settings)):
                 best = found
             if ((best.converged and best.novelty < settings.novelty_limit)
@@ -259,8 +259,8 @@ class ReducedModel:
             step /= 2
             if step < 0.5**settings.max_halvings:
                 return None
-        place = self.grasp.centre + q[:count]
-        return self.followed(q, np.concatenate([place, np.zeros(3)]), settings)
+        position = self.grasp.centre + q[:count]
+        return self.followed(q, np.concatenate([position, np.zeros(3)]), settings)
 
     def sensitivities(self, state: ReducedState) -> ReducedSensitivities:
         """Differentiate a converged state to log Young's modulus at each control point."""
@@ -401,7 +401,7 @@ class _Found:
     novelty: float
     iterations: int
     potential: float
-    steady: bool = False  # every tangent on the way was positive definite
+    steady: bool = False  # every tangent along the path was positive definite
 
     def agrees(self, other: "_Found") -> bool:
         """Whether both are the same equilibrium."""

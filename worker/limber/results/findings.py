@@ -50,15 +50,15 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
         assumed: What the reader must know first; empty for a real pull.
     """
     intervals = estimate.get("young_interval_pa") or [None] * len(estimate["young_pa"])
-    told = [_with_interval(young, interval) for young, interval in zip(
+    values = [_with_interval(young, interval) for young, interval in zip(
         estimate["young_pa"], intervals, strict=True)]
-    if len(told) > _MOST_NAMED:
-        order = sorted(range(len(told)), key=lambda k: estimate["young_pa"][k])
-        told = [told[order[0]], told[order[-1]]]
+    if len(values) > _MOST_NAMED:
+        order = sorted(range(len(values)), key=lambda k: estimate["young_pa"][k])
+        values = [values[order[0]], values[order[-1]]]
         words = "between the lowest and the highest control point"
     else:
         words = "from base to tip"
-    return (f"Young's modulus {words}: {', '.join(told)} MPa (95 % intervals"
+    return (f"Young's modulus {words}: {', '.join(values)} MPa (95 % intervals"
             f"{f'; {assumed}' if assumed else ''}).")
 
 
@@ -74,14 +74,14 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
         parts.append(f"stores at most {1e3 * gentle['peak_energy_j']:.3g} mJ")
     if gentle.get("peak_force_n") is not None:
         parts.append(f"needs at most {gentle['peak_force_n']:.3g} N")
-    told = "The gentle path " + _listed(parts)
+    sentence = "The gentle path " + _listed(parts)
     saved, added = plan.get("energy_saved_percent"), plan.get("length_added_percent")
     if saved is None or added is None:
-        return f"{told}."
+        return f"{sentence}."
     if max(abs(saved), abs(added)) < SAME:
-        return f"{told}; no shorter one was found."
-    return (f"{told}; it saves {saved:.3g} % of the shortest path's energy for {added:+.2g} % of "
-            "length.")
+        return f"{sentence}; no shorter one was found."
+    return (f"{sentence}; it saves {saved:.3g} % of the shortest path's energy for {added:+.2g} % "
+            "of length.")
 
 
 def certificate_sentence(plan: Mapping[str, Any]) -> str:
@@ -108,13 +108,13 @@ def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:
     """
     found = {}
     for key, over in (("peak_force_n", _over_arm), ("peak_strain", _over_wood)):
-        told: dict[str, list[str]] = {}
+        remarks: dict[str, list[str]] = {}
         for path, name in PATH_NAMES.items():
             if (plan.get(path) or {}).get(key) is not None and (words := over(path, plan)):
-                told.setdefault(words, []).append(name)
-        if told:
+                remarks.setdefault(words, []).append(name)
+        if remarks:
             found[key] = "; ".join(f"{' and '.join(names)}: {words}"
-                                   for words, names in told.items())
+                                   for words, names in remarks.items())
     return found
 
 

@@ -20,8 +20,8 @@ from limber.robot.ur.factory_calibration import FactoryCalibration
 _FEWEST = 3
 _FIRST_READING_SECONDS = 0.2
 _BEFORE_MOTION_SECONDS = 0.1
-_NOISE = 10.0  # times what the cell states: more is touching, shaking, or another unit
-_STILL = 1e-6  # N: a living sensor's noise never repeats so
+_NOISE = 10.0  # times the stated noise; more is contact, vibration or another unit
+_STILL = 1e-6  # N: a working sensor's noise never repeats so closely
 
 
 @dataclass(frozen=True)
@@ -84,22 +84,23 @@ class Observed:
         if not np.isfinite(self.readings).all():
             return ["the sensor sends readings that are no numbers"]
         sensor, spread = cell.sensor, self.readings.std(axis=0)
-        told = []
+        warnings = []
         if spread.max() < _STILL:
-            told.append("the sensor repeats one reading: it is frozen or not connected")
+            warnings.append("the sensor repeats one reading: it is frozen or not connected")
         for name, part, stated, unit in (("force", slice(0, 3), sensor.force_sigma_n, "N"),
                                          ("torque", slice(3, 6), sensor.torque_sigma_nm, "N m")):
             if (worst := float(spread[part].max())) > _NOISE * stated:
-                told.append(f"the {name} varies by {worst:.2g} {unit} while the arm stands, the "
-                            f"cell file states {stated:.2g} {unit}: the gripper is touched, or "
-                            "the unit differs")
+                warnings.append(f"the {name} varies by {worst:.2g} {unit} while the arm stands, "
+                                "the "
+                                f"cell file states {stated:.2g} {unit}: the gripper is touched, or "
+                                "the unit differs")
         for name, part, most, unit in (
                 ("force", slice(0, 3), sensor.force_range_n, "N"),
                 ("torque", slice(3, 6), sensor.torque_range_nm, "N m")):
             if (worst := float(np.abs(self.readings[:, part]).max())) >= 0.999 * most:
-                told.append(f"the {name} of {worst:.3g} {unit} is at the end of the sensor's range "
-                            f"({most:g} {unit})")
-        return told
+                warnings.append(f"the {name} of {worst:.3g} {unit} is at the end of the sensor's "
+                                f"range ({most:g} {unit})")
+        return warnings
 
 
 def observe(cell: Cell, seconds: float) -> Observed:
@@ -139,8 +140,8 @@ def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
         raise SafetyStop("A program is running on the controller.",
                          "Limber's own program would end it, wherever it is.",
                          "Stop it on the pendant.")
-    if told := seen.implausible(cell):
-        raise SafetyStop(f"The force sensor cannot be right: {'; '.join(told)}.",
+    if warnings := seen.implausible(cell):
+        raise SafetyStop(f"The force sensor cannot be right: {'; '.join(warnings)}.",
                          "The guard would not feel the branch.",
                          "Check the sensor and the cell's [sensor] entries with `limber robot "
                          "check`.")

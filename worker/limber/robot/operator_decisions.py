@@ -58,38 +58,40 @@ def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: 
         typed = input("The robot has stopped. Type retreat to return along the same path; "
                       "anything else holds: ")
         choice = "retreat" if typed.strip() == "retreat" else "hold"
-    told: dict[str, Any] = {"choice": "hold", "retreated": False, "gripper_opened": False}
+    decision: dict[str, Any] = {"choice": "hold", "retreated": False, "gripper_opened": False}
     if choice != "retreat":
-        told |= {"force_n": _force_left(link)}
-        return told | {"outcome": f"The arm holds where it stopped; {_left(told['force_n'])}."}
+        decision |= {"force_n": _force_left(link)}
+        return decision | {"outcome":
+                           f"The arm holds where it stopped; {_left(decision['force_n'])}."}
     if not link.has_ended:
         found = _gone_back(cell, link, progress)
         if found["retreated"] or not link.has_ended:
-            return told | found
+            return decision | found
     try:
         # The link's driver has ended. Its path and its tare are on disk.
         with RobotLink(cell) as other:
             other.wait_for_samples(_CONNECTED_SECONDS)
-            return told | _gone_back(cell, other, progress)
+            return decision | _gone_back(cell, other, progress)
     except LimberError as error:
         opened, how = _opened_without_driver(cell)
-        return told | {"choice": "retreat", "gripper_opened": opened, "force_n": None, "outcome":
-                       "The arm could not return: its driver has ended, and none could take its "
-                       f"place ({str(error).rstrip('.')}); {_left(None)}. {how}."}
+        return decision | {"choice": "retreat", "gripper_opened": opened, "force_n": None,
+                           "outcome":
+                           "The arm could not return: its driver has ended, and none could take "
+                           f"its place ({str(error).rstrip('.')}); {_left(None)}. {how}."}
 
 
 def _gone_back(cell: Cell, link: RobotLink, progress: Progress) -> dict[str, Any]:
     """Retreat; if a force above the soft limit remains, open the gripper."""
     event = _retreated(link)
     force = _force_left(link)
-    told = {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
-    went = ("The arm returned along its path" if told["retreated"] else
+    outcome = {"choice": "retreat", "retreated": event["event"] == "reached", "force_n": force}
+    went = ("The arm returned along its path" if outcome["retreated"] else
             f"The arm could not return: {event['reason'].rstrip('.')}")
-    if told["retreated"] and force is not None and force <= cell.limits.soft_force_n:
-        return told | {"outcome": f"{went}; {_left(force)}."}
+    if outcome["retreated"] and force is not None and force <= cell.limits.soft_force_n:
+        return outcome | {"outcome": f"{went}; {_left(force)}."}
     opened, how = _opened(cell, link, progress)
-    told |= {"gripper_opened": opened, "force_n": _force_left(link)}
-    return told | {"outcome": f"{went}; {_left(force)}. {how}; {_left(told['force_n'])}."}
+    outcome |= {"gripper_opened": opened, "force_n": _force_left(link)}
+    return outcome | {"outcome": f"{went}; {_left(force)}. {how}; {_left(outcome['force_n'])}."}
 
 
 def _opened_without_driver(cell: Cell) -> tuple[bool, str]:

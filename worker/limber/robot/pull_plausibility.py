@@ -16,12 +16,12 @@ from limber.robot.cell.cell import Cell
 LOOKED_M = 0.01
 """Travel by which a wrong sensor has been detected."""
 
-_NOISES = 4.0  # times a smoothed force's noise: less is no statement
+_NOISES = 4.0  # times the noise of a smoothed force; less is not significant
 _MOSTLY = 0.5  # cosine of the angle to the predicted force
-_AGREE = 10  # samples in a row that say the same
-_FROM_M = 0.002  # of travel: before that slack and the bark decide
-_BACK_SHARE = 0.15  # of the peak force that may be left when the gripper is back
-_SMOOTHED = 3  # readings at least in a smoothed force
+_AGREE = 10  # consecutive samples that agree
+_FROM_M = 0.002  # of travel; before that slack and the bark dominate
+_BACK_SHARE = 0.15  # fraction of the peak force that may remain when the gripper is back
+_SMOOTHED = 3  # fewest readings in a smoothed force
 _RAW, _COLUMNS = slice(7, 10), slice(13, 16)
 _BIN_M, _MOVED_M = 2.5e-4, 1e-6
 _RECENT_M = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012, 0.02)  # over which the force's growth is
@@ -60,19 +60,20 @@ class PredictedPull:
     """Forces along the first way out of a pull, by the branch's model.
 
     Attributes:
-        ways: Travel of the gripper [m], ascending from 0, shape [n].
+        travels: Travel of the gripper [m], ascending from 0, shape [n].
         forces: Forces of the gripper on the branch [N], branch frame, shape [n, 3].
         factor: Factor by which a force may be larger or smaller, if the moduli are known; else
         None.
     """
 
-    ways: np.ndarray
+    travels: np.ndarray
     forces: np.ndarray
     factor: float | None
 
-    def at(self, way: float | np.ndarray) -> np.ndarray:
+    def at(self, travel: float | np.ndarray) -> np.ndarray:
         """Return the force at a travel [m], shape [3]; at travels [n], shape [n, 3]."""
-        return np.stack([np.interp(way, self.ways, self.forces[:, k]) for k in range(3)], axis=-1)
+        return np.stack([np.interp(travel, self.travels, self.forces[:, k]) for k in range(3)],
+                        axis=-1)
 
 
 class _Growth:
@@ -170,10 +171,10 @@ class PullPlausibility:
         self._noise = _NOISES * cell.sensor.force_sigma_n / np.sqrt(_SMOOTHED)
         self._drift = cell.sensor.drift_n_per_minute / 60.0
         self._predicted = predicted
-        self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.ways[-1]))
+        self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.travels[-1]))
         self._start: np.ndarray | None = None
         self._began = self._peak = 0.0
-        self._told = ("", 0)
+        self._doubt_streak = ("", 0)
         self.reason: str | None = None
 
     def take(self, samples: np.ndarray) -> str | None:
@@ -182,12 +183,12 @@ class PullPlausibility:
         if self._start is None:
             self._start, self._began = samples[0, 1:4].copy(), float(samples[0, 0])
         ways = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)
-        for way, force in zip(ways, samples[:, _COLUMNS], strict=True):
+        for travel, force in zip(ways, samples[:, _COLUMNS], strict=True):
             if not np.isfinite(force).all():
                 continue
             self._peak = max(self._peak, float(np.linalg.norm(force)))
-            if self.reason is None and _FROM_M <= way <= LOOKED_M:
-                self._agree(self._doubt(float(way), force))
+            if self.reason is None and _FROM_M <= travel <= LOOKED_M:
+                self._agree(self._doubt(float(travel), force))
         self._grow(samples, ways)
         if self.reason is None:
             self.reason = self._slip() or self._scale()
@@ -209,8 +210,9 @@ class PullPlausibility:
     def _agree(self, doubt: str) -> None:
         """Take a suspected error as certain when it is repeated."""
         kind = doubt.split(":", maxsplit=1)[0]
-        self._told = (kind, self._told[1] + 1 if doubt and kind == self._told[0] else 1)
-        if doubt and self._told[1] >= _AGREE:
+        self._doubt_streak = (kind, self._doubt_streak[1] + 1 if doubt
+                              and kind == self._doubt_streak[0] else 1)
+        if doubt and self._doubt_streak[1] >= _AGREE:
             self.reason = doubt
 
     def _grow(self, samples: np.ndarray, ways: np.ndarray) -> None:
@@ -241,24 +243,24 @@ class PullPlausibility:
                 f"gripper, or gives way (over the last {1000 * way:.0f} mm it grew by "
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
 
-    def _doubt(self, way: float, force: np.ndarray) -> str:
-        wanted = self._predicted.at(way)
-        size, felt = float(np.linalg.norm(wanted)), float(np.linalg.norm(force))
+    def _doubt(self, travel: float, force: np.ndarray) -> str:
+        predicted = self._predicted.at(travel)
+        size, felt = float(np.linalg.norm(predicted)), float(np.linalg.norm(force))
         if size < 1e-9:
             return ""
-        along = float(force @ wanted) / size
-        told = f"after {1000 * way:.1f} mm"
+        along = float(force @ predicted) / size
+        when = f"after {1000 * travel:.1f} mm"
         if felt > self._noise and along < -_MOSTLY * felt:
             return ("the force points against the predicted one: the sensor's sign or pose "
-                    f"(sensor.pose) is wrong ({felt:.2g} N {told})")
+                    f"(sensor.pose) is wrong ({felt:.2g} N {when})")
         if felt > self._noise and along < _MOSTLY * felt:
             return ("the force lies across the predicted one: the sensor's axes or pose "
-                    f"(sensor.pose) are wrong, or another part is pulled ({felt:.2g} N {told})")
+                    f"(sensor.pose) are wrong, or another part is pulled ({felt:.2g} N {when})")
         factor = self._predicted.factor
         if factor is None:
             return ""
         if along > factor * size + self._noise:
-            return f"{_LARGER} ({along:.2g} N {told}, {size:.2g} N predicted)"
+            return f"{_LARGER} ({along:.2g} N {when}, {size:.2g} N predicted)"
         if along < size / factor - self._noise:
-            return f"{_SMALLER} ({along:.2g} N {told}, {size:.2g} N predicted)"
+            return f"{_SMALLER} ({along:.2g} N {when}, {size:.2g} N predicted)"
         return ""

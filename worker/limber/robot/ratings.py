@@ -16,8 +16,8 @@ MOST_SPEED = 0.25
 """[m/s], the reduced speed of industrial arms with people beside them."""
 MOST_TURN_SPEED = 1.5
 """[rad/s]"""
-_PAYLOADS = 2.0  # weights of its payload that an arm exerts: it moves it as well as it holds it
-_LEVER = 0.15  # m beyond the flange at which arms still hold their payload
+_PAYLOADS = 2.0  # payload weights that an arm exerts: it moves its payload too
+_LEVER = 0.15  # m beyond the flange at which arms still carry their payload
 
 
 def greatest_force(arm: Arm) -> float:

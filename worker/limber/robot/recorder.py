@@ -84,9 +84,9 @@ def known_noise(cell: Cell, position_sigma: float | None = None) -> SensorEntry:
     Args:
         position_sigma: Noise of a tracked point [m]; None: as is usual.
     """
-    told = {} if position_sigma is None else {"position_sigma_m": position_sigma}
+    noise = {} if position_sigma is None else {"position_sigma_m": position_sigma}
     return SensorEntry(
-        **told,
+        **noise,
         force_sigma_n=cell.sensor.force_sigma_n, torque_sigma_nm=cell.sensor.torque_sigma_nm,
         force_range_n=cell.sensor.force_range_n)
 
@@ -140,7 +140,7 @@ class MarkerStream:
                             "Start the tracker, or record without --markers.") from error
         self._data = b""
         self._count: int | None = None
-        self.left_out = 0
+        self.rejected_count = 0
 
     def read(self, timeout: float = 0.0) -> list[tuple[float, np.ndarray]]:
         """Return the frames that have arrived: time [s], points [n, 3] in the branch's frame.
@@ -162,7 +162,7 @@ class MarkerStream:
                                for point in content["points_m"]], float).reshape(-1, 3)
             self._count = len(points) if self._count is None else self._count
             if len(points) != self._count:
-                self.left_out += 1
+                self.rejected_count += 1
                 continue
             if content.get("frame") == "base":
                 points = points @ self._base[:3, :3].T + self._base[:3, 3]
@@ -182,9 +182,9 @@ class MarkerStream:
         frames = self.read(1.0)
         if not frames:
             raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
-        if self.left_out:
+        if self.rejected_count:
             raise WorkError(f"The tracker sends {self._count} points, but a different number in "
-                            f"{self.left_out} of {len(frames) + self.left_out} frames.",
+                            f"{self.rejected_count} of {len(frames) + self.rejected_count} frames.",
                             "So the points cannot be distinguished.",
                             "Make it send null for a point that it does not see.")
         seen = np.array([points for _, points in frames])

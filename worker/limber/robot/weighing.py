@@ -11,11 +11,11 @@ import numpy as np
 from limber.core.errors import InputError
 
 GRAVITY = 9.81
-_LEAST_TILT = 0.03  # of the direction of gravity: sine of an angle
+_LEAST_TILT = 0.03  # sine of the angle of gravity's change
 _MOST_TILT = 0.5  # rad
-_CHANGE_N = 2.0  # of the weight; the guard stops at limits.unexpected_force_n, 3 N by default
-_SECOND_TILT = 0.4  # of the first, about the second axis
-_ALIKE = 0.8  # cosine of the angle between what changed and what should
+_CHANGE_N = 2.0  # N of the weight; the guard stops at limits.unexpected_force_n, 3 N by default
+_SECOND_TILT = 0.4  # fraction of the first, about the second axis
+_ALIKE = 0.8  # cosine of the angle between measured and expected change
 _UNITS = {0.1019: "kilograms-force", 0.2248: "pounds-force", 0.001: "kilonewtons",
           1000.0: "millinewtons"}
 _NEAR = 0.15  # relative
@@ -90,26 +90,26 @@ def weigh(downs: np.ndarray, forces: np.ndarray, times: np.ndarray, stated: floa
     left = forces - columns @ found
     free = max(left.size - found.size, 1)
     spread = float(np.sqrt((left**2).sum() / free))
-    changes, wanted = found[:2] / GRAVITY, axes[:2]
-    along = float((changes * wanted).sum() / 2)
+    changes, regressors = found[:2] / GRAVITY, axes[:2]
+    along = float((changes * regressors).sum() / 2)
     size = float(np.sqrt((changes**2).sum() / 2))
     sigma = spread / GRAVITY / np.sqrt((tilts**2).sum())
     return Weighing(along, sigma, tuple(_faults(along, size, sigma, stated)))
 
 
 def _faults(along: float, size: float, sigma: float, stated: float) -> list[str]:
-    told = f"the sensor shows {along:.3f} kg for {stated:.3f} kg"
+    message = f"the sensor shows {along:.3f} kg for {stated:.3f} kg"
     if size < 4 * sigma or size < 0.02 * stated:
-        return [f"the sensor does not notice the gripper's weight ({told})"]
+        return [f"the sensor does not notice the gripper's weight ({message})"]
     if along < -_ALIKE * size:
-        return [f"the sensor's sign is wrong ({told})"]
+        return [f"the sensor's sign is wrong ({message})"]
     if along < _ALIKE * size:
         return ["the sensor's axes are wrong: the weight changes it in another direction. Check "
-                f"sensor.pose ({told})"]
+                f"sensor.pose ({message})"]
     factor = along / stated
     for unit, name in _UNITS.items():
         if abs(factor / unit - 1.0) < _NEAR:
-            return [f"the sensor's unit seems to be {name} ({told})"]
+            return [f"the sensor's unit seems to be {name} ({message})"]
     if abs(along - stated) > max(0.05, 0.1 * stated, 4 * sigma):
-        return [f"tool.mass_kg or the sensor's scale is wrong ({told})"]
+        return [f"tool.mass_kg or the sensor's scale is wrong ({message})"]
     return []

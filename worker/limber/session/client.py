@@ -224,7 +224,7 @@ class InteractiveSession:
     def close(self) -> None:
         """End the session; safe to call again."""
         if self.alive:
-            with contextlib.suppress(WorkError, OSError):  # it ends just now
+            with contextlib.suppress(WorkError, OSError):  # it is just ending
                 self._send(command="close")
             end_by_closing(self._process, _GRACE_SECONDS)
         self._process.wait()
@@ -237,7 +237,7 @@ class InteractiveSession:
         self._listener.join(1.0)
         for stream in (self._process.stdin, self._process.stdout, self._errors):
             if stream and not stream.closed:
-                with contextlib.suppress(OSError):  # what was not sent has nobody to read it
+                with contextlib.suppress(OSError):  # nobody reads what was not sent
                     stream.close()
 
     def _listen(self) -> None:
@@ -271,9 +271,9 @@ class InteractiveSession:
                 f" {self._trouble()}", "", "Close it and start a new one.")
 
     def _trouble(self) -> str:
-        said = [line["message"] for line in self.events if line.get("event") == "failed"]
-        if said:
-            return said[-1]
+        messages = [line["message"] for line in self.events if line.get("event") == "failed"]
+        if messages:
+            return messages[-1]
         if self._errors.closed:
             return "no message"
         self._errors.seek(0)

@@ -31,7 +31,7 @@ class Events:
         try:
             self._lines.put_nowait(json.dumps(plain(line), default=str))
         except queue.Full:
-            return  # nobody reads
+            return  # nobody reads it
 
     def close(self) -> None:
         """Report the end of the session, and write waiting events for at most a second."""

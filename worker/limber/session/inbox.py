@@ -85,7 +85,7 @@ def read_commands(source: int, inbox: Inbox, refuse: Callable[[int, str], None])
             for line in lines.feed(piece):
                 _take(line, inbox, refuse)
     except OSError:
-        pass  # the pipe is gone, which is its end
+        pass  # the pipe is closed: end of input
     finally:
         # However this thread ends, a session without input must not run on.
         inbox.close()

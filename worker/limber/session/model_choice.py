@@ -250,13 +250,13 @@ class Answering:
             self._state = state
             self.held.put(number, held.goal, reduced.displacement(state))
         # Out of reach the branch stays in its last position: a false state would flicker.
-        shown = self._state or state
+        current = self._state or state
         displacement = self.held.displacement if self._state is not None else (
-            reduced.displacement(shown))
+            reduced.displacement(current))
         if self._learning is not None and state.converged:
             self._learning.check(state)
-        at = HeldAt(number, shown.pose, shown.reaction_force, shown.reaction_torque)
-        return Answer(displacement, (at,), shown.energy, is_converged=state.converged,
+        at = HeldAt(number, current.pose, current.reaction_force, current.reaction_torque)
+        return Answer(displacement, (at,), current.energy, is_converged=state.converged,
                       is_reached=state.converged, is_reduced=True,
                       is_trusted=state.trusted and not self._is_doubted(state.pose))
 
@@ -271,7 +271,7 @@ class Answering:
         length = min(max(now - self._last_step, _SOONEST / RATE), _LATEST / RATE)
         self._last_step = now
         ((number, held),) = self.held.grasps.items()
-        pose = self._within_reach(held.pose, held.goal, self.held.way(number), length)
+        pose = self._within_reach(held.pose, held.goal, self.held.goal_distance(number), length)
         good = stepper.move(pose, length)
         reduced = stepper.model
         if not good:
@@ -288,8 +288,8 @@ class Answering:
                       is_converged=good, is_reached=bool(np.array_equal(pose, held.goal)),
                       is_reduced=True, is_trusted=good and self.held.loads is None)
 
-    def _within_reach(self, pose: np.ndarray, goal: np.ndarray, way: float,
+    def _within_reach(self, pose: np.ndarray, goal: np.ndarray, distance: float,
                       seconds: float) -> np.ndarray:
         """Return how far the gripper moves towards a pose: a jump would whip the branch."""
-        part = _FASTEST * self.held.model.extent * seconds / max(way, 1e-12)
+        part = _FASTEST * self.held.model.extent * seconds / max(distance, 1e-12)
         return goal if part >= 1.0 else pose_between(pose, goal, part)

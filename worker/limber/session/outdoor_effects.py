@@ -67,7 +67,7 @@ class EffectsTeller:
         """Report the result of a request."""
         about: dict[str, Any] = {"id": question.id, "command": question.command}
         try:
-            told = asked.result()
+            effects = asked.result()
         except (Cancelled, CancelledError):
             return
         except LimberError as error:
@@ -76,7 +76,7 @@ class EffectsTeller:
             # Like everything that a command triggers: the branch stays held.
             self._events.say(event="error", **about, message=f"{type(error).__name__}: {error}")
         else:
-            self._events.say(event="reply", **about, **told)
+            self._events.say(event="reply", **about, **effects)
 
 
 def gusts_of(question: Effects) -> Gusts | None:
@@ -104,7 +104,7 @@ def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads
     outdoors, peak = held.set_outdoors(loads), None
     if gusts is not None:
         outdoors, peak = with_peak(outdoors, gusts, known_damping(Branch.read(folder), progress))
-    _, told = load_effects(
+    _, effects = load_effects(
         outdoors, strain_limit=question.strain_limit, deviation=held.young_deviation,
         most=question.most if question.limit_load else None, progress=progress)
-    return told | {"gusts": peak}
+    return effects | {"gusts": peak}

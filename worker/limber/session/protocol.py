@@ -46,7 +46,7 @@ class _OnBranch(BaseModel):
     point: _Vector | None = None
 
     @model_validator(mode="after")
-    def _one_place(self) -> "_OnBranch":
+    def _one_position(self) -> "_OnBranch":
         if (self.vertex is None) == (self.point is None):
             raise ValueError("give a position as either `vertex` or `point`")
         return self
@@ -203,10 +203,10 @@ def parse_command(line: bytes) -> Command:
         return _COMMANDS.validate_json(line, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
+        key = ".".join(str(part) for part in first["loc"])
         raise NotUnderstood(
             f"Not understood: {line[:200].decode(errors='replace').strip()}",
-            f"{place + ': ' if place else ''}{first['msg']}.", "",
+            f"{key + ': ' if key else ''}{first['msg']}.", "",
             reply_id=_id_of(line)) from None
 
 

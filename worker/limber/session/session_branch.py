@@ -108,7 +108,7 @@ class HeldBranch:
         if len(self.grasps) >= GRASP_LIMIT:
             raise InputError(f"There are already {GRASP_LIMIT} grasps.",
                              "A frame cannot hold more.", "Release one.")
-        return self.hold(Grasp.at(self.model.mesh, self._place(vertex, point), radius, mode))
+        return self.hold(Grasp.at(self.model.mesh, self._position_of(vertex, point), radius, mode))
 
     def hold(self, grasp: Grasp) -> int:
         """Hold a known patch; as :meth:`grab`."""
@@ -185,8 +185,9 @@ class HeldBranch:
         """
         forces = np.zeros_like(self.model.mesh.nodes)
         for load in loads:
-            place = self._place(load.vertex, load.point)
-            forces[np.linalg.norm(self.model.mesh.nodes - place, axis=1).argmin()] += load.force_n
+            position = self._position_of(load.vertex, load.point)
+            forces[np.linalg.norm(self.model.mesh.nodes - position,
+                                  axis=1).argmin()] += load.force_n
         self._hung = forces if loads else None
 
     def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
@@ -245,7 +246,7 @@ class HeldBranch:
         moved = answer.displacement[left] @ down
         return float(moved[np.abs(moved).argmax()])
 
-    def way(self, number: int) -> float:
+    def goal_distance(self, number: int) -> float:
         """Return the distance of a grasp from its target [m]; rotations count as lengths."""
         held = self.grasps[number]
         move = held.goal - held.pose
@@ -262,7 +263,7 @@ class HeldBranch:
 
         If there is no equilibrium, the branch keeps its last position.
         """
-        longest = max((self.way(number) for number in self.grasps), default=0.0)
+        longest = max((self.goal_distance(number) for number in self.grasps), default=0.0)
         part = min(1.0, FULL_STEP * self.model.extent / max(longest, 1e-12))
         goals = {number: held.goal if part == 1.0 else pose_between(held.pose, held.goal, part)
                  for number, held in self.grasps.items()}
@@ -300,10 +301,11 @@ class HeldBranch:
         strains[self._is_gone] = 0.0
         worst = int(strains.argmax())
         corners = self.model.mesh.tets[worst, :4]
-        place = (self.model.mesh.nodes[corners] + answer.displacement[corners]).mean(axis=0)
-        return self._strains(strains), float(strains[worst]), place
+        position = (self.model.mesh.nodes[corners] + answer.displacement[corners]).mean(axis=0)
+        return self._strains(strains), float(strains[worst]), position
 
-    def _place(self, vertex: int | None, point: tuple[float, float, float] | None) -> np.ndarray:
+    def _position_of(self, vertex: int | None,
+                     point: tuple[float, float, float] | None) -> np.ndarray:
         if vertex is None:
             return np.asarray(point, float)
         if vertex >= len(self.surface):
@@ -317,9 +319,9 @@ class _AtVertices:
 
     def __init__(self, model: BranchModel, surface: np.ndarray):
         tets = model.mesh.tets
-        place = np.full(model.mesh.node_count, -1)
-        place[surface] = np.arange(len(surface))
-        vertex = place[tets].ravel()
+        indices = np.full(model.mesh.node_count, -1)
+        indices[surface] = np.arange(len(surface))
+        vertex = indices[tets].ravel()
         tet = np.repeat(np.arange(len(tets)), tets.shape[1])[vertex >= 0]
         vertex = vertex[vertex >= 0]
         order = np.argsort(vertex, kind="stable")

@@ -79,12 +79,12 @@ def _serve(folder: Path, settings: SessionSettings, cache: ReducedCache) -> None
     progress = Progress(JsonSink(interval_seconds=0.5))
     requests: queue.Queue[dict[str, Any] | None] = queue.Queue()
     threading.Thread(target=_listen, args=(requests, progress), daemon=True).start()
-    wanted = requests.get()
-    if wanted is None:
+    latest = requests.get()
+    if latest is None:
         return
     held = load_held(folder, settings)
-    nodes, shares = np.array(wanted["nodes"]), np.array(wanted["weights"])
-    grasp = Grasp(nodes, shares, shares @ held.model.mesh.nodes[nodes], wanted["mode"])
+    nodes, shares = np.array(latest["nodes"]), np.array(latest["weights"])
+    grasp = Grasp(nodes, shares, shares @ held.model.mesh.nodes[nodes], latest["mode"])
     weights, young = as_control_points(held.model)
     about, began = reduced_settings(settings), time.perf_counter()
     key = model_key(held.model, grasp, weights, young, about)

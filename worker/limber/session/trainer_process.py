@@ -97,7 +97,7 @@ class Learning:
                 if stream is not None:
                     stream.close()
             except (OSError, ValueError):
-                continue  # what was not sent has nobody to read it
+                continue  # nobody reads what was not sent
 
     def _write(self, line: dict[str, Any]) -> None:
         try:
@@ -105,7 +105,7 @@ class Learning:
             stdin.write(json.dumps(line) + "\n")
             stdin.flush()
         except (OSError, ValueError):
-            self._checked = None  # it has ended; its listener says so
+            self._checked = None  # it has ended; its listener reports it
 
     def _listen(self) -> None:
         try:

@@ -232,9 +232,9 @@ class Session:
 
     def _publish(self, answer: Answer) -> None:
         held = self.held
-        strains, greatest, place = held.strain(answer)
+        strains, greatest, position = held.strain(answer)
         move_id, asked_at = self._asked
-        numbers = {"strain_x_m": place[0], "strain_y_m": place[1], "strain_z_m": place[2]}
+        numbers = {"strain_x_m": position[0], "strain_y_m": position[1], "strain_z_m": position[2]}
         if answer.grasps:
             first = answer.grasps[0]
             for name, vector, unit in (("force", first.force, "n"), ("torque", first.torque, "nm")):

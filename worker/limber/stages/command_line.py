@@ -141,8 +141,8 @@ def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
     """Add an option per field of a model; the function gets ``values``, those that were given."""
     @functools.wraps(function)
     def body(*args: Any, **options: Any) -> Any:
-        given = {field: options.pop(f"{prefix}__{field}") for field in fields}
-        values = {field: value for field, value in given.items() if value is not None}
+        chosen = {field: options.pop(f"{prefix}__{field}") for field in fields}
+        values = {field: value for field, value in chosen.items() if value is not None}
         return function(*args, values=values, **options)
     for name, model in reversed(fields.items()):
         body = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(body)
@@ -249,19 +249,19 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 
 def _help(name: str, field: Any, kind: Any, default: Any) -> str:
     """A field's description, then its default and range as they are typed."""
-    told = []
+    parts = []
     if default is not None and default != ():
         if kind is bool:
-            shown = name if default else f"no_{name}"
-            told.append(f"default: --{shown.replace('_', '-')}")
+            flag = name if default else f"no_{name}"
+            parts.append(f"default: --{flag.replace('_', '-')}")
         elif isinstance(default, tuple):
             # Lists of any length are typed with commas, vectors with spaces.
             between = "," if typing.get_args(kind)[-1] is Ellipsis else " "
-            told.append(f"default: {between.join(map(_shown, default))}")
+            parts.append(f"default: {between.join(map(_shown, default))}")
         else:
-            told.append(f"default: {_shown(_new_name(field, default))}")
-    told += _bounds(field)
-    return f"{field.description or ''}  [{'; '.join(told)}]" if told else field.description or ""
+            parts.append(f"default: {_shown(_new_name(field, default))}")
+    parts += _bounds(field)
+    return f"{field.description or ''}  [{'; '.join(parts)}]" if parts else field.description or ""
 
 
 def _new_name(field: Any, value: Any) -> Any:

@@ -315,13 +315,13 @@ class Branch:
         entry = self.manifest.stages.get(key)
         if entry is None or any(name not in self.manifest.files for name in reads):
             return False
-        wanted = self._read_digests(reads, digests)
+        current = self._read_digests(reads, digests)
         intact = all(name in self.manifest.files
                      and not self._checker.trouble(name, self.manifest.files[name])
                      for name in entry.writes if self._owner(name) == key)
         stored = (settings.without_retired(entry.settings) if isinstance(settings, Settings)
                   else entry.settings)
-        return (intact and entry.reads == wanted and stored == plain(settings or {})
+        return (intact and entry.reads == current and stored == plain(settings or {})
                 and entry.programs.get(RESULTS, "1") == _results_version(settings))
 
     @contextmanager
@@ -348,7 +348,7 @@ class Branch:
                 entry = StageEntry(
                     settings=plain(settings or {}), reads=read, writes=stage.written(),
                     result=plain(stage.result),
-                    programs=program_versions() | _told_version(settings),
+                    programs=program_versions() | _version_entry(settings),
                     seconds=round(time.perf_counter() - started, 3),
                     finished=datetime.now(UTC).isoformat(timespec="seconds"))
                 self._commit(key, entry, stage, work)
@@ -395,7 +395,7 @@ def _results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
     return str(getattr(type(settings), "results_version", 1))
 
 
-def _told_version(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
+def _version_entry(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
     version = _results_version(settings)
     return {} if version == "1" else {RESULTS: version}
 

@@ -24,14 +24,14 @@ def in_words(folder: Path) -> Iterator[None]:
     except OSError as error:
         if _is_gone(folder):
             raise gone(folder) from error
-        told = machine_error(error, folder)
-        if told is None:
+        translated = machine_error(error, folder)
+        if translated is None:
             raise
         # A file still open in the failed writer keeps its space, removed or not; the next stage of
         # this process would find the disk full as well.
         traceback.clear_frames(error.__traceback__)
         gc.collect()
-        raise told from error
+        raise translated from error
 
 
 def require_there(folder: Path) -> None:

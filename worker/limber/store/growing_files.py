@@ -124,10 +124,10 @@ class Stream:
 
     def _raise_error(self) -> None:
         if self._error is not None:
-            told = machine_error(self._error, self.path)
+            cause = machine_error(self._error, self.path)
             raise WorkError(f"{self.path} could not be written ({self._error.strerror}).",
-                            f"{told.why if told else ''} The last lines are lost.".strip(),
-                            told.fix if told else "Make room on the disk.") from self._error
+                            f"{cause.why if cause else ''} The last lines are lost.".strip(),
+                            cause.fix if cause else "Make room on the disk.") from self._error
 
 
 def stream_lines(path: Path) -> Iterator[str]:
@@ -148,9 +148,9 @@ def _cut_torn_line(path: Path) -> int:
         while end > 0:
             start = max(end - _TAIL_BYTES, 0)
             stream.seek(start)
-            place = stream.read(end - start).rfind(b"\n")
-            if place >= 0:
-                end = start + place + 1
+            newline = stream.read(end - start).rfind(b"\n")
+            if newline >= 0:
+                end = start + newline + 1
                 break
             end = start
         if end < size:

@@ -61,8 +61,8 @@ def commit(folder: Path, work: Path, manifest: Manifest) -> None:
         BranchFolderError: an entry that is not a file of a branch is in the way; no file was
         committed.
     """
-    _require_places(folder, (path.relative_to(work).as_posix() for path in work.rglob("*")
-                             if path.is_file()))
+    _require_targets(folder, (path.relative_to(work).as_posix() for path in work.rglob("*")
+                              if path.is_file()))
     (work / MANIFEST).write_text(manifest.text(), encoding="utf-8")
     flush_tree(work)
     os.replace(work, folder / _COMMIT)
@@ -81,7 +81,7 @@ def roll_forward(folder: Path) -> None:
         return
     try:
         if (pending / MANIFEST).exists():
-            _move_into_place(folder, pending)
+            _install(folder, pending)
         # Without its manifest, all files have already been moved.
         shutil.rmtree(pending)
         flush_folder(folder)
@@ -93,11 +93,11 @@ def roll_forward(folder: Path) -> None:
             "on the folder again.") from error
 
 
-def _move_into_place(folder: Path, pending: Path) -> None:
+def _install(folder: Path, pending: Path) -> None:
     new = read_manifest(pending)
     old = read_manifest(folder) if (folder / MANIFEST).exists() else None
     touched = {folder}
-    _require_places(folder, (name for name in new.files if inside(pending, name).is_file()))
+    _require_targets(folder, (name for name in new.files if inside(pending, name).is_file()))
     for name in sorted(new.files):
         path = inside(pending, name)
         if not path.is_file():
@@ -106,28 +106,28 @@ def _move_into_place(folder: Path, pending: Path) -> None:
         target = inside(folder, name)
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, target)
-        touched |= {place for place in target.parents if place.is_relative_to(folder)}
+        touched |= {parent for parent in target.parents if parent.is_relative_to(folder)}
     for name in set(old.files if old else ()) - set(new.files):
         if (gone := inside(folder, name)).is_file():
             gone.unlink(missing_ok=True)
-    for place in touched:
-        flush_folder(place)
+    for parent in touched:
+        flush_folder(parent)
     os.replace(pending / MANIFEST, folder / MANIFEST)
     flush_folder(folder)
 
 
-def _require_places(folder: Path, names: Iterable[str]) -> None:
+def _require_targets(folder: Path, names: Iterable[str]) -> None:
     """Refuse to commit files if a folder, or a pipe or file in place of a folder, is in the way.
 
     Checked before the first of them is moved: a commit that stops halfway would never end.
     """
     for name in names:
         path = inside(folder, name)
-        above = [place for place in path.parents if place.is_relative_to(folder)]
-        way = path if path.is_dir() else next(
-            (place for place in above if place.exists() and not place.is_dir()), None)
-        if way is not None:
+        above = [parent for parent in path.parents if parent.is_relative_to(folder)]
+        folder_above = path if path.is_dir() else next(
+            (parent for parent in above if parent.exists() and not parent.is_dir()), None)
+        if folder_above is not None:
             raise BranchFolderError(
-                f"{way} is in the way of the file {name}.",
+                f"{folder_above} is in the way of the file {name}.",
                 "A branch folder has a file in the place of a folder there, or the reverse.",
                 "Remove it, or get the folder from its source again. Then run this again.")

@@ -195,11 +195,11 @@ def young_deviation(branch: Branch) -> float | None:
     Raises:
         InputError: ``estimate.json`` is damaged.
     """
-    told = {key: branch.manifest.stages[key] for key in ("estimate", "swing", "vibration")
-            if key in branch.manifest.stages}
-    last = max(told, key=lambda key: told[key].finished, default=None)
+    entries = {key: branch.manifest.stages[key] for key in ("estimate", "swing", "vibration")
+               if key in branch.manifest.stages}
+    last = max(entries, key=lambda key: entries[key].finished, default=None)
     if last in ("swing", "vibration"):
-        interval = told[last].result.get("young_interval_pa")
+        interval = entries[last].result.get("young_interval_pa")
         if isinstance(interval, list) and len(interval) == 2 and all(
                 isinstance(end, int | float) and end > 0 for end in interval):
             return abs(math.log(interval[1] / interval[0])) / (2 * 1.96)

@@ -101,8 +101,9 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         content = read_json(path, "a manifest")
     except InputError as error:
-        if isinstance(error.__cause__, OSError) and (told := machine_error(error.__cause__, path)):
-            raise told from error
+        if isinstance(error.__cause__,
+                      OSError) and (translated := machine_error(error.__cause__, path)):
+            raise translated from error
         raise BranchFolderError(
             error.seen, "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
@@ -115,9 +116,9 @@ def read_manifest(folder: Path) -> Manifest:
         manifest = validated(Manifest, content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        key = ".".join(str(part) for part in first["loc"])
         raise BranchFolderError(
-            f"{path}: {place or 'content'}: {first['msg']}.", "The manifest is damaged.",
+            f"{path}: {key or 'content'}: {first['msg']}.", "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
     _require_inside(path, manifest)
     return manifest

@@ -51,11 +51,11 @@ class Checker:
 
 def damage_error(folder: Path, damages: list[Damage], shown_count: int = 4) -> BranchFolderError:
     """Return the error that names the damaged files, the first ``shown_count`` of them."""
-    shown = ", ".join(f"{d.name} ({d.trouble})" for d in damages[:shown_count])
+    listed = ", ".join(f"{d.name} ({d.trouble})" for d in damages[:shown_count])
     more = f" and {len(damages) - shown_count} more" if len(damages) > shown_count else ""
     stages = sorted({d.stage for d in damages})
     return BranchFolderError(
-        f"Damaged files in {folder}: {shown}{more}.",
+        f"Damaged files in {folder}: {listed}{more}.",
         "They differ from the checksums written when they were made.",
         f"Restore them from a copy, or run again with --force: {', '.join(stages)}.")
 

@@ -29,8 +29,8 @@ class StageTask:
     @property
     def fingerprint(self) -> str:
         """The task without its options: the same text for the same task."""
-        told = json.dumps([self.stage, plain(self.inputs), plain(self.settings)], sort_keys=True)
-        return hashlib.sha256(told.encode("utf-8")).hexdigest()[:16]
+        content = json.dumps([self.stage, plain(self.inputs), plain(self.settings)], sort_keys=True)
+        return hashlib.sha256(content.encode("utf-8")).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

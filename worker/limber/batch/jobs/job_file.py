@@ -16,7 +16,7 @@ from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.batch.jobs.job_paths import JobPaths
 from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.stage_tables import Source, StageTables
-from limber.batch.jobs.toml_positions import Place, toml_lines
+from limber.batch.jobs.toml_positions import KeyPath, toml_lines
 from limber.core.errors import InputError
 from limber.core.files.atomic import require_file
 from limber.core.files.reading import read_text, read_toml
@@ -88,21 +88,22 @@ class _Reader:
             self.problems.add((key,), f"{key}: {error}")
             return None
 
-    def job(self, job: dict[str, Any], place: Place) -> list[BranchJob]:
-        self.problems.check_keys(job, _JOB_KEYS, place)
-        stages = self.problems.tables(job, "stage", place)
+    def job(self, job: dict[str, Any], key_path: KeyPath) -> list[BranchJob]:
+        self.problems.check_keys(job, _JOB_KEYS, key_path)
+        stages = self.problems.tables(job, "stage", key_path)
         if not stages:
-            self.problems.add(place, "The job has no [[job.stage]].")
-        branches = itertools.product(self.sources(job, place), self.sweeps(job, stages, place))
+            self.problems.add(key_path, "The job has no [[job.stage]].")
+        branches = itertools.product(self.sources(job, key_path),
+                                     self.sweeps(job, stages, key_path))
         found = []
         for source, sweep in itertools.islice(branches, _MOST_BRANCHES):
-            found.append(self.branch(source, sweep, stages, place))
+            found.append(self.branch(source, sweep, stages, key_path))
         if next(branches, None) is not None:
-            self.problems.add(place, f"The job has more than {_MOST_BRANCHES} branches.")
+            self.problems.add(key_path, f"The job has more than {_MOST_BRANCHES} branches.")
         return found
 
     def branch(self, source: Source, sweep: dict[str, Any], stages: list[dict[str, Any]],
-               place: Place) -> BranchJob:
+               key_path: KeyPath) -> BranchJob:
         name = source.name + "".join(f"-{key.split('.')[-1]}-{_plain_name(value)}"
                                      for key, value in sweep.items())
         paths = self.paths
@@ -110,20 +111,20 @@ class _Reader:
         home = paths.address_of(folder)
         if source.is_scan and paths.home:
             home = f"{paths.home}/{name}.branch"
-        tasks = StageTables(self.problems, paths, source, folder, sweep).tasks(stages, place)
+        tasks = StageTables(self.problems, paths, source, folder, sweep).tasks(stages, key_path)
         return BranchJob(name, folder, tuple(tasks), sweep,
                          paths.fetched([path for path in _paths_in(tasks) if path != folder]),
                          home)
 
-    def sources(self, job: dict[str, Any], place: Place) -> list[Source]:
-        given = [key for key in ("scans", "folders") if key in job]
-        if len(given) != 1:
-            self.problems.add(place, "A job needs either scans or folders.")
+    def sources(self, job: dict[str, Any], key_path: KeyPath) -> list[Source]:
+        kinds = [key for key in ("scans", "folders") if key in job]
+        if len(kinds) != 1:
+            self.problems.add(key_path, "A job needs either scans or folders.")
             return []
-        key, at = given[0], (*place, given[0])
+        key, at = kinds[0], (*key_path, kinds[0])
         look = self.paths.files if key == "scans" else self.paths.folders
         found: list[Source] = []
-        for pattern in self.problems.typed(job, key, list, place, []):
+        for pattern in self.problems.typed(job, key, list, key_path, []):
             if not isinstance(pattern, str):
                 self.problems.add(at, f"{pattern!r} is not a path.")
                 continue
@@ -134,10 +135,10 @@ class _Reader:
             found += [Source(path, key == "scans") for path in matches or ()]
         return found
 
-    def sweeps(self, job: dict[str, Any], stages: list[dict[str, Any]], place: Place,
+    def sweeps(self, job: dict[str, Any], stages: list[dict[str, Any]], key_path: KeyPath,
                ) -> list[dict[str, Any]]:
         table = job.get("sweep", {})
-        at = (*place, "sweep")
+        at = (*key_path, "sweep")
         if not isinstance(table, dict):
             self.problems.add(at, "Write the sweep as a table: [job.sweep].")
             return [{}]

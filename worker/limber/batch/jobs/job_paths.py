@@ -8,7 +8,7 @@ from typing import Any
 
 from limber.batch.addresses import checked_address, is_address, matching, plain_name
 from limber.batch.jobs.problems import Problems
-from limber.batch.jobs.toml_positions import Place
+from limber.batch.jobs.toml_positions import KeyPath
 from limber.core.errors import LimberError
 from limber.store.manifest import MANIFEST
 
@@ -44,39 +44,39 @@ class JobPaths:
         elif out:
             self.out = self._folder / out
 
-    def files(self, pattern: str, place: Place) -> list[Path] | None:
+    def files(self, pattern: str, key_path: KeyPath) -> list[Path] | None:
         """Return the files that a pattern names, sorted; None if it was refused."""
         if not is_address(pattern):
             return [self._folder / name for name in sorted(
                 glob.glob(pattern, root_dir=self._folder, recursive=True))]
-        found = self._tried(matching, pattern, place)
-        return None if found is None else [self._file(each, place) for each in found]
+        found = self._tried(matching, pattern, key_path)
+        return None if found is None else [self._file(each, key_path) for each in found]
 
-    def folders(self, pattern: str, place: Place) -> list[Path] | None:
+    def folders(self, pattern: str, key_path: KeyPath) -> list[Path] | None:
         """Return the branch folders that a pattern names; None if it was refused."""
         if not is_address(pattern):
-            return [path for path in self.files(pattern, place) or ()
+            return [path for path in self.files(pattern, key_path) or ()
                     if (path / MANIFEST).is_file()]
-        found = self._tried(matching, f"{pattern.rstrip('/')}/{MANIFEST}", place)
+        found = self._tried(matching, f"{pattern.rstrip('/')}/{MANIFEST}", key_path)
         return None if found is None else [
-            self._here(each.removesuffix(f"/{MANIFEST}"), self.out, place) for each in found]
+            self._here(each.removesuffix(f"/{MANIFEST}"), self.out, key_path) for each in found]
 
-    def file(self, name: str, place: Place) -> Path:
+    def file(self, name: str, key_path: KeyPath) -> Path:
         """Return the path of one file or folder."""
         if not is_address(name):
             return self._folder / name
-        address = self._tried(checked_address, name, place)
-        return self._file(address, place) if address else self.out
+        address = self._tried(checked_address, name, key_path)
+        return self._file(address, key_path) if address else self.out
 
-    def written(self, name: str, place: Place) -> Path:
+    def written(self, name: str, key_path: KeyPath) -> Path:
         """Return the path for a stage's output file: never outside ``out``."""
         path = (self.out / name).resolve()
         if is_address(name):
-            if self._tried(checked_address, name, place):
+            if self._tried(checked_address, name, key_path):
                 self._problems.add(
-                    place, f"{name!r} is an address. Stages write their files to `out` only.")
+                    key_path, f"{name!r} is an address. Stages write their files to `out` only.")
         elif not path.is_relative_to(self.out.resolve()):
-            self._problems.add(place, f"{name!r} is outside {self.out}.")
+            self._problems.add(key_path, f"{name!r} is outside {self.out}.")
         return path
 
     def address_of(self, path: Path) -> str:
@@ -88,22 +88,22 @@ class JobPaths:
         return tuple((self._known[path], path) for path in dict.fromkeys(paths)
                      if path in self._known)
 
-    def _tried(self, function: Callable[[str], Any], address: str, place: Place) -> Any:
+    def _tried(self, function: Callable[[str], Any], address: str, key_path: KeyPath) -> Any:
         """Return ``function(address)``; None if it refuses the address."""
         try:
             return function(address)
         except LimberError as error:
-            self._problems.add(place, str(error))
+            self._problems.add(key_path, str(error))
             return None
 
-    def _file(self, address: str, place: Place) -> Path:
+    def _file(self, address: str, key_path: KeyPath) -> Path:
         """Return the local path of a file or folder; neighbours stay neighbours."""
         around = address.rpartition("/")[0]
         own = hashlib.sha256(around.encode("utf-8")).hexdigest()[:12]
-        return self._here(address, self.out / ".inputs" / own, place)
+        return self._here(address, self.out / ".inputs" / own, key_path)
 
-    def _here(self, address: str, folder: Path, place: Place) -> Path:
-        name = self._tried(plain_name, address, place)
+    def _here(self, address: str, folder: Path, key_path: KeyPath) -> Path:
+        name = self._tried(plain_name, address, key_path)
         if name is None:
             return folder / "refused"
         self._known[folder / name] = address

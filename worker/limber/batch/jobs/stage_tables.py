@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.jobs.job_paths import JobPaths
 from limber.batch.jobs.problems import Problems
-from limber.batch.jobs.toml_positions import Place
+from limber.batch.jobs.toml_positions import KeyPath
 from limber.core.settings import nearest
 from limber.core.units import in_unit
 from limber.stages.registry import (
@@ -63,32 +63,32 @@ class StageTables:
     folder: Path
     sweep: dict[str, Any]
 
-    def tasks(self, tables: list[dict[str, Any]], place: Place) -> list[StageTask]:
+    def tasks(self, tables: list[dict[str, Any]], key_path: KeyPath) -> list[StageTask]:
         """Return the tasks of all stages of a job."""
         return [task for number, table in enumerate(tables)
-                for task in self._tasks_of(table, (*place, "stage", number))]
+                for task in self._tasks_of(table, (*key_path, "stage", number))]
 
-    def _tasks_of(self, table: dict[str, Any], place: Place) -> list[StageTask]:
+    def _tasks_of(self, table: dict[str, Any], key_path: KeyPath) -> list[StageTask]:
         name = str(table.get("run"))
         if trouble := _trouble(name):
-            self.problems.add((*place, "run"), f"run = {table.get('run')!r}: {trouble}")
+            self.problems.add((*key_path, "run"), f"run = {table.get('run')!r}: {trouble}")
             return []
-        given = {key: (value, (*place, key)) for key, value in table.items() if key != "run"}
+        entries = {key: (value, (*key_path, key)) for key, value in table.items() if key != "run"}
         for swept, value in self.sweep.items():
             stage, _, key = swept.partition(".")
             if stage == name:
-                given[key] = value, (*place[:2], "sweep", swept)
-        return _StageValues(self, stage_description(name), given, place).tasks()
+                entries[key] = value, (*key_path[:2], "sweep", swept)
+        return _StageValues(self, stage_description(name), entries, key_path).tasks()
 
 
 class _StageValues:
     """The values of one stage on one branch, each with its position in the file."""
 
     def __init__(self, of: StageTables, stage: StageDescription,
-                 given: dict[str, tuple[Any, Place]], place: Place):
-        self._of, self._problems, self._stage, self._place = of, of.problems, stage, place
-        self._places = {key: where for key, (_, where) in given.items()}
-        self._given = {key: value for key, (value, _) in given.items()}
+                 entries: dict[str, tuple[Any, KeyPath]], key_path: KeyPath):
+        self._of, self._problems, self._stage, self._key_path = of, of.problems, stage, key_path
+        self._key_paths = {key: where for key, (_, where) in entries.items()}
+        self._values = {key: value for key, (value, _) in entries.items()}
         schema = stage_schema(stage.name)
         self._fields = {key: about for part in ("inputs", "settings", "options")
                         for key, about in schema[part].get("properties", {}).items()}
@@ -98,11 +98,12 @@ class _StageValues:
     def tasks(self) -> list[StageTask]:
         own = self._own_inputs()
         values: dict[str, Any] = {}
-        for key, value in self._given.items():
+        for key, value in self._values.items():
             if key in own:
-                self._problems.add(self._places[key], f"The batch sets {key!r} itself. Remove it.")
+                self._problems.add(self._key_paths[key],
+                                   f"The batch sets {key!r} itself. Remove it.")
             elif key not in self._fields:
-                self._problems.add(self._places[key], f"{self._stage.name} has no {key!r}. "
+                self._problems.add(self._key_paths[key], f"{self._stage.name} has no {key!r}. "
                                    f"{nearest(key, list(self._fields))}")
             else:
                 values[key] = self._value(key, value)
@@ -127,17 +128,17 @@ class _StageValues:
                 return in_unit(value, about.get("unit", ""))
         except ValueError as error:
             self._refused.add(key)
-            where = self._places[key]
+            where = self._key_paths[key]
             self._problems.add(where, f"{where[-1]}: {error}")
-        return self._filled(value, self._places[key]) if isinstance(value, str) else value
+        return self._filled(value, self._key_paths[key]) if isinstance(value, str) else value
 
-    def _filled(self, text: str, place: Place) -> str:
+    def _filled(self, text: str, key_path: KeyPath) -> str:
         def fill(match: re.Match) -> str:
             if match.group(1) == "scan":
                 return self._of.source.name
             if match.group(1) == "file":
                 return match.group(0)
-            self._problems.add(place, f"{match.group(0)} is unknown. Use {{scan}} or {{file}}.")
+            self._problems.add(key_path, f"{match.group(0)} is unknown. Use {{scan}} or {{file}}.")
             return ""
         return _PLACEHOLDER.sub(fill, text)
 
@@ -155,14 +156,14 @@ class _StageValues:
 
     def _files(self, key: str, name: str) -> list[tuple[str, Path, bool]]:
         """Return the choices for a file: its field, its path, whether a pattern found it."""
-        place = (*self._place, key)
+        key_path = (*self._key_path, key)
         if self._fields[key]["group"] == "output":
-            return [(key, self._of.paths.written(name, place), False)]
+            return [(key, self._of.paths.written(name, key_path), False)]
         if not glob.has_magic(name):
-            return [(key, self._of.paths.file(name, place), False)]
-        matches = self._of.paths.files(name, place)
+            return [(key, self._of.paths.file(name, key_path), False)]
+        matches = self._of.paths.files(name, key_path)
         if matches == []:
-            self._problems.add(place, f"{key}: no file matches {name!r}.")
+            self._problems.add(key_path, f"{key}: no file matches {name!r}.")
         return [(key, path, True) for path in matches or ()]
 
     def _checked(self, values: dict[str, Any]) -> StageTask | None:
@@ -173,17 +174,17 @@ class _StageValues:
                 made.append(model(**own))
             except ValidationError as error:
                 for one in error.errors():
-                    self._told(one)
+                    self._report_refusal(one)
         return StageTask(self._stage.name, *made) if len(made) == 3 else None
 
-    def _told(self, refusal: Any) -> None:
+    def _report_refusal(self, refusal: Any) -> None:
         """Report why the stage's settings refuse a value."""
         key = str(refusal["loc"][0]) if refusal["loc"] else ""
         if key in self._refused:
             return
         unit = self._fields.get(key, {}).get("unit")
         seen = "" if refusal["type"] == "missing" else f", not {refusal['input']!r}"
-        self._problems.add(self._places.get(key, (*self._place, key)),
+        self._problems.add(self._key_paths.get(key, (*self._key_path, key)),
                            f"{self._stage.name} {key}: {refusal['msg']}{seen}"
                            + (f" [{unit}]." if unit else "."))
 

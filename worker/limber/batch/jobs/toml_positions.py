@@ -2,21 +2,21 @@
 
 import re
 
-Place = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
 
 _HEADER = re.compile(r"(\[\[?)([^\]]+)\]")
 _PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
 _KEY = re.compile(rf"({_PART}(?:\s*\.\s*{_PART})*)\s*=")
 
 
-def toml_lines(text: str) -> dict[Place, int]:
+def toml_lines(text: str) -> dict[KeyPath, int]:
     """Return the line, from 1, of every table and key: ``("job", 0, "stage", 1, "run")``.
 
     Text in a multi-line string that looks like a key counts as one, which does no harm.
     """
-    found: dict[Place, int] = {(): 1}
-    counts: dict[Place, int] = {}
-    table: Place = ()
+    found: dict[KeyPath, int] = {(): 1}
+    counts: dict[KeyPath, int] = {}
+    table: KeyPath = ()
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
         if header := _HEADER.match(line):
             table = ()
@@ -31,18 +31,18 @@ def toml_lines(text: str) -> dict[Place, int]:
                 table = (*table, counts[table] - 1)
             found[table] = number
         elif key := _KEY.match(line):
-            place = table
+            key_path = table
             for part in _parts(key.group(1)):
-                place = (*place, part)
-                found.setdefault(place, number)
+                key_path = (*key_path, part)
+                found.setdefault(key_path, number)
     return found
 
 
-def line_of(lines: dict[Place, int], place: Place) -> int:
-    """Return the line of ``place``, or of the nearest table that contains it."""
-    while place not in lines:
-        place = place[:-1]
-    return lines[place]
+def line_of(lines: dict[KeyPath, int], key_path: KeyPath) -> int:
+    """Return the line of ``key_path``, or of the nearest table that contains it."""
+    while key_path not in lines:
+        key_path = key_path[:-1]
+    return lines[key_path]
 
 
 def _parts(text: str) -> list[str]:

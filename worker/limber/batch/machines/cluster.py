@@ -69,8 +69,8 @@ class Cluster:
                  workers: int | None = None, progress: Progress):
         packages = ("distributed", "cryptography", *(["dask_jobqueue"] if kind in _QUEUES else []))
         require_extra("cluster", packages, "A batch on a cluster")
-        self._limits, self._place = jobs.limits, str(Path.cwd())
-        self._wanted = workers
+        self._limits, self._directory = jobs.limits, str(Path.cwd())
+        self._requested = workers
         self._is_cancelled = False
         with ExitStack() as stack:
             self._client = stack.enter_context(self._connected(stack, jobs, kind, address))
@@ -80,7 +80,7 @@ class Cluster:
     @property
     def count(self) -> int:
         """Number of tasks to run at a time."""
-        return self._wanted or max(sum(self._client.nthreads().values()), 1)
+        return self._requested or max(sum(self._client.nthreads().values()), 1)
 
     def submit(self, task: StageTask, folder: Path) -> Future:
         """Submit a task; its future holds the result of :func:`~limber.batch.stage_task.run_task`.
@@ -92,7 +92,7 @@ class Cluster:
         future: Future = Future()
         future.set_running_or_notify_cancel()
         try:
-            remote = self._client.submit(run_line, line_of_task(task), self._place, str(folder),
+            remote = self._client.submit(run_line, line_of_task(task), self._directory, str(folder),
                                          self._limits, VERSION, pure=False)
         except (OSError, NoAnswer) as error:
             raise _lost(error) from error
@@ -154,10 +154,11 @@ class Cluster:
         from distributed import LocalCluster
         from distributed.security import Security
 
-        self._wanted = worker_count(len(jobs.branches), wanted=self._wanted or jobs.workers)
-        cores = max(core_budget() // self._wanted, 1)
+        self._requested = worker_count(len(jobs.branches), requested=self._requested
+                                       or jobs.workers)
+        cores = max(core_budget() // self._requested, 1)
         return LocalCluster(
-            n_workers=self._wanted, threads_per_worker=1, processes=True, memory_limit=0,
+            n_workers=self._requested, threads_per_worker=1, processes=True, memory_limit=0,
             host=_LOOPBACK, protocol="tls://", security=Security.temporary(),
             dashboard_address=f"{_LOOPBACK}:0", worker_dashboard_address=f"{_LOOPBACK}:0",
             scheduler_kwargs={"dashboard": False}, env={CORES: str(cores)}, silence_logs="CRITICAL")
@@ -166,8 +167,8 @@ class Cluster:
         import dask
         import dask_jobqueue
 
-        self._wanted = self._wanted or jobs.workers
-        if self._wanted is None:
+        self._requested = self._requested or jobs.workers
+        if self._requested is None:
             raise InputError(f"The number of jobs to request from {kind} is not given.",
                              "Each job waits in the queue and uses its allocation.",
                              "Give --workers N, or `workers = N` in the job file.")
@@ -194,8 +195,8 @@ class Cluster:
             raise WorkError(f"The cluster of {kind} could not be started: {error}", "",
                             f"Its settings are Dask's own (jobqueue.{kind}).") from error
         # An expired allocation is requested again.
-        cluster.adapt(minimum_jobs=self._wanted, maximum_jobs=self._wanted)
-        self._wanted *= cores
+        cluster.adapt(minimum_jobs=self._requested, maximum_jobs=self._requested)
+        self._requested *= cores
         return cluster
 
     def _wait(self, name: str, progress: Progress) -> None:
@@ -216,8 +217,8 @@ def _unfit_here(version: str) -> str:
 
 
 def _lost(error: Exception | None) -> ClusterLostError:
-    told = f" ({error})" if error is not None else ""
-    return ClusterLostError(f"The Dask scheduler no longer responds{told}.",
+    cause = f" ({error})" if error is not None else ""
+    return ClusterLostError(f"The Dask scheduler no longer responds{cause}.",
                             "Completed results are kept. A branch that was in work has its state "
                             "before or after the running stage.",
                             "Run the batch again. It continues from there.")
@@ -225,8 +226,8 @@ def _lost(error: Exception | None) -> ClusterLostError:
 
 def _check_address(address: str) -> None:
     """Only encrypted data leaves this computer: whoever reaches a worker can run programs."""
-    protocol, _, place = address.partition("://")
-    host = place.rpartition(":")[0].strip("[]")
+    protocol, _, rest = address.partition("://")
+    host = rest.rpartition(":")[0].strip("[]")
     if protocol not in ("tls", "tcp") or not host:
         raise InputError(f"{address!r} is not the address of a Dask scheduler.", "",
                          "Write tls://HOST:PORT, as `dask scheduler` prints it.")

@@ -37,13 +37,13 @@ def unfit(version: str) -> str:
     return ""
 
 
-def run_line(line: list[str], place: str, folder: str, limits: Limits, version: str,
+def run_line(line: list[str], directory: str, folder: str, limits: Limits, version: str,
              ) -> dict[str, Any]:
     """Run a stage's command line in a process of this worker's pool; return its outcome.
 
     Args:
         line: The stage and its arguments, as typed after ``limber``.
-        place: The folder to which the paths in it are relative.
+        directory: The folder to which the paths in it are relative.
         folder: The branch folder.
         limits: Its limits on time and memory.
         version: Version of the batch.
@@ -59,7 +59,7 @@ def run_line(line: list[str], place: str, folder: str, limits: Limits, version: 
         return _failed(f"The worker {os.getpid()} cannot run this stage: {reason}.", 0.0)
     started = time.perf_counter()
     try:
-        return _workers_pool().submit(_run, line, place, folder, limits=limits).result()
+        return _workers_pool().submit(_run, line, directory, folder, limits=limits).result()
     except Cancelled:
         raise
     except LimberError as error:
@@ -88,9 +88,9 @@ def _workers_pool() -> Pool:
         return _pool
 
 
-def _run(line: list[str], place: str, folder: str, progress: Progress) -> dict[str, Any]:
+def _run(line: list[str], directory: str, folder: str, progress: Progress) -> dict[str, Any]:
     # Paths of the command line are relative to the start folder of the batch, on every machine.
-    os.chdir(place)
+    os.chdir(directory)
     task = task_of_line(line)
     end = time.monotonic() + _BUSY_SECONDS
     while True:

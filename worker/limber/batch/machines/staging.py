@@ -72,7 +72,7 @@ def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
     if not branch.home:
         return
     theirs = read_bytes(f"{branch.home}/{MANIFEST}")
-    if theirs is None or _is_ours(branch, theirs):
+    if theirs is None or _is_unchanged(branch, theirs):
         return
     if (branch.folder / MANIFEST).is_file():
         # All local content was uploaded before the remote content was changed.
@@ -102,7 +102,7 @@ def put_summary(jobs: JobFile) -> None:
             put(path, f"{jobs.home}/{path.name}")
 
 
-def _is_ours(branch: BranchJob, theirs: bytes) -> bool:
+def _is_unchanged(branch: BranchJob, theirs: bytes) -> bool:
     """Whether the local branch is the one at its address, or newer.
 
     Raises:
@@ -113,19 +113,19 @@ def _is_ours(branch: BranchJob, theirs: bytes) -> bool:
         return False
     # Files of a killed program come first: they are this branch.
     settled_manifest(branch.folder)
-    there, known = hashlib.sha256(theirs).hexdigest(), _known(branch)
+    remote_digest, known = hashlib.sha256(theirs).hexdigest(), _known(branch)
     here = file_digest(path)
-    if here == there:
+    if here == remote_digest:
         _note(branch, here)
         return True
-    if here != known != there:
+    if here != known != remote_digest:
         raise BranchFolderError(
             f"{branch.home} and {branch.folder} are different branches.",
             "Both have changed since one was copied from the other, or they were never the same "
             "branch.",
             f"Move {branch.folder} away to continue with the remote branch, or move the remote "
             "branch away to continue with the local one.")
-    return there == known
+    return remote_digest == known
 
 
 def _download(branch: BranchJob, manifest: bytes, stop: Callable[[], None]) -> None:
@@ -150,20 +150,20 @@ def _download(branch: BranchJob, manifest: bytes, stop: Callable[[], None]) -> N
 
 def _put_branch(branch: BranchJob) -> None:
     theirs = read_bytes(f"{branch.home}/{MANIFEST}")
-    if theirs is not None and not _is_ours(branch, theirs):
+    if theirs is not None and not _is_unchanged(branch, theirs):
         raise BranchFolderError(f"Another program changed {branch.home} at the same time.",
                                 f"The results of this run are in {branch.folder}.",
                                 "Run only one batch at a time on this branch.")
     mine = settled_manifest(branch.folder)
-    there = _files(theirs)
+    remote_files = _files(theirs)
     for name, entry in mine.files.items():
-        if there.pop(name, None) != entry.sha256:
+        if remote_files.pop(name, None) != entry.sha256:
             put(branch.folder / checked_name(name), f"{branch.home}/{name}")
     digest = file_digest(branch.folder / MANIFEST)
     if theirs is None or hashlib.sha256(theirs).hexdigest() != digest:
         put(branch.folder / MANIFEST, f"{branch.home}/{MANIFEST}")
     _note(branch, digest)
-    for name in there:
+    for name in remote_files:
         take_away(f"{branch.home}/{name}")
 
 
@@ -199,12 +199,12 @@ def _mark(branch: BranchJob) -> Path:
 def _known(branch: BranchJob) -> str:
     """The manifest's checksum when the local and the remote branch were last the same."""
     try:
-        told = read_json(_mark(branch), "a record of the fetched files")
+        record = read_json(_mark(branch), "a record of the fetched files")
     except InputError:
         # There is none, or it is damaged: then its state is unknown.
         return ""
-    is_of_it = isinstance(told, dict) and told.get("address") == branch.home
-    return str(told.get("manifest", "")) if is_of_it else ""
+    is_of_it = isinstance(record, dict) and record.get("address") == branch.home
+    return str(record.get("manifest", "")) if is_of_it else ""
 
 
 def _note(branch: BranchJob, digest: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from limber.robot.virtual.launch import VirtualRobot
 
 STILL_M_S = 1e-4
-_LED_M = 0.015  # from the grasp's rest: the branch is led
+_LED_M = 0.015  # the tip moves this far from the grasp's rest while the branch is led
 _LED_M_S = 0.01
 _AT_END_M = 5e-4
 _EVERY_SECONDS, _CLOSELY_SECONDS = 0.05, 0.004
@@ -22,11 +22,11 @@ class Overload:
 
     Attributes:
         standstill: Time from the overload until the arm stood still [s].
-        way: Distance that the gripper still moved [m].
+        travel: Distance that the gripper still moved [m].
     """
 
     standstill: float
-    way: float
+    travel: float
 
 
 @dataclass
@@ -73,10 +73,10 @@ class Watch:
         still = [state for state in held if _speed(state) < STILL_M_S]
         if not still:
             return None
-        places = np.array([state["flange"] for state in still])
-        away = np.linalg.norm(places - held[0]["flange"], axis=1)
-        there = np.linalg.norm(places - places[away.argmax()], axis=1) < _AT_END_M
-        return np.mean([state["points"] for state, is_there in zip(still, there, strict=True)
+        positions = np.array([state["flange"] for state in still])
+        away = np.linalg.norm(positions - held[0]["flange"], axis=1)
+        is_at_end = np.linalg.norm(positions - positions[away.argmax()], axis=1) < _AT_END_M
+        return np.mean([state["points"] for state, is_there in zip(still, is_at_end, strict=True)
                         if is_there], axis=0)
 
     def _run(self) -> None:
@@ -85,13 +85,13 @@ class Watch:
             state = self.robot.state
             self.states.append(state)
             # The flange's: the tool that poses are of is set for a motion, and put back.
-            place = np.array(state["flange"])
+            position = np.array(state["flange"])
             if state["branch"] != "held":
                 start = None
                 continue
-            start = place if start is None else start
-            is_led = np.linalg.norm(place - start) > _LED_M and _speed(state) > _LED_M_S
-            if self.overload is not None and self.overloaded is None and is_led:
+            start = position if start is None else start
+            is_moving = np.linalg.norm(position - start) > _LED_M and _speed(state) > _LED_M_S
+            if self.overload is not None and self.overloaded is None and is_moving:
                 self._overload()
 
     def _overload(self) -> None:
@@ -101,8 +101,8 @@ class Watch:
         while not self._ended.wait(_CLOSELY_SECONDS):
             state = self.robot.state
             if _speed(state) < STILL_M_S:
-                way = np.subtract(state["flange"], before["flange"])
-                self.overloaded = Overload(time.monotonic() - began, float(np.linalg.norm(way)))
+                offset = np.subtract(state["flange"], before["flange"])
+                self.overloaded = Overload(time.monotonic() - began, float(np.linalg.norm(offset)))
                 return
 
 

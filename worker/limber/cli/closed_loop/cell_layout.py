@@ -16,7 +16,7 @@ from limber.robot.motion.trajectory import densely
 
 GRASP_FRACTION = 0.85
 """Position of the grasp on the branch's main path."""
-_AROUND_M = 0.06  # that the gripper is to reach about the grasp
+_AROUND_M = 0.06  # the gripper must reach this far around the grasp
 _RIM_M = 0.12  # radius of the pot's rim, which has marks to touch
 _MARKS = 6
 _SINGULARITY = 0.08
@@ -32,9 +32,9 @@ def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: f
     """
     path = skeleton.main_path()
     along, radius = skeleton.arc_length[path], skeleton.radius[path]
-    place = fraction * along[-1]
-    at = np.linspace(0.0, place, 400)
-    arms, radii = place - at, np.interp(at, along, radius)
+    distance = fraction * along[-1]
+    at = np.linspace(0.0, distance, 400)
+    arms, radii = distance - at, np.interp(at, along, radius)
     return float(force / travel * scipy.integrate.trapezoid(arms**2 / (np.pi / 4 * radii**4), at))
 
 
@@ -85,9 +85,9 @@ def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis:
     for rotation in across(axis):
         grasp = matrices(np.r_[point, rotation])
         around = [grasp]
-        for way in _AROUND_M * np.vstack([np.eye(3), -np.eye(3)]):
+        for offset in _AROUND_M * np.vstack([np.eye(3), -np.eye(3)]):
             away = grasp.copy()
-            away[:3, 3] += way
+            away[:3, 3] += offset
             around += [away, grasp]
         back = grasp.copy()
         back[:3, 3] -= 0.08 * grasp[:3, 2]

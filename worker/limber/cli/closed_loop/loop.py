@@ -25,8 +25,8 @@ from limber.cli.closed_loop.cell_layout import (
     sideways,
     write_touched,
 )
-from limber.cli.closed_loop.comparison import Told, compared
-from limber.cli.closed_loop.task_sizes import Wish, wish_for
+from limber.cli.closed_loop.comparison import Planned, compared
+from limber.cli.closed_loop.task_sizes import TaskSizes, wish_for
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.json_values import plain
 from limber.core.numerics.rigid import matrices
@@ -49,18 +49,18 @@ FLOWER, PLAN = "flower", "to-light"
 PLANNED_TOLERANCE_M = 0.006
 """Tolerance for planning: a path ends where the region begins, and the model has an error."""
 
-_LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
+_LENGTH_M = 0.4  # solved within some hundredths of a second
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
 OPEN_FACTOR = 4.0
 """Ratio of the ends of a modulus's interval above which `limber suggest-pull` decides whether
 another pull is worthwhile for the plan.
 """
 _MOST_PULLS = 3
-_MORE_SAMPLES = 450  # about twice the usual
-_FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
+_MORE_SAMPLES = 450  # about twice the default
+_FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # fractions of the main path at which another pull may hold it
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 _TOUCH_SIGMA_M = 3e-4
-_POISSON_SIGMA, _DENSITY_SIGMA, _WAVE_SIGMA = 0.05, 0.1, 0.12  # from what a fit is told
+_POISSON_SIGMA, _DENSITY_SIGMA, _WAVE_SIGMA = 0.05, 0.1, 0.12  # standard deviations in the fit
 _SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8
 _PULL_SPEED_M_S = 0.02
 _PLAN_SPEED_M_S = 0.03
@@ -128,7 +128,7 @@ class ClosedLoop:
                           ["--branch", str(file), "--seed", str(self.seed)]) as robot:
             try:
                 moved = self._reconstructed(truth, cell)
-                told = self._told(robot)
+                planned = self._pulled_and_planned(robot)
                 executed, watch = self._executed(robot)
                 stopped = self._overloaded(robot, executed)
             except SafetyStop:
@@ -139,7 +139,7 @@ class ClosedLoop:
                                        f"by {held_up:.0f} ms in total.")
                 raise
         return plain({"seed": self.seed, "branch": self.branch, **compared(
-            truth, moved, told, executed, watch, stopped,
+            truth, moved, planned, executed, watch, stopped,
             read_cell(self.cell_file).limits.soft_force_n), "part_seconds": self.seconds})
 
     # Parts
@@ -157,11 +157,11 @@ class ClosedLoop:
 
     def _setting(self, truth: TrueBranch, cell: Cell) -> BranchSetting:
         """Return the true branch: it deviates from the fit's assumptions within their limits."""
-        rng, told = np.random.default_rng([self.seed, 8]), VirtualPullSettings()
-        poisson = float(np.clip(rng.normal(told.poisson, _POISSON_SIGMA), 0.2, 0.47))
+        rng, defaults = np.random.default_rng([self.seed, 8]), VirtualPullSettings()
+        poisson = float(np.clip(rng.normal(defaults.poisson, _POISSON_SIGMA), 0.2, 0.47))
         return BranchSetting.of_truth(
             truth, cell, self.folder / "truth.vtu", poisson=poisson,
-            density=told.density * (1 + _DENSITY_SIGMA * float(rng.standard_normal())),
+            density=defaults.density * (1 + _DENSITY_SIGMA * float(rng.standard_normal())),
             wave=_WAVE_SIGMA * float(rng.standard_normal()))
 
     def _cell(self, truth: TrueBranch) -> Cell:
@@ -206,82 +206,82 @@ class ClosedLoop:
                    "--at", *tip)
         return moved
 
-    def _told(self, robot: VirtualRobot) -> Told:
+    def _pulled_and_planned(self, robot: VirtualRobot) -> Planned:
         """Pull, estimate and plan; repeat the pull as long as that is worthwhile for the plan."""
         branch = Branch.open(self.branch)
         point, axis = grasp_of(load_skeleton(branch))
         self._pulled(robot, 1, point, axis, "--direction", *sideways(point)[0], "--distance",
                      _TRAVEL_M)
-        told = self._planned()
+        planned = self._planned()
         for number in range(2, _MOST_PULLS + 1):
-            if told.open_factor <= OPEN_FACTOR:
-                return replace(told, reason=f"no interval is open beyond {OPEN_FACTOR:g}")
+            if planned.open_factor <= OPEN_FACTOR:
+                return replace(planned, reason=f"no interval is open beyond {OPEN_FACTOR:g}")
             reached = [part for part in _FRACTIONS if self._reaches(part)]
             if not reached:
-                return replace(told, reason="the arm reaches no grasp for another pull")
+                return replace(planned, reason="the arm reaches no grasp for another pull")
             found = self._part("suggest", "whether another pull is worthwhile", "suggest-pull",
                                self.branch, "--plan", PLAN, "--fractions",
                                ",".join(map(str, reached)), "--max-force",
                                read_cell(self.cell_file).limits.soft_force_n)
             if not found["plan"]["worth"]:
-                return replace(told, reason=found["plan"]["why"])
+                return replace(planned, reason=found["plan"]["why"])
             self._pulled(robot, number, *grasp_of(load_skeleton(branch),
                                                    found["best"]["grasp_fraction"]), "--suggested")
-            told = replace(self._planned(told.goal), pull_count=number)
-        return replace(told, reason=f"{_MOST_PULLS} pulls were made")
+            planned = replace(self._planned(planned.goal), pull_count=number)
+        return replace(planned, reason=f"{_MOST_PULLS} pulls were made")
 
     def _reaches(self, fraction: float) -> bool:
         """Whether the arm reaches the surroundings of a position on the main path."""
-        place = grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
+        grasp = grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
         try:
-            gripper_at(read_cell(self.cell_file), *place)
+            gripper_at(read_cell(self.cell_file), *grasp)
         except NoPathError:
             return False
         return True
 
     def _pulled(self, robot: VirtualRobot, number: int, point: np.ndarray, axis: np.ndarray,
-                *way: object) -> None:
+                *options: object) -> None:
         """Record a pull with the gripper about ``point`` [3]."""
         joints, _rotation = gripper_at(read_cell(self.cell_file), point, axis)
         robot.ask("stand", joints=list(map(float, joints)))
         name = f"pull-{number}"
         self._part("record", "a pull along the branch's arc", "record", self.branch, "--cell",
                    self.cell_file, "--name", name, "--confirm", name, "--markers", MARKER_PORT,
-                   *way, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
+                   *options, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
 
-    def _planned(self, goal: np.ndarray | None = None) -> Told:
+    def _planned(self, goal: np.ndarray | None = None) -> Planned:
         """Estimate, sample the energy field and plan the flower's path to a position [3], or to one
         that suits the branch.
         """
         estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
                                self.branch)
         branch = Branch.open(self.branch)
-        place, _axis = grasp_of(load_skeleton(branch))
+        point, _axis = grasp_of(load_skeleton(branch))
         # A target position for the flower: where a pull to the other side takes it.
-        wish = wish_for(branch, sideways(place)[1], _TRAVEL_M)
-        write_cell(self.cell_file, wish.limited(read_cell(self.cell_file)))
-        goal = wish.place if goal is None else goal
-        self._sampled(wish)
+        task = wish_for(branch, sideways(point)[1], _TRAVEL_M)
+        write_cell(self.cell_file, task.limited(read_cell(self.cell_file)))
+        goal = task.target if goal is None else goal
+        self._sampled(task)
         try:
-            plan = self._ways(wish, goal)
+            plan = self._path(task, goal)
         except WorkError as error:
             if UNPROVEN not in str(error):
                 raise
             # Follow the advice of the error once: with two stable shapes, few poses describe the
             # force of a branch only coarsely.
             self.progress.warn(f"plan: {error} Planning is repeated with {_MORE_SAMPLES} poses.")
-            self._sampled(wish, "--samples", _MORE_SAMPLES)
-            plan = self._ways(wish, goal)
-        return Told(estimated, goal, wish, plan)
+            self._sampled(task, "--samples", _MORE_SAMPLES)
+            plan = self._path(task, goal)
+        return Planned(estimated, goal, task, plan)
 
-    def _sampled(self, wish: Wish, *more: object) -> None:
+    def _sampled(self, task: TaskSizes, *more: object) -> None:
         self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed",
-                   self.seed, "--deflection", wish.sampled_deflection, *more)
+                   self.seed, "--deflection", task.sampled_deflection, *more)
 
-    def _ways(self, wish: Wish, goal: np.ndarray) -> dict[str, Any]:
+    def _path(self, task: TaskSizes, goal: np.ndarray) -> dict[str, Any]:
         return self._part("plan", "path of the flower to the light", "plan", self.branch, "--name",
                           PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
-                          "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", wish.max_force,
+                          "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", task.max_force,
                           "--speed", _PLAN_SPEED_M_S, "--seed", self.seed)
 
     def _executed(self, robot: VirtualRobot) -> tuple[dict[str, Any], Watch]:
@@ -310,11 +310,11 @@ class ClosedLoop:
             raise WorkError("The overload stopped nothing.", f"{overload[2]:.0f} N were added to "
                             "the sensor reading while the branch was "
                             "moved.", "See the robot's log.")
-        told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
-        if told["stop_reason"] is None:
+        recorded = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
+        if recorded["stop_reason"] is None:
             # It was stopped by something else before it moved; the report is of the earlier path.
             raise stopped
-        return told["stop_reason"], watch
+        return recorded["stop_reason"], watch
 
     def _armed(self, dry: dict[str, Any]) -> list[object]:
         return ["--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S, "--arm",

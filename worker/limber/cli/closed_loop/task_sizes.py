@@ -21,16 +21,16 @@ _BEYOND = 1.5
 
 
 @dataclass(frozen=True)
-class Wish:
+class TaskSizes:
     """A goal for the flower, and the effort to hold it there by the branch's model.
 
     Attributes:
-        place: Position of the flower, branch frame [m], shape [3].
+        target: Position of the flower, branch frame [m], shape [3].
         holding_force: [N] of the gripper.
         deflection: Displacement of the grasp, as a fraction of the branch's length up to it.
     """
 
-    place: np.ndarray
+    target: np.ndarray
     holding_force: float
     deflection: float
 
@@ -52,18 +52,18 @@ class Wish:
         return cell.model_copy(update={"limits": LimitsEntry.model_validate(limits)})
 
 
-def wish_for(branch: Branch, way: np.ndarray, travel: float) -> Wish:
+def wish_for(branch: Branch, direction: np.ndarray, travel: float) -> TaskSizes:
     """Return a position for the branch's first target in which the branch can be held.
 
-    A force along ``way`` [3] that moves the grasp by ``travel`` [m] takes the target there; the
-    branch is then bent, and neither stretched nor compressed.
+    A force along ``direction`` [3] that moves the grasp by ``travel`` [m] takes the target there;
+    the branch is then bent, and neither stretched nor compressed.
 
     Raises:
         WorkError: no such force moves it so far.
     """
     model = load_grasp_model(branch, gravity=True)
-    size = force_for_travel(model.model, model.grasp, way, travel)
-    state = solve_static(model.model, grasp=model.grasp, grasp_force=size * way).require()
+    size = force_for_travel(model.model, model.grasp, direction, travel)
+    state = solve_static(model.model, grasp=model.grasp, grasp_force=size * direction).require()
     gone = np.linalg.norm(model.pose(state.displacement)[:3] - model.rest_position)
-    return Wish(model.branch.target_positions(state.displacement)[0],
-                float(size * np.linalg.norm(way)), float(gone / model.reach.arc_length))
+    return TaskSizes(model.branch.target_positions(state.displacement)[0],
+                     float(size * np.linalg.norm(direction)), float(gone / model.reach.arc_length))

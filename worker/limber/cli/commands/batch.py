@@ -77,11 +77,11 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     if dry_run:
         planned = plan_of(jobs, records, retry_failed=retry_failed)
         run.show("What would run", [["branch", "stage", ""], *(
-            [branch.name, task.label, told] for branch, task, told in planned)])
+            [branch.name, task.label, state] for branch, task, state in planned)])
         run.close(f"{len(planned)} stages on {len(jobs.branches)} branches would run.",
                   then=f"limber batch {shlex.quote(str(job_file))}")
         return {"branch_count": len(jobs.branches), "task_count": len(planned),
-                "planned": [[branch.name, task.label, told] for branch, task, told in planned]}
+                "planned": [[branch.name, task.label, state] for branch, task, state in planned]}
     try:
         run_jobs(jobs, records, retry_failed=retry_failed, workers=workers,
                  cluster=cluster, scheduler=scheduler, progress=run.progress)

@@ -36,25 +36,27 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     if not source.exists():
         raise InputError(f"There is no {source}.", "A branch folder or a scan was expected.",
                          "Name the branch folder or scan that the bug is about.")
-    told: dict[str, Any] = {"note": note, "doctor": plain(report()), "damages": [], "opens": True}
+    report_content: dict[str, Any] = {"note": note, "doctor": plain(report()), "damages": [],
+                                      "opens": True}
     if source.is_dir():
-        told |= _of_folder(source)
+        report_content |= _of_folder(source)
         # A link may lead to a file outside the branch.
-        files = sorted(Path(place, name) for place, _, names in os.walk(source) for name in names
-                       if Path(place, name).is_file() and not is_link(Path(place, name)))
+        files = sorted(Path(folder, name) for folder, _, names in os.walk(source) for name in names
+                       if Path(folder, name).is_file() and not is_link(Path(folder, name)))
         names = {path: path.relative_to(source).as_posix() for path in files}
     else:
         files, names = [source], {source: source.name}
-    told["files"] = {names[path]: {"bytes": path.stat().st_size, "sha256": _digest(path)}
-                     for path in files}
+    report_content["files"] = {names[path]: {"bytes": path.stat().st_size, "sha256": _digest(path)}
+                               for path in files}
     # A file with a second name elsewhere may not belong to the branch either.
     kept = {path for path in files if source.is_dir() and has_other_names(path)}
-    told["not_packed"] = sorted(names[path] for path in kept)
+    report_content["not_packed"] = sorted(names[path] for path in kept)
     count = 0
     try:
         with replacing(output) as stream, zipfile.ZipFile(
                 stream, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("report.json", json.dumps(plain(told), indent=1, default=str))
+            archive.writestr("report.json",
+                             json.dumps(plain(report_content), indent=1, default=str))
             for path, name in names.items():
                 if path not in kept and (name == MANIFEST or (
                         data and path.resolve() != Path(output).resolve())):
@@ -67,7 +69,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     run.close(f"{count} files and what is installed. Look into it before you send it.",
               where=output)
     return {"output": output, "file_count": count, "byte_count": Path(output).stat().st_size,
-            "opens": told["opens"], "damaged_count": len(told["damages"])}
+            "opens": report_content["opens"], "damaged_count": len(report_content["damages"])}
 
 
 def _of_folder(folder: Path) -> dict[str, Any]:

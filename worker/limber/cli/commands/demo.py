@@ -76,24 +76,24 @@ class _Demo:
             self.kept.add(name)
         self._tell(title, name)
         for warning in result.get("warnings", []):
-            if told := without_foreign_options(warning, self.own):
-                self.run.progress.warn(f"{name}: {told}")
+            if text := without_foreign_options(warning, self.own):
+                self.run.progress.warn(f"{name}: {text}")
 
     def scene(self, scene: Path, picture: Path) -> None:
         """Make scene and picture, unless they exist and show the current branch."""
         title, note = "a Blender scene and its picture", self.folder / "demo.json"
-        shown = {"branch": self._digest(), "limber": VERSION}
-        if scene.is_file() and picture.is_file() and _read_note(note) == shown:
+        origin = {"branch": self._digest(), "limber": VERSION}
+        if scene.is_file() and picture.is_file() and _read_note(note) == origin:
             self.kept.add("scene")
             self.seconds["scene"], self.done = 0.0, _ENDS["scene"]
             self._tell(title, "scene")
             return
         self.stage(title, "scene", self.branch, "-o", scene, "--render", picture)
-        write_atomically(note, json.dumps(shown) + "\n")
+        write_atomically(note, json.dumps(origin) + "\n")
 
     def _tell(self, title: str, name: str) -> None:
-        told = "kept" if name in self.kept else f"{self.seconds[name]:.1f} s"
-        self.run.say(f"  {title:<42} {told:>8}")
+        duration = "kept" if name in self.kept else f"{self.seconds[name]:.1f} s"
+        self.run.say(f"  {title:<42} {duration:>8}")
 
     def _entries(self) -> dict[str, str]:
         """Return when each stage of the branch was finished, by its entry."""
@@ -106,8 +106,8 @@ class _Demo:
         return None if manifest is None else manifest.content_digest()
 
     def _manifest(self) -> Manifest | None:
-        there = (self.branch / MANIFEST).is_file()
-        return Branch.read(self.branch).manifest if there else None
+        is_written = (self.branch / MANIFEST).is_file()
+        return Branch.read(self.branch).manifest if is_written else None
 
     def _in_own_words(self, name: str, error: LimberError) -> LimberError:
         """Return a stage's error without advice on options that only the stage has."""
@@ -165,7 +165,7 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     if cloud is not None:
         run.say("The pull is simulated with an assumed Young's modulus (--young). The stiffness "
                 "of this branch was not measured.")
-    failure = _run_stages(demo, cloud, young=young, seed=seed, wishes=wishes)
+    failure = _run_stages(demo, cloud, young=young, seed=seed, options=wishes)
     _show_tables(demo)
     summary = _summary(demo) | {"demo_seconds": round(time.perf_counter() - started, 1)}
     if failure is not None:
@@ -208,7 +208,7 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
 
 
 def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
-                wishes: Mapping[str, Any]) -> LimberError | None:
+                options: Mapping[str, Any]) -> LimberError | None:
     """Run all stages; a failure between mesh and scene still ends in a report.
 
     Returns:
@@ -222,8 +222,8 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
         cloud = source / "cloud.ply"
     else:
         truth = ("--young", young)
-    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *_scan_options(wishes))
-    goal = ["--goal", *wishes["goal"]] if wishes.get("goal") else []
+    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *_scan_options(options))
+    goal = ["--goal", *options["goal"]] if options.get("goal") else []
     failure = None
     try:
         demo.stage("a simulated pull, with noise and the errors of a cell", "virtual-pull", branch,
@@ -244,17 +244,17 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
     return failure
 
 
-def _scan_options(wishes: Mapping[str, Any]) -> list[object]:
+def _scan_options(chosen: Mapping[str, Any]) -> list[object]:
     """Known properties of the scan, as options of `limber reconstruct`."""
-    scan = wishes["scan"]
-    if wishes["crop"]:
-        scan = scan.model_copy(update={"crop_low": wishes["crop"][:3],
-                                       "crop_high": wishes["crop"][3:]})
+    scan = chosen["scan"]
+    if chosen["crop"]:
+        scan = scan.model_copy(update={"crop_low": chosen["crop"][:3],
+                                       "crop_high": chosen["crop"][3:]})
     options: list[object] = list(command_line(scan))
     for name in ("skeleton", "edits"):
-        if wishes[name]:
-            options += [f"--{name}", wishes[name]]
-    return [*options, "--force"] if wishes["force"] else options
+        if chosen[name]:
+            options += [f"--{name}", chosen[name]]
+    return [*options, "--force"] if chosen["force"] else options
 
 
 def _make_folder(folder: Path) -> None:
@@ -281,12 +281,12 @@ def _found(demo: _Demo) -> list[str]:
     from limber.results.findings import beyond_sentence, certificate_sentence, path_sentence
 
     plan = demo.results["plan"]
-    told = [path_sentence(plan), certificate_sentence(plan), beyond_sentence(plan)]
+    sentences = [path_sentence(plan), certificate_sentence(plan), beyond_sentence(plan)]
     if demo.kept:
         kept = "All results" if not demo.results.keys() - demo.kept - {"generate"} else (
             f"Results of {', '.join(sorted(demo.kept))}")
-        told.append(f"{kept} were kept from an earlier demo. --force reconstructs again.")
-    return [line for line in told if line]
+        sentences.append(f"{kept} were kept from an earlier demo. --force reconstructs again.")
+    return [line for line in sentences if line]
 
 
 def _loop_sentence(result: Mapping[str, Any]) -> str:
@@ -300,9 +300,9 @@ def _loop_sentence(result: Mapping[str, Any]) -> str:
 
 def _files(report: object, scene: Path, picture: Path) -> list[str]:
     """Print where the results are."""
-    shown = [(name, path) for name, path in (("scene", scene), ("picture", picture))
-             if path.is_file()]
-    return [f"{name:<8}{path}" for name, path in (("report", report), *shown)]
+    written = [(name, path) for name, path in (("scene", scene), ("picture", picture))
+               if path.is_file()]
+    return [f"{name:<8}{path}" for name, path in (("report", report), *written)]
 
 
 def _read_note(path: Path) -> Any:

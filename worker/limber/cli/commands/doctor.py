@@ -83,23 +83,23 @@ def report() -> dict[str, Any]:
     from limber.core.files.caches import known_caches
 
     return {
-        "caches": {one.name: _told_cache(one) for one in known_caches()},
+        "caches": {one.name: _cache_summary(one) for one in known_caches()},
         "python": platform.python_version(), "system": platform.platform(),
         "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
     }
 
 
-def _told_cache(cache: "Cache") -> str:
+def _cache_summary(cache: "Cache") -> str:
     """Size of a cache and its faults; `--warm` also reads its content."""
-    told = [f"{cache.file_count} files, {cache.byte_count / 1e6:.0f} MB"]
+    parts = [f"{cache.file_count} files, {cache.byte_count / 1e6:.0f} MB"]
     if not os.access(cache.folder, os.W_OK):
-        told.append(f"{cache.folder} cannot be written: nothing is kept, every run computes it")
+        parts.append(f"{cache.folder} cannot be written: nothing is kept, every run computes it")
     elif (free := shutil.disk_usage(cache.folder).free) < _LEAST_FREE_BYTES:
-        told.append(f"its disk has {free / 1e6:.0f} MB left (`limber cache --clear` frees some)")
+        parts.append(f"its disk has {free / 1e6:.0f} MB left (`limber cache --clear` frees some)")
     if cache.empty_count:
-        told.append(f"{cache.empty_count} of them empty, as after a power cut: each is made again "
-                    "when needed (`limber cache --clear` removes all)")
-    return "; ".join(told)
+        parts.append(f"{cache.empty_count} of them empty, as after a power cut: each is made again "
+                     "when needed (`limber cache --clear` removes all)")
+    return "; ".join(parts)
 
 
 def _version(distribution: str) -> str:

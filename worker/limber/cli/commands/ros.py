@@ -152,7 +152,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     _, cell, _, motion, result = planned_motion(
         branch_folder, name, cell_file, ExecuteSettings(speed=speed), progress=run.progress,
         is_to_move=armed)
-    trajectory = {"approach": motion.approach, "path": motion.path, "return": motion.way_back,
+    trajectory = {"approach": motion.approach, "path": motion.path, "return": motion.return_path,
                   "leaving": motion.leaving}[leg]
     result |= {"leg": leg, "leg_seconds": trajectory.duration, "armed": armed}
     if not armed:
@@ -187,10 +187,10 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     """
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
-    from limber.robot.motion.way_file import read_way
+    from limber.robot.motion.way_file import read_followed_path
 
     cell = read_cell(cell_file)
-    way = read_way(cell)
+    way = read_followed_path(cell)
     if way is None:
         raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
                          "known.", "It has followed none from this account, or the cell has "

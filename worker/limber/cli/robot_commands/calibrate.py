@@ -159,7 +159,7 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any,
     from limber.robot.cell.hand_eye import base_from_camera
     from limber.store.loading import load_skeleton
 
-    fit, told = found
+    fit, summary = found
     alignment = branch.manifest.alignment
     scan = np.eye(4)
     scan[:3, :3] = np.array(alignment.rotation)
@@ -181,7 +181,7 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any,
     return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": pose,
             "residual_m": fit.residual, "position_sigma_m": position_sigma,
             "rotation_sigma_rad": rotation_sigma, "camera_pose": mounted["pose"],
-            "camera_mount": mounted["mount"]} | told
+            "camera_mount": mounted["mount"]} | summary
 
 
 def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
@@ -266,7 +266,7 @@ def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
     """Read the tool's position at each point; the arm is guided by hand, no command is sent to it.
     """
     from limber.core.errors import WorkError
-    from limber.robot.cell.base_calibration import touched_place
+    from limber.robot.cell.base_calibration import touched_point
     from limber.robot.ur.samples import SampleStream
 
     touched = []
@@ -279,7 +279,7 @@ def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
             samples = stream.read(1.0)
             if not samples:
                 raise WorkError("The robot sends no data.", "", "Restart its controller.")
-            touched.append(touched_place(cell, samples[-1]))
+            touched.append(touched_point(cell, samples[-1]))
     finally:
         stream.close()
     return np.array(touched), version

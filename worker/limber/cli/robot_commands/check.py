@@ -39,8 +39,8 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
                           "pendant before a motion.")
     for each in seen.differences:
         run.progress.warn(f"{each}.")
-    for told in seen.implausible(cell):
-        run.progress.warn(f"The force sensor: {told}.")
+    for warning in seen.implausible(cell):
+        run.progress.warn(f"The force sensor: {warning}.")
     computer = _computer(run)
     force = seen.readings[:, :3]
     run.close(f"A {cell.arm.name} with controller version {version} answers at "
@@ -71,16 +71,16 @@ def _computer(run: Run) -> dict[str, bool]:
     """Real-time privileges of the loop that moves a robot."""
     from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 
-    told = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
-            "kept_awake": keep_awake()}
-    if not told["real_time"]:
+    summary = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
+               "kept_awake": keep_awake()}
+    if not summary["real_time"]:
         run.progress.warn("The loop has no real-time priority. Other programs can delay it, which "
                           "stops the robot.")
-    if not told["kept_in_memory"]:
+    if not summary["kept_in_memory"]:
         run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`). Memory that "
                           "was swapped out can delay it, which stops the robot.")
-    if not told["kept_awake"]:
+    if not summary["kept_awake"]:
         run.progress.warn("The computer's processors may sleep while idle (on Linux, write access "
                           "to /dev/cpu_dma_latency prevents this). Those of a virtual machine "
                           "wake late, which stops the robot.")
-    return told
+    return summary

@@ -67,9 +67,10 @@ def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, bran
     from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
 
     cell = read_cell(cell_file)
-    told = execute(branch_folder, name, cell_file, ExecuteSettings(speed=speed), ExecuteOptions(),
-                   progress=run.progress)
-    goal = np.array(told["start_joints_rad"], float)
+    dry_run = execute(branch_folder, name, cell_file, ExecuteSettings(speed=speed),
+                      ExecuteOptions(),
+                      progress=run.progress)
+    goal = np.array(dry_run["start_joints_rad"], float)
     return _to(run, cell_file, cell, branch_folder, goal, "goto-start", armed, confirm)
 
 
@@ -83,35 +84,35 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
-    from limber.robot.motion.retreat import WayBack
-    from limber.robot.motion.way_file import read_way
+    from limber.robot.motion.retreat import RetreatPath
+    from limber.robot.motion.way_file import read_followed_path
     from limber.robot.operator_decisions import require_confirmation, retreat_if_chosen
 
     cell = read_cell(cell_file)
-    way = read_way(cell)
-    if way is None:
+    followed = read_followed_path(cell)
+    if followed is None:
         raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
                          "known.", "It has followed none from this account, or the cell has "
                          "changed since.", "Free the branch: limber robot release.")
     sample, pose = stands(cell)
-    back = WayBack(cell.arm.joint_names, way).from_here(
+    back = RetreatPath(cell.arm.joint_names, followed).from_here(
         _with_pose(sample, pose), cell.limits.acceleration_m_s2)
-    result = {"way_began": datetime.fromtimestamp(way.at, UTC).isoformat(timespec="seconds"),
+    result = {"way_began": datetime.fromtimestamp(followed.at, UTC).isoformat(timespec="seconds"),
               "way_m": float(np.linalg.norm(np.diff(back.poses[:, :3], axis=0), axis=1).sum()),
-              "duration_s": back.duration, "tare_known": way.bias is not None,
-              "gripper_closed": way.gripper_closed, "armed": armed}
+              "duration_s": back.duration, "tare_known": followed.bias is not None,
+              "gripper_closed": followed.gripper_closed, "armed": armed}
     if not armed:
         return result
     require_confirmation("retreat", confirm, cell, run.progress)
     with RobotLink(cell) as link:
         link.wait_for_samples()
-        told = retreat_if_chosen(cell, link, "retreat", run.progress)
-    result |= told
+        outcome = retreat_if_chosen(cell, link, "retreat", run.progress)
+    result |= outcome
     log_move(cell_file, "retreat", result)
-    force = told["force_n"]
-    if not (told["retreated"] or told["gripper_opened"]) or (
+    force = outcome["force_n"]
+    if not (outcome["retreated"] or outcome["gripper_opened"]) or (
             force is not None and force > cell.limits.soft_force_n):
-        raise SafetyStop(told["outcome"], "", "Free the branch by hand, or `limber robot "
+        raise SafetyStop(outcome["outcome"], "", "Free the branch by hand, or `limber robot "
                          "release`.", result=result)
     return result
 
@@ -127,7 +128,7 @@ def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     cell = read_cell(cell_file)
     sample, pose = stands(cell)
     motion = away_from_branch(cell, sample.joints, pose)
-    result = _told(motion) | {"armed": armed}
+    result = _motion_summary(motion) | {"armed": armed}
     if not armed:
         return result
     require_confirmation("release", confirm, cell, run.progress)
@@ -146,7 +147,7 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
     from limber.core.errors import InputError
     from limber.robot.cell.cell import read_cell
     from limber.robot.grippers import drive_gripper, is_driven
-    from limber.robot.motion.way_file import WayFile
+    from limber.robot.motion.way_file import FollowedPathFile
 
     cell = read_cell(cell_file)
     if not is_driven(cell):
@@ -161,7 +162,7 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
                          "A bent branch springs back.", "Give --confirm open.")
     drive_gripper(cell, False)
     time.sleep(cell.tool.grip_seconds)
-    kept = WayFile(cell)
+    kept = FollowedPathFile(cell)
     kept.gripped(False)
     kept.close()
     log_move(cell_file, "open", result)
@@ -188,7 +189,7 @@ def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.nda
     sample, _ = stands(cell)
     motion = to_joints(cell, sample.joints, goal, around)
     assert motion.joints is not None
-    result = _told(motion) | {"armed": armed, "clearance_m": float(
+    result = _motion_summary(motion) | {"armed": armed, "clearance_m": float(
         around.clearance(motion.joints).min())}
     if not armed:
         return result
@@ -237,10 +238,10 @@ def _with_pose(sample: Sample, pose: np.ndarray) -> Sample:
 def require_empty(cell: Cell, run: Run) -> None:
     """Refuse a motion of the arm alone if the gripper is known to hold the branch."""
     from limber.core.errors import SafetyStop
-    from limber.robot.motion.way_file import read_way
+    from limber.robot.motion.way_file import read_followed_path
 
-    way = read_way(cell)
-    if way is not None and way.gripper_closed:
+    followed = read_followed_path(cell)
+    if followed is not None and followed.gripper_closed:
         raise SafetyStop("The gripper was closed last, and may hold the branch.",
                          "The arm would pull at it.",
                          "Use `limber robot retreat` or `limber robot release` first.")
@@ -248,7 +249,7 @@ def require_empty(cell: Cell, run: Run) -> None:
         run.progress.warn("The gripper is opened by hand: check that it is open.")
 
 
-def _told(motion: Trajectory) -> dict[str, Any]:
+def _motion_summary(motion: Trajectory) -> dict[str, Any]:
     assert motion.joints is not None
     return {"duration_s": motion.duration, "start_joints_rad": motion.joints[0],
             "end_joints_rad": motion.joints[-1], "pose_count": len(motion.times),

@@ -52,10 +52,10 @@ def new_cell(run: Run, cell_file: Path, **given: Any) -> dict[str, Any]:
     return {"cell": str(cell_file), "model": cell.arm.name, "sensor": sensor}
 
 
-def _answer(name: str, given: Any) -> Any:
+def _answer(name: str, value: Any) -> Any:
     """The given value, else the one typed at a terminal, else the usual one."""
-    if given is not None:
-        return given
+    if value is not None:
+        return value
     text, usual = _ASKED[name]
     if not sys.stdin.isatty():
         return usual

@@ -41,18 +41,18 @@ def weigh(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[s
     cell = read_cell(cell_file)
     require_empty(cell, run)
     sample, _ = stands(cell)
-    wanted = tilted_joints(sample.joints, cell.tool.mass_kg or 0.0)
-    require_tilts(-cell.arm.forward(wanted)[:, 2, :3], cell.tool.mass_kg or 0.0)
+    tilted = tilted_joints(sample.joints, cell.tool.mass_kg or 0.0)
+    require_tilts(-cell.arm.forward(tilted)[:, 2, :3], cell.tool.mass_kg or 0.0)
     around = ArmSurroundings(cell, cell_obstacles(cell, cell_file.parent), None)
-    ways = [to_joints(cell, first, second, around)
-            for first, second in pairwise(wanted)]
-    result: dict[str, Any] = {"armed": armed, "duration_s": sum(way.duration for way in ways)}
+    moves = [to_joints(cell, first, second, around)
+             for first, second in pairwise(tilted)]
+    result: dict[str, Any] = {"armed": armed, "duration_s": sum(move.duration for move in moves)}
     if not armed:
         return result
     require_confirmation("weigh", confirm, cell, run.progress)
     rows: list[np.ndarray] = []
     with RobotLink(weightless(cell), rows.append) as link:
-        found = weighed(cell, link, ways, rows)
+        found = weighed(cell, link, moves, rows)
     result |= {"mass_kg": found.mass, "mass_sigma_kg": found.sigma, "faults": list(found.faults)}
     log_move(cell_file, "weigh", result)
     if found.faults:
@@ -67,17 +67,17 @@ def weightless(cell: Cell) -> Cell:
     return cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": 0.0})})
 
 
-def weighed(cell: Cell, link: RobotLink, ways: list[Trajectory], rows: list[np.ndarray]) -> Any:
-    """Read the sensor at each end of ``ways``, and compare; ``rows`` grows as samples come."""
+def weighed(cell: Cell, link: RobotLink, moves: list[Trajectory], rows: list[np.ndarray]) -> Any:
+    """Read the sensor at each end of ``moves``, and compare; ``rows`` grows as samples come."""
     from limber.core.errors import SafetyStop
     from limber.robot.weighing import weigh as weigh_readings
 
     link.wait_for_samples()
     link.tare(_TARE_SECONDS)
     read = [_reading(cell, rows)]
-    for way in ways:
+    for move in moves:
         try:
-            event = link.follow(way)
+            event = link.follow(move)
         except KeyboardInterrupt:
             # Ctrl-C stops the arm before anything else.
             link.stop()

@@ -63,12 +63,12 @@ def flush_folder(folder: Path) -> None:
 
 def flush_tree(folder: Path) -> None:
     """Flush all files below ``folder``, and their names, to the disk."""
-    for place, _folders, files in os.walk(folder):
+    for parent, _folders, files in os.walk(folder):
         for name in files:
             # Windows flushes only files that are open for writing.
-            with open(Path(place, name), "rb+" if os.name == "nt" else "rb") as stream:
+            with open(Path(parent, name), "rb+" if os.name == "nt" else "rb") as stream:
                 os.fsync(stream.fileno())
-        flush_folder(Path(place))
+        flush_folder(Path(parent))
 
 
 def file_digest(path: str | os.PathLike) -> str:

@@ -33,9 +33,9 @@ def known_caches() -> list[Cache]:
     if not folder.is_dir():
         return []
     found = []
-    for place in sorted(path for path in folder.iterdir() if path.is_dir()):
-        sizes = [size for _, size, _ in _files(place)]
-        found.append(Cache(place.name, place, len(sizes), sum(sizes), sizes.count(0)))
+    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
+        sizes = [size for _, size, _ in _files(path)]
+        found.append(Cache(path.name, path, len(sizes), sum(sizes), sizes.count(0)))
     return found
 
 
@@ -67,20 +67,20 @@ def clear(folder: Path) -> int:
         with contextlib.suppress(OSError):
             path.unlink()
             freed += size
-    for place, _folders, _names in os.walk(folder, topdown=False):
+    for parent, _folders, _names in os.walk(folder, topdown=False):
         # The folder of each cache is kept: a running program may be about to write to it.
-        if len(Path(place).relative_to(folder).parts) > 1:
+        if len(Path(parent).relative_to(folder).parts) > 1:
             with contextlib.suppress(OSError):
-                os.rmdir(place)
+                os.rmdir(parent)
     return freed
 
 
 def _files(folder: Path) -> list[tuple[float, int, Path]]:
     """Time of last use, size and path of each file; locks, which are empty, are skipped."""
     found = []
-    for place, _folders, names in os.walk(folder):
+    for parent, _folders, names in os.walk(folder):
         for name in names:
-            path = Path(place, name)
+            path = Path(parent, name)
             with contextlib.suppress(OSError):
                 about = path.lstat()
                 if path.suffix != ".lock":

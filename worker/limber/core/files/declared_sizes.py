@@ -51,14 +51,14 @@ def check_pcd(path: Path) -> None:
         InputError: it holds fewer.
     """
     lines, body = _text_header(path, b"\nDATA")
-    said = {words[0]: words[1:] for line in lines if (words := line.split())}
+    header = {words[0]: words[1:] for line in lines if (words := line.split())}
     count = max(_count(path, word) for word in
-                (said.get("POINTS") or ["0"])[:1] + (said.get("WIDTH") or ["0"])[:1])
-    if said.get("WIDTH") and said.get("HEIGHT"):
-        count = max(count, _count(path, said["WIDTH"][0]) * _count(path, said["HEIGHT"][0]))
-    sizes = [_count(path, word) for word in said.get("SIZE", [])]
-    repeats = [_count(path, word) for word in said.get("COUNT", [])] or [1] * len(sizes)
-    kind = (said.get("DATA") or [""])[0]
+                (header.get("POINTS") or ["0"])[:1] + (header.get("WIDTH") or ["0"])[:1])
+    if header.get("WIDTH") and header.get("HEIGHT"):
+        count = max(count, _count(path, header["WIDTH"][0]) * _count(path, header["HEIGHT"][0]))
+    sizes = [_count(path, word) for word in header.get("SIZE", [])]
+    repeats = [_count(path, word) for word in header.get("COUNT", [])] or [1] * len(sizes)
+    kind = (header.get("DATA") or [""])[0]
     held = float(path.stat().st_size - body)
     if kind == "ascii":
         require_size(path, 2.0 * count * sum(repeats), held + 1, f"{count} points")

@@ -125,8 +125,8 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
                 else validated(kind, content))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {place + ': ' if place else ''}{first['msg']}.",
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: {key + ': ' if key else ''}{first['msg']}.",
                          f"{what[0].upper()}{what[1:]} was expected.",
                          "It is damaged, or was written by another program. Make it again.",
                          ) from error
@@ -274,8 +274,9 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
         array = arrays.get(name)
         fits = array is not None and array.dtype.kind in (
             "iufb" if name in flags else "iuf") and (array.ndim == len(shape)) and all(
-            length == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length))
-            for wanted, length in zip(shape, array.shape, strict=True))
+            length == (expected if isinstance(expected, int)
+                       else lengths.setdefault(expected, length))
+            for expected, length in zip(shape, array.shape, strict=True))
         if not fits:
             found = "is missing" if array is None else (
                 f"has shape {list(array.shape)} and type {array.dtype}")

@@ -76,13 +76,13 @@ def refuse_links(folder: Path) -> None:
             names it.
     """
     top = len(Path(folder).parts)
-    for place, folders, files in os.walk(folder):
-        if folders and len(Path(place).parts) - top >= _MOST_LEVELS:
+    for parent, folders, files in os.walk(folder):
+        if folders and len(Path(parent).parts) - top >= _MOST_LEVELS:
             raise InputError(f"{folder} has folders that are nested more than {_MOST_LEVELS} deep, "
-                             f"as {Path(place).relative_to(folder).as_posix()[:100]}.",
+                             f"as {Path(parent).relative_to(folder).as_posix()[:100]}.",
                              "Limber writes no such folder.", "Remove it.")
         for name in folders + files:
-            if is_link(path := Path(place, name)) and not _may_follow():
+            if is_link(path := Path(parent, name)) and not _may_follow():
                 raise _link_error(path)
 
 

@@ -70,12 +70,12 @@ def is_alive(process_id: int, start_second: int) -> bool:
 
 
 def _abandoned(folder: Path) -> Iterator[Path]:
-    for place, folders, files in os.walk(folder):
+    for parent, folders, files in os.walk(folder):
         owned = [name for name in folders + files if is_owned_name(name)]
         # Unfinished folders belong to their owners and are not searched.
         folders[:] = [name for name in folders if name not in owned]
         for name in owned:
-            path = Path(place, name)
+            path = Path(parent, name)
             if _is_abandoned(path):
                 yield path
 

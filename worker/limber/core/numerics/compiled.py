@@ -135,13 +135,13 @@ class _CheckedFile(IndexDataCacheFile):
 _DIGEST = hashlib.sha256().digest_size
 
 
-_damage_told: list[str] = []
+_reported_damage: list[str] = []
 
 
 def _tell_damage(message: str) -> None:
     """Warn once per process: if one file is damaged, others usually are too."""
-    if not _damage_told:
-        _damage_told.append(message)
+    if not _reported_damage:
+        _reported_damage.append(message)
         warnings.warn(message, DamagedCacheWarning, stacklevel=2)
 
 
@@ -151,7 +151,7 @@ def _forgiving(kernel: Any) -> Any:
     Argument types are cached by module and name. After an update that moves one, numba reads the
     old entry before it notices the changed source, and fails.
     """
-    cache = getattr(kernel, "_cache", None)  # there is none where numba is told not to compile
+    cache = getattr(kernel, "_cache", None)  # missing where numba is told not to compile
     if cache is None:
         return kernel
     cache._cache_file = _CheckedFile(cache.cache_path, cache._impl.filename_base,

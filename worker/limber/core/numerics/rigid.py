@@ -62,21 +62,21 @@ def pose_between(first: np.ndarray, second: np.ndarray, part: float | np.ndarray
                            composed(turns, first[..., 3:])], axis=-1)
 
 
-def rotations_at(times: np.ndarray, vectors: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return rotation vectors [rad] at ``wanted`` times, along the shortest rotations.
+def rotations_at(times: np.ndarray, vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
+    """Return rotation vectors [rad] at ``query`` times, along the shortest rotations.
 
     Args:
         times: Ascending, shape [n], n > 1.
         vectors: Rotation vectors at those times, shape [n, 3].
-        wanted: Times within that range, shape [m].
+        query: Times within that range, shape [m].
     """
-    return scipy.spatial.transform.Slerp(times, _rotations(vectors))(wanted).as_rotvec()
+    return scipy.spatial.transform.Slerp(times, _rotations(vectors))(query).as_rotvec()
 
 
-def poses_at(times: np.ndarray, poses: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return poses [m, 6] at ``wanted`` times; arguments as for :func:`rotations_at`."""
-    positions = np.column_stack([np.interp(wanted, times, axis) for axis in poses[:, :3].T])
-    return np.hstack([positions, rotations_at(times, poses[:, 3:], wanted)])
+def poses_at(times: np.ndarray, poses: np.ndarray, query: np.ndarray) -> np.ndarray:
+    """Return poses [m, 6] at ``query`` times; arguments as for :func:`rotations_at`."""
+    positions = np.column_stack([np.interp(query, times, axis) for axis in poses[:, :3].T])
+    return np.hstack([positions, rotations_at(times, poses[:, 3:], query)])
 
 
 def matrices(poses: np.ndarray) -> np.ndarray:

@@ -21,31 +21,31 @@ def core_budget() -> int:
     Raises:
         InputError: ``LIMBER_CORES`` is not a positive whole number.
     """
-    given = os.environ.get(CORES)
-    if given is None:
+    text = os.environ.get(CORES)
+    if text is None:
         return _machine_cores()
     try:
-        count = int(given)
+        count = int(text)
     except ValueError:
         count = 0
     if count < 1:
-        raise InputError(f"{CORES} is {given!r}.",
+        raise InputError(f"{CORES} is {text!r}.",
                          "It sets the number of cores that Limber may use.",
                          "Set it to a whole number of at least 1, or unset it.")
     return count
 
 
-def worker_count(task_count: int, *, wanted: int | None = None,
+def worker_count(task_count: int, *, requested: int | None = None,
                  memory_mb_each: float = 0.0) -> int:
     """Return how many processes to start for ``task_count`` tasks, at least 1.
 
     Args:
         task_count: Number of tasks; more processes would idle.
-        wanted: Number requested by the user; the budget still applies.
+        requested: Number requested by the user; the budget still applies.
         memory_mb_each: Estimated memory per task; only as many processes run as fit into the free
         memory.
     """
-    count = min(core_budget(), max(task_count, 1), wanted or task_count or 1)
+    count = min(core_budget(), max(task_count, 1), requested or task_count or 1)
     if memory_mb_each > 0:
         room = (1 - _SPARED_MEMORY) * free_memory_mb() / memory_mb_each
         count = min(count, int(room))

@@ -41,7 +41,7 @@ def run_module(module: str, arguments: list[str], name: str, limits: Limits, *,
         try:
             while True:
                 try:
-                    _, told = process.communicate(timeout=_TICK_SECONDS)
+                    _, stderr = process.communicate(timeout=_TICK_SECONDS)
                     break
                 except subprocess.TimeoutExpired:
                     waiting(watch.seconds)
@@ -50,4 +50,4 @@ def run_module(module: str, arguments: list[str], name: str, limits: Limits, *,
         finally:
             if process.poll() is None:
                 kill_tree(process.pid)
-    return process.returncode, (told.strip().splitlines() or [""])[-1]
+    return process.returncode, (stderr.strip().splitlines() or [""])[-1]

@@ -211,20 +211,20 @@ class Pool:
                 "It crashed, or the system ended it because it ran out of memory.",
                 "Use a coarser mesh or fewer processes (LIMBER_CORES)."))
 
-    def _take(self, worker: Worker, said: Any) -> None:
-        if isinstance(said, Began):
+    def _take(self, worker: Worker, message: Any) -> None:
+        if isinstance(message, Began):
             worker.has_begun = True
-        elif isinstance(said, CacheDamaged):
-            warnings.warn(said.message, DamagedCacheWarning, stacklevel=2)
-        elif isinstance(said, Reported) and worker.job is not None:
-            worker.job.report(said)
-        elif isinstance(said, Returned) and worker.job is not None:
-            worker.take_job().future.set_result(said.value)
-        elif isinstance(said, Failed):
+        elif isinstance(message, CacheDamaged):
+            warnings.warn(message.message, DamagedCacheWarning, stacklevel=2)
+        elif isinstance(message, Reported) and worker.job is not None:
+            worker.job.report(message)
+        elif isinstance(message, Returned) and worker.job is not None:
+            worker.take_job().future.set_result(message.value)
+        elif isinstance(message, Failed):
             if worker.job is not None:
-                worker.take_job().fail(said.error)
+                worker.take_job().fail(message.error)
             else:
-                self._broken = said.error
+                self._broken = message.error
 
     def _enforce(self) -> None:
         """Stop tasks that were cancelled or have exceeded their limits."""
@@ -292,7 +292,7 @@ def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None
         progress: Overall progress.
         message: Description of the work.
     """
-    count = worker_count(len(tasks), wanted=workers)
+    count = worker_count(len(tasks), requested=workers)
     if count > 1:
         with Pool(count, name=message or "the computation") as pool:
             return pool.map(function, tasks, progress=progress, message=message)

@@ -16,7 +16,7 @@ from typing import Any
 from limber.core.errors import LimberError, WorkError
 from limber.core.processes.budget import CORES
 from limber.core.processes.ending import end_by_kernel
-from limber.core.progress import Progress, damage_told_to
+from limber.core.progress import Progress, report_damage_to
 
 _REPORT_SECONDS = 0.05
 
@@ -88,7 +88,7 @@ def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) ->
     tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
     voice = _Voice(pipe)
     threading.Thread(target=_receive, args=(pipe, tasks, voice), daemon=True).start()
-    with damage_told_to(lambda message: voice.say(CacheDamaged(message))):
+    with report_damage_to(lambda message: voice.say(CacheDamaged(message))):
         _work(tasks, voice, begin)
 
 
@@ -122,10 +122,10 @@ class _Voice:
         """Make a progress for the next task, not cancelled."""
         self.progress = Progress(self._report, self._warn)
 
-    def say(self, said: object) -> None:
+    def say(self, message: object) -> None:
         try:
             with self._guard:
-                self._pipe.send(said)
+                self._pipe.send(message)
         except OSError:
             # There is no receiver any more.
             os._exit(1)
@@ -143,7 +143,7 @@ class _Voice:
 def _receive(pipe: Connection, tasks: "queue.SimpleQueue[Task]", voice: _Voice) -> None:
     while True:
         try:
-            said = pipe.recv()
+            message = pipe.recv()
         except (EOFError, OSError):
             # The parent ended or closed the pool: no work here needs to be finished.
             os._exit(0)
@@ -151,11 +151,11 @@ def _receive(pipe: Connection, tasks: "queue.SimpleQueue[Task]", voice: _Voice) 
             # A task that cannot be unpickled here.
             voice.say(Failed(_sendable(error)))
             continue
-        if said is None:
+        if message is None:
             voice.progress.cancel()
         else:
             voice.fresh()
-            tasks.put(said)
+            tasks.put(message)
 
 
 def _sendable(error: BaseException) -> BaseException:

@@ -23,12 +23,12 @@ class Job:
     future: Future = field(default_factory=Future)
     cancelled_at: float | None = None
 
-    def report(self, said: Reported) -> None:
+    def report(self, message: Reported) -> None:
         try:
-            if said.warning:
-                self.progress.warn(said.message)
+            if message.warning:
+                self.progress.warn(message.message)
             else:
-                self.progress(said.fraction, said.message, **said.numbers)
+                self.progress(message.fraction, message.message, **message.numbers)
         except Cancelled:
             self._end_soon()
 
@@ -63,14 +63,14 @@ class Worker:
         self.has_begun = False
         self._name = name
         self._watch: LimitWatch | None = None
-        self._is_told = False
+        self._is_cancel_sent = False
 
     @property
     def is_idle(self) -> bool:
         return self.has_begun and self.job is None
 
     def give(self, job: Job) -> None:
-        self.job, self._is_told = job, False
+        self.job, self._is_cancel_sent = job, False
         self._watch = LimitWatch(self._name, job.limits, self.process_id)
         try:
             self.pipe.send(job.task)
@@ -89,8 +89,8 @@ class Worker:
         return self._watch.broken() if self._watch else None
 
     def cancel_once(self) -> None:
-        if not self._is_told:
-            self._is_told = True
+        if not self._is_cancel_sent:
+            self._is_cancel_sent = True
             try:
                 self.pipe.send(None)
             except OSError:

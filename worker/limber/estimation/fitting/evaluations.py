@@ -73,7 +73,7 @@ class EvaluationLog:
                 entry = EvaluationEntry(**(record | {"parameters": tuple(record["parameters"])}))
                 self._known[_key(np.array(entry.parameters))] = entry
             except (KeyError, TypeError, ValueError):
-                continue  # a damaged line: that evaluation is done again
+                continue  # a damaged line: repeat that evaluation
         self.resumed_count = len(self._known)
 
 

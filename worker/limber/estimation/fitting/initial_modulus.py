@@ -48,7 +48,7 @@ def scaled_start(objective: Objective, values: Values) -> Values:
     return _scaled(objective, values)
 
 
-def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
+def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool]:
     """Fit pulls with an observed path by their force alone first, without the path.
 
     Far from the solution no force explains both the path and the points; the measured force merely
@@ -90,8 +90,8 @@ def _followed(
 ) -> Evaluation:
     """Continue the fit at the forces from a first fit, unless that is worse."""
     rough.follow_forces(found)
-    there = rough.evaluate(found.free, jacobian=True)
-    if there is None or there.objective > WORSE * found.objective:
+    at_end = rough.evaluate(found.free, jacobian=True)
+    if at_end is None or at_end.objective > WORSE * found.objective:
         for forward in observed:
             forward.step_back()
         return found
@@ -204,8 +204,8 @@ def standing_start(objective: Objective, start: Values, uniform: Values, *, expl
     Args:
         explains: Whether the start explains the pulls; otherwise the other starts come first.
     """
-    place = np.arange(len(uniform.young))
-    falling = np.exp(FALL * (place.mean() - place))
+    index = np.arange(len(uniform.young))
+    falling = np.exp(FALL * (index.mean() - index))
     likely = [replace(uniform, young=uniform.young * factor * course)
               for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)]
     if not explains and (first := _first_standing(objective, likely)) is not None:

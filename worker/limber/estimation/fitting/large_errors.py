@@ -11,7 +11,7 @@ import numpy as np
 
 from limber.core.numerics.rigid import rotated
 from limber.core.present import present
-from limber.estimation.fitting.nuisances import told
+from limber.estimation.fitting.nuisances import nuisance_records
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.parameters import Values
 from limber.recordings.recording import Pull
@@ -82,7 +82,8 @@ class FarPoints:
         if evaluation.errors is None:
             return
         size = objective.space.size
-        listed = told(objective.cell_errors.nuisances, evaluation.errors, np.zeros((size, size)))
+        listed = nuisance_records(objective.cell_errors.nuisances, evaluation.errors,
+                                  np.zeros((size, size)))
         far = far_points(listed, self.shifts)
         if far is not None:
             raise FarPointsError(far, objective.space.unpack(evaluation.free))

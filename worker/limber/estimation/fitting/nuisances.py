@@ -164,32 +164,32 @@ class CellErrors:
 
     def __init__(self, forwards: Sequence[Forward]):
         self.nuisances: list[Nuisance] = []
-        self._places: list[list[tuple[_Source, np.ndarray]]] = []
+        self._indexed_sources: list[list[tuple[_Source, np.ndarray]]] = []
         self._forwards = forwards
         known: dict[tuple[object, ...], int] = {}
         self._pivots: dict[CalibrationEntry, np.ndarray] = {}
         for forward in forwards:
-            places = []
+            indexed = []
             calibration = calibration_of(forward.entry)
             self._pivots.setdefault(calibration, np.array(forward.entry.grasp.point_m))
             for source in _sources(forward, calibration):
                 used = np.empty(len(source.names), int)
-                for place, (name, sigma) in enumerate(zip(source.names, source.sigma,
-                                                          strict=True)):
+                for k, (name, sigma) in enumerate(zip(source.names, source.sigma,
+                                                      strict=True)):
                     pull = None if source.is_shared else forward.name
                     key = (name, pull if pull is not None else calibration)
                     if key not in known:
                         known[key] = len(self.nuisances)
                         self.nuisances.append(Nuisance(name, source.unit, sigma, pull))
-                    used[place] = known[key]
-                places.append((source, used))
-            self._places.append(places)
+                    used[k] = known[key]
+                indexed.append((source, used))
+            self._indexed_sources.append(indexed)
 
     @property
     def known(self) -> np.ndarray:
         """Parts of the errors that the simulations already have, in deviations, shape [k]."""
         parts = np.zeros(self.count)
-        for forward, places in zip(self._forwards, self._places, strict=True):
+        for forward, places in zip(self._forwards, self._indexed_sources, strict=True):
             for source, used in places:
                 if source.slopes is _along:
                     parts[used] = forward.point_shifts / np.array(source.sigma)
@@ -208,7 +208,7 @@ class CellErrors:
                     for kind in ("forces", "torques", "grasps")}}
         pull = _Pull(forward.entry, frames, self._pivots[calibration_of(forward.entry)],
                      forward.grasp_tangent, forward.point_directions, positions, forces)
-        for source, used in self._places[index]:
+        for source, used in self._indexed_sources[index]:
             for kind, slope in source.slopes(pull).items():
                 total[kind][..., used] += slope * np.array(source.sigma)
         return ErrorSlopes(**total)
@@ -291,7 +291,8 @@ def _late(pull: _Pull) -> dict[str, np.ndarray]:
     return {"points": np.gradient(pull.positions, times, axis=0)[..., None]}
 
 
-def told(nuisances: Sequence[Nuisance], found: Eliminated, free: np.ndarray) -> list[dict]:
+def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
+                     free: np.ndarray) -> list[dict]:
     """Return each error with its value, 95 % interval and prior deviation, in its own unit.
 
     Args:

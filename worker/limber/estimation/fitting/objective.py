@@ -137,7 +137,7 @@ class Objective:
         other.forward_count = self.forward_count
         return other
 
-    def apart(self) -> "Objective":
+    def without_priors(self) -> "Objective":
         """Return an objective on copies of the pulls with its own log; evaluating it does not
         change this one.
         """
@@ -274,10 +274,11 @@ class Objective:
         errors: Eliminated | None = None
         if with_errors:
             known = self.cell_errors.known
-            residual, jacobian, told = eliminated(residual, jacobian, np.vstack(columns), known)
-            pulls = [_shown(simulated, of_errors, told.values - known)
+            residual, jacobian, eliminated_errors = eliminated(residual, jacobian,
+                                                               np.vstack(columns), known)
+            pulls = [_shown(simulated, of_errors, eliminated_errors.values - known)
                      for simulated, of_errors in zip(pulls, slopes, strict=True)]
-            errors = told
+            errors = eliminated_errors
             unknown_count += self.cell_errors.count
         rows, offsets = self.space.own_rows()
         residual = np.concatenate([residual, rows @ free - offsets])

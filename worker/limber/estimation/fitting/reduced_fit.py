@@ -113,11 +113,11 @@ class Reduction:
             for old in path.parent.glob(".reduced-*.npz"):
                 if not old.name.startswith(own):
                     old.unlink()
-        for place, basis in zip(self.paths, self.bases, strict=True):
-            if place is not None:
-                part = place.with_suffix(".part")
+        for file, basis in zip(self.paths, self.bases, strict=True):
+            if file is not None:
+                part = file.with_suffix(".part")
                 write_model(basis, part)
-                part.replace(place)
+                part.replace(file)
 
 
 def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rough: Optimise,

@@ -59,8 +59,8 @@ class CorrectedForward(Forward):
     def full(self) -> QuasiStaticForward:
         return self._full
 
-    def led_elsewhere(self, poses: np.ndarray) -> QuasiStaticForward:
-        return self._full.led_elsewhere(poses)
+    def with_prescribed_poses(self, poses: np.ndarray) -> QuasiStaticForward:
+        return self._full.with_prescribed_poses(poses)
 
     @property
     def reduction_error(self) -> tuple[float, float]:

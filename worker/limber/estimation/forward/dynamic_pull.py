@@ -72,8 +72,9 @@ class DynamicForward(Forward):
         drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
                                      for pose in frames.poses])} if by_pose
                  else {"grasp_forces": self._forces})
-        wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
-        asked = {"sensitivities": wanted, "sensitivity_nodes": self._nodes} if sensitivities else {}
+        parameters = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
+        asked = {"sensitivities": parameters,
+                 "sensitivity_nodes": self._nodes} if sensitivities else {}
         # The same scheme with and without derivatives: one loss, one minimum.
         result = simulate_dynamics(model, grasp=self.grasp, times=frames.times,
                                    settings=NewmarkSettings(), **drive, **asked)
@@ -113,7 +114,7 @@ class DynamicForward(Forward):
         return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points,
                               field=self.field)
 
-    def led_elsewhere(self, poses: np.ndarray) -> "DynamicForward":
+    def with_prescribed_poses(self, poses: np.ndarray) -> "DynamicForward":
         name, model, weights, entry = self._arguments
         return DynamicForward(name, model, weights, entry, replace(self.frames, poses=poses),
                               self.rest_points, field=self.field)

@@ -70,10 +70,10 @@ def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.nd
     count = len(times)
     k, d = squares[:, None], damping[:, None]
     hats = np.eye(count)
-    place = hats[0] / k
-    speed, push = np.zeros_like(place), np.zeros_like(place)
+    target = hats[0] / k
+    speed, push = np.zeros_like(target), np.zeros_like(target)
     swing = np.empty((len(squares), count, count))
-    swing[:, 0] = place
+    swing[:, 0] = target
     for frame in range(1, count):
         gap = times[frame] - times[frame - 1]
         steps = int(np.ceil(gap / NewmarkSettings().max_step - 1e-9))
@@ -81,9 +81,9 @@ def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.nd
         for step in range(1, steps + 1):
             share = step / steps
             force = (1 - share) * hats[frame - 1] + share * hats[frame]
-            foretold = place + dt * speed + dt**2 / 4 * push
+            predicted = target + dt * speed + dt**2 / 4 * push
             going = speed + dt / 2 * push
-            push = (force - d * going - k * foretold) / (1 + dt / 2 * d + dt**2 / 4 * k)
-            place, speed = foretold + dt**2 / 4 * push, going + dt / 2 * push
-        swing[:, frame] = place
+            push = (force - d * going - k * predicted) / (1 + dt / 2 * d + dt**2 / 4 * k)
+            target, speed = predicted + dt**2 / 4 * push, going + dt / 2 * push
+        swing[:, frame] = target
     return swing

@@ -173,9 +173,9 @@ class Forward(ABC):
 
     def refine(self) -> None:
         """From now on simulate twice as many frames, if not all of them are simulated already."""
-        return  # Here all of them are.
+        return  # all of them are here
 
-    def led_elsewhere(self, poses: np.ndarray) -> "Forward":
+    def with_prescribed_poses(self, poses: np.ndarray) -> "Forward":
         """Return the same pull, on the full model, with other recorded poses [m, rad], [f, 6]; a
         slow one at few key frames, enough to show a difference.
         """

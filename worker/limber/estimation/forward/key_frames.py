@@ -40,35 +40,36 @@ def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         Indices of the key frames, shape [k], and S, shape [n, k]: values at all frames are
         S @ values at the key frames.
     """
-    places, first = np.unique(along, return_index=True)
-    if len(places) > count:
-        wanted = np.linspace(places[0], places[-1], count)
-        near = np.unique(np.abs(places[:, None] - wanted).argmin(axis=0))
-        places, first = places[near], first[near]
-    if len(places) == 1:
+    distances, first = np.unique(along, return_index=True)
+    if len(distances) > count:
+        targets = np.linspace(distances[0], distances[-1], count)
+        near = np.unique(np.abs(distances[:, None] - targets).argmin(axis=0))
+        distances, first = distances[near], first[near]
+    if len(distances) == 1:
         return first, np.ones((len(along), 1))
-    if len(places) < 4:
-        spread = np.column_stack([np.interp(along, places, row) for row in np.eye(len(places))])
+    if len(distances) < 4:
+        spread = np.column_stack([np.interp(along, distances, row) for row
+                                  in np.eye(len(distances))])
         return first, spread
-    return first, scipy.interpolate.CubicSpline(places, np.eye(len(places)))(along)
+    return first, scipy.interpolate.CubicSpline(distances, np.eye(len(distances)))(along)
 
 
-def smoothed(times: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+def smoothed(times: np.ndarray, values: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """Return noisy measurements at given instants, each from a local quadratic fit.
 
     Args:
         times: [s], shape [n].
         values: Shape [n, c]; rows with NaN are discarded.
-        places: Requested instants [s], shape [k].
+        keys: Requested instants [s], shape [k].
     """
     known = np.isfinite(values).all(axis=1)
     times, values = times[known], values[known]
-    width = max(2.0 * np.ptp(times) / max(len(places) - 1, 1), 1e-9)
-    result = np.empty((len(places), values.shape[1]))
-    for row, place in enumerate(places):
-        near = np.abs(times - place) <= width / 2
+    width = max(2.0 * np.ptp(times) / max(len(keys) - 1, 1), 1e-9)
+    result = np.empty((len(keys), values.shape[1]))
+    for row, key in enumerate(keys):
+        near = np.abs(times - key) <= width / 2
         if near.sum() < 6:
-            result[row] = [np.interp(place, times, column) for column in values.T]
+            result[row] = [np.interp(key, times, column) for column in values.T]
         else:
-            result[row] = np.polynomial.polynomial.polyfit(times[near] - place, values[near], 2)[0]
+            result[row] = np.polynomial.polynomial.polyfit(times[near] - key, values[near], 2)[0]
     return result

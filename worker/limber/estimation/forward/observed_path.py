@@ -129,18 +129,18 @@ class ObservedPathForward(QuasiStaticForward):
 
     def _held(self, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
         states = self.states()
-        places = np.array([self.place(state.displacement) for state in states])
+        positions = np.array([self.grasp_position(state.displacement) for state in states])
         self.grasp_tangent = self.spread @ np.array(
             [self._tangent(state.displacement) for state in states])
         if not sensitivities:
-            return places, None
-        return places, np.array([self.grasp.place_slopes(
+            return positions, None
+        return positions, np.array([self.grasp.position_slopes(
             self.mesh.nodes, state.displacement,
             present(state.slope, "derivative of a key frame")) for state in states])
 
     def _response(self, compliances: list[np.ndarray]) -> Response:
         found = super()._response(compliances)
-        at_keys = np.array([self.grasp.place_slopes(
+        at_keys = np.array([self.grasp.position_slopes(
             self.mesh.nodes, state.displacement, np.moveaxis(np.asarray(each), 0, -1)).T
             for state, each in zip(self.states(), self._compliances, strict=True)])
         grasps = np.einsum("fk,kci->fikc", self.spread, at_keys)

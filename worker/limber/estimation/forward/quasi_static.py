@@ -307,7 +307,7 @@ class QuasiStaticForward(Forward):
                 self.mesh, np.array(held.point_m), held.radius_m + length))
         return other
 
-    def place(self, displacement: np.ndarray) -> np.ndarray:
+    def grasp_position(self, displacement: np.ndarray) -> np.ndarray:
         """Position of the recorded grasp point [m], shape [3]."""
         arm = np.array(self.entry.grasp.point_m) - self.grasp.centre
         pose = self.grasp.pose_of(self.mesh.nodes, displacement)
@@ -319,7 +319,7 @@ class QuasiStaticForward(Forward):
         each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
         return np.array(each, float) / np.sqrt(np.maximum(self.frames.wrench_counts, 1))[:, None]
 
-    def led_elsewhere(self, poses: np.ndarray) -> "QuasiStaticForward":
+    def with_prescribed_poses(self, poses: np.ndarray) -> "QuasiStaticForward":
         made = type(self)(self.name, self._model, self.weights, self.entry,
                           replace(self.frames, poses=poses), self.rest_points,
                           key_count=FEW_KEYS, field=self.field)
@@ -352,12 +352,12 @@ class QuasiStaticForward(Forward):
         row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
         force = frames.wrenches[row, :3] - self._zero[:3]
         size = float(np.linalg.norm(force))
-        way = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
-        if size <= 0 or way <= 0:
+        moved = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
+        if size <= 0 or moved <= 0:
             return None
         try:
             return float(size / force_for_travel(self.model_with(values), self.grasp,
-                                                 force / size, way))
+                                                 force / size, moved))
         except WorkError:
             return None
 
@@ -443,12 +443,12 @@ class QuasiStaticForward(Forward):
     def _torque_slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
                        result: StaticResult, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
         """Derivative of the gripper's torque about a fixed point, shape [3, p]."""
-        wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
+        parameters = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
         held = self.grasp.nodes
         arm = model.mesh.nodes[held] + result.displacement[held] - about
         columns = []
         for column, partial in enumerate(explicit_forces(
-                model, wanted, result.displacement)):
+                model, parameters, result.displacement)):
             out = partial + model.tangent_times(result.displacement,
                                                 np.ascontiguousarray(slope[..., column]))
             columns.append(np.cross(arm, out[held]).sum(axis=0))

@@ -75,12 +75,12 @@ class Corrections:
         exact = np.r_[found.moved.ravel(), found.force]
         d_exact = np.vstack([found.d_moved.reshape(-1, found.d_moved.shape[-1]), found.d_force])
         new = _Correction(frame, found.log_young, exact - rows, d_exact - slopes)
-        foretold = self.at(frame, found.log_young)[0]
-        self._surprises.append(float(np.sqrt(np.mean(((new.rows - foretold) / self._sigmas)**2))))
+        predicted = self.at(frame, found.log_young)[0]
+        self._surprises.append(float(np.sqrt(np.mean(((new.rows - predicted) / self._sigmas)**2))))
         self._known = [old for old in self._known if old.frame is not frame]
         self._known.append(new)
 
-    def wanted(self, kept: list[Kept], log_young: np.ndarray) -> Kept | None:
+    def next_requested(self, kept: list[Kept], log_young: np.ndarray) -> Kept | None:
         """Return the frame farthest from the known ones. None: none is far."""
         poses = np.array([each.frame.pose[:3] for each in kept])
         far = np.full(len(poses), np.inf)

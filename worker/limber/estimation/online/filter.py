@@ -280,7 +280,7 @@ class OnlineEstimator:
         if not whole and self._is_strange():
             self._making = self._exact.basis(self._spread_poses(), self.log_young.copy())
             return True
-        chosen = self._corrections.wanted(self._information.kept, self.log_young)
+        chosen = self._corrections.next_requested(self._information.kept, self.log_young)
         if chosen is None:
             return False
         start = self.reduced.displacement(present(chosen.state, "state of the frame"))

@@ -76,8 +76,8 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
         # It is being recorded now: missed frames are caught up.
         pace = np.inf
     states: list[OnlineState] = []
-    told = begun_sentences(first, progress)
-    is_exact = not told
+    reported = begun_sentences(first, progress)
+    is_exact = not reported
     slowest, stopped = 0.0, False
     with Beside(begun.branch) as beside:
         estimator = begun.estimator(beside)
@@ -86,7 +86,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
                 started = time.perf_counter()
                 states.append(estimator.update(frame))
                 slowest = max(slowest, time.perf_counter() - started)
-                _report(name, states[-1], share, told, progress)
+                _report(name, states[-1], share, reported, progress)
             progress(0.95, "waiting for the full model")
             settled = estimator.settle()
             states += [settled] if settled is not None else []
@@ -126,17 +126,17 @@ def begun_sentences(pull: Pull, progress: Progress) -> set[str]:
     return {"enough"}
 
 
-def _report(name: str, state: OnlineState, share: float, told: set[str],
+def _report(name: str, state: OnlineState, share: float, reported: set[str],
             progress: Progress) -> None:
-    """Report how well a pull is known; ``told`` are the sentences already reported."""
+    """Report how well a pull is known; ``reported`` are the sentences already reported."""
     progress(0.5 + 0.45 * share, "following", time_s=state.time,
              young_mpa=" ".join(f"{young / 1e6:.4g}" for young in state.young),
              young_factor=" ".join(f"{np.sqrt(high / low):.3g}" for low, high in state.interval),
              enough=state.enough)
     for kind, is_so in (("enough", state.enough), ("idle", state.idle)):
-        if is_so and kind not in told:
+        if is_so and kind not in reported:
             progress.warn(f"{name}: {state.time:.2f} s: {SAID[kind]}")
-            told.add(kind)
+            reported.add(kind)
 
 
 def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[str, Any]:
@@ -211,8 +211,8 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
 
 def _rough(pull: Pull, subject: Subject, settings: EstimateSettings) -> Values | None:
     """A quick fit of the recording so far; None if the branch has not moved yet."""
-    way = np.linalg.norm(pull.poses[:, :3] - pull.entry.grasp.point_m, axis=1)
-    if way.max(initial=0.0) < MOVED * subject.model.extent:
+    travel = np.linalg.norm(pull.poses[:, :3] - pull.entry.grasp.point_m, axis=1)
+    if travel.max(initial=0.0) < MOVED * subject.model.extent:
         return None
     few = settings.model_copy(update={"key_frames": 4})
     forwards = forwards_of([clean(pull)], subject, few)

@@ -49,7 +49,7 @@ def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungFie
     count = space.group_count
     information = evaluation.slopes.T @ evaluation.slopes
     left_open = np.diag(np.linalg.inv(information[count:, count:]))
-    told = 1 - left_open[[space.extra.index(name) for name in field.names]]
+    informed = 1 - left_open[[space.extra.index(name) for name in field.names]]
     slope = np.zeros(space.size)
-    slope[:count] = -(told @ field.growth(space.unpack(evaluation.free))) @ space.membership
+    slope[:count] = -(informed @ field.growth(space.unpack(evaluation.free))) @ space.membership
     return np.linalg.solve(information, slope)

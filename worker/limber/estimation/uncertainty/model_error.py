@@ -161,17 +161,17 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
     fine = BranchModel(refined(mesh), young=np.repeat(weights @ young, 8),
                        poisson=np.repeat(coarse.poisson, 8), density=np.repeat(coarse.density, 8),
                        gravity=None, point_masses=coarse.point_masses)
-    wanted = ParameterSet(("log_young",), weights, young)
+    parameters = ParameterSet(("log_young",), weights, young)
     try:
-        ours, theirs = (each.equations().tangent(each, np.zeros_like(each.mesh.nodes))
-                        for each in (coarse, fine))
+        own_tangent, finer_tangent = (each.equations().tangent(each, np.zeros_like(each.mesh.nodes))
+                                      for each in (coarse, fine))
     except NotPositiveDefiniteError:
         return None
     missing, slopes = [], []
     for load in loads or [SmallLoad(across, np.zeros(3)) for across in _across(
             grasp, mesh.nodes[coarse.fixed])]:
         moved, more = (tangent.solve(_nodal(each, grasp, load)) for each, tangent in (
-            (coarse, ours), (fine, theirs)))
+            (coarse, own_tangent), (fine, finer_tangent)))
         size = np.linalg.norm(operator @ moved.ravel())
         if size == 0:
             continue
@@ -180,20 +180,20 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
         # Small enough that the force is linear in it.
         little = SMALL * model.mean_edge / np.abs(moved).max()
         slopes.append(np.column_stack([
-            operator @ ours.solve(-partial).ravel()
-            for partial in explicit_forces(coarse, wanted, little * moved)]) / (size * little))
+            operator @ own_tangent.solve(-partial).ravel()
+            for partial in explicit_forces(coarse, parameters, little * moved)]) / (size * little))
     if not missing:
         return None
     lacking, slope = np.concatenate(missing), np.vstack(slopes)
     together = slope.sum(axis=1)
     alike = float(lacking @ together / (together @ together))
     # Beside the common change, as far as the response distinguishes the moduli.
-    apart = np.linalg.lstsq(slope, lacking - alike * together, rcond=0.03)[0]
+    correction = np.linalg.lstsq(slope, lacking - alike * together, rcond=0.03)[0]
     # The common part is well determined and corrected; the rest, the uneven error of the mesh,
     # stays in the uncertainty.
     count = len(young)
     return MeshStiffness(np.full(count, np.exp(-REMAINING * alike)),
-                         np.hypot(UNSURE * alike, REMAINING * apart) * np.ones(count))
+                         np.hypot(UNSURE * alike, REMAINING * correction) * np.ones(count))
 
 
 def observer(mesh: TetMesh, forwards: Sequence[Forward], grasp: Grasp, points: np.ndarray,
@@ -205,8 +205,9 @@ def observer(mesh: TetMesh, forwards: Sequence[Forward], grasp: Grasp, points: n
     Args:
         points: Used if no pull observes any [m], shape [k, 3].
     """
-    places = [forward.rest_points for forward in forwards if len(forward.rest_points)]
-    rows = [point_operator(mesh, np.unique(np.vstack(places), axis=0) if places else points)]
+    rest_points = [forward.rest_points for forward in forwards if len(forward.rest_points)]
+    rows = [point_operator(mesh, np.unique(np.vstack(rest_points), axis=0) if rest_points
+                           else points)]
     if any(not forward.force_is_stated for forward in forwards):
         mean = sparse.csr_matrix((grasp.weights, (np.zeros(len(grasp.nodes), int), grasp.nodes)),
                                  shape=(1, mesh.node_count))

@@ -24,7 +24,7 @@ WIDEST = 35.0
 """Standard deviation of log E that means unknown."""
 
 
-def led_by_path(forwards: Sequence[Forward]) -> list[Forward]:
+def path_prescribed(forwards: Sequence[Forward]) -> list[Forward]:
     """Return the pulls with a prescribed path and an uncertain gripper frame."""
     return [forward for forward in forwards if forward.drive == "pose" and (
         calibration_of(forward.entry).pose_sigma_m > 0
@@ -45,8 +45,8 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
         None if a simulation finds no equilibrium.
     """
     known = {calibration_of(forward.entry): np.array(forward.entry.grasp.point_m)
-             for forward in reversed(led_by_path(objective.forwards))}
-    base = _evaluated(evaluation, objective, [forward.led_elsewhere(forward.frames.poses)
+             for forward in reversed(path_prescribed(objective.forwards))}
+    base = _evaluated(evaluation, objective, [forward.with_prescribed_poses(forward.frames.poses)
                                               for forward in objective.forwards], jacobian=True)
     if base is None:
         return None
@@ -55,7 +55,7 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
         for error in range(6):
             if (calibration.pose_sigma_m, calibration.pose_sigma_rad)[error // 3] == 0:
                 continue
-            moved = [forward.led_elsewhere(
+            moved = [forward.with_prescribed_poses(
                 _aside(forward.frames.poses, calibration, pivot, error)
                 if forward.drive == "pose" and calibration_of(forward.entry) == calibration
                 else forward.frames.poses) for forward in objective.forwards]

@@ -94,7 +94,7 @@ class _Profile:
 
     def _limit(self, group: int, side: float, first: float) -> tuple[float, float]:
         """Limit to one side, in deviations, and the curvature of the profile up to there."""
-        objective, wanted = self._objective.apart(), side * self._quantile
+        objective, target = self._objective.without_priors(), side * self._quantile
         farthest, bend = self._farthest(group, side), 0.0
         at, others = side * min(abs(first), abs(farthest)), np.zeros(len(self._best.free))
         for _ in range(TRIES):
@@ -106,11 +106,11 @@ class _Profile:
                 continue
             rise, others = found
             bend = bend_of(at, side * np.sqrt(max(rise, 0.0)))
-            aim = side * min(abs(limit_of(bend, wanted)), 2 * abs(at), abs(farthest))
+            aim = side * min(abs(limit_of(bend, target)), 2 * abs(at), abs(farthest))
             if abs(aim - at) * self.deviations[group] < NEAR:
                 return aim, bend
             at, others = aim, others * aim / at
-        return side * min(abs(limit_of(bend, wanted)), abs(farthest)), bend
+        return side * min(abs(limit_of(bend, target)), abs(farthest)), bend
 
     def _farthest(self, group: int, side: float) -> float:
         """Largest shift that is evaluated, in deviations: neighbours hardly differ by more."""
@@ -128,8 +128,8 @@ class _Profile:
             others: Expected offset of the others, shape [p].
         """
         best = self._best
-        way = at * self._covariance[group] / self.deviations[group]
-        free = np.clip(best.free + way + others, *objective.space.bounds())
+        direction = at * self._covariance[group] / self.deviations[group]
+        free = np.clip(best.free + direction + others, *objective.space.bounds())
         found = objective.evaluate(free, jacobian=True)
         if found is None:
             return None
@@ -144,7 +144,7 @@ class _Profile:
         step[movable] = -np.linalg.lstsq(slopes[:, movable].T @ slopes[:, movable],
                                          gradient[movable], rcond=None)[0]
         rise = change @ change + 2 * self._pull @ bent - np.sum((slopes @ step)**2)
-        return float(rise), free - best.free - way + step
+        return float(rise), free - best.free - direction + step
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:
         return scaled_rows(rows, self._objective.space.own_row_count, self._scale)

@@ -51,7 +51,8 @@ def taken_up(evaluation: Evaluation, objective: Objective,
     """
     if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
         return None
-    forwards = [forward.led_elsewhere(forward.frames.poses) for forward in objective.forwards]
+    forwards = [forward.with_prescribed_poses(forward.frames.poses) for forward
+                in objective.forwards]
     alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
     expected = alone.evaluate(evaluation.free, jacobian=True)
     if expected is None:
@@ -110,10 +111,10 @@ def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiS
         before = here.out_of_balance(key, state)
         seen = here.seen(key, state, before)
         tangent = equations.exact_tangent(here.model, state)
-        for there, ways, (moved, out) in zip(others, elsewhere, _followed(
+        for other, paths, (moved, out) in zip(others, elsewhere, _followed(
                 here, others, key, state, tangent, before), strict=True):
-            points = operator @ moved.ravel() + ways @ state.ravel()
-            after = there.seen(key, state + STEP * moved, out)
+            points = operator @ moved.ravel() + paths @ state.ravel()
+            after = other.seen(key, state + STEP * moved, out)
             changes.append([points.reshape(-1, 3), *(
                 (now - then) / STEP for now, then in zip(after, seen, strict=True))])
     return ErrorSlopes(*(
@@ -159,12 +160,12 @@ class _Pulled:
 
         If a force drives, force and torque do not change.
         """
-        grasp, place = self.forward.grasp, self.forward.place(state)
+        grasp, position = self.forward.grasp, self.forward.grasp_position(state)
         if not self.is_held:
-            return np.zeros(3), np.zeros(3), place
+            return np.zeros(3), np.zeros(3), position
         about = self.forward.frames.poses[self.forward.keys[key], :3]
         arms = (self.model.mesh.nodes + state)[grasp.nodes] - about
-        return (reactions([grasp], out)[0], np.cross(arms, out[grasp.nodes]).sum(axis=0), place)
+        return (reactions([grasp], out)[0], np.cross(arms, out[grasp.nodes]).sum(axis=0), position)
 
 
 def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndarray,
@@ -174,11 +175,11 @@ def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndar
     """
     held, missing = here.hold(key, state)
     moved, rights, pins, after = [], [], [], []
-    for there in others:
-        held_there, missing_there = there.hold(key, state)
+    for forward in others:
+        held_there, missing_there = forward.hold(key, state)
         moved.append((held_there - held) / STEP)
         pins.append(np.ravel(missing_there - missing) / STEP)
-        after.append(there.out_of_balance(key, state))
+        after.append(forward.out_of_balance(key, state))
         rights.append((before - after[-1]) / STEP - here.model.tangent_times(state, moved[-1]))
     found = tangent.solve_all(rights, np.column_stack(pins))
     return [(led + free, out + STEP * here.model.tangent_times(state, led + free))

@@ -81,10 +81,10 @@ def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 
     """
     rows = information_rows(evaluation, objective, scale)
     covariance = inverse_information(np.vstack([each.rows for each in rows]))
-    wanted = covariance[list(objective.space.groups)]
+    total = covariance[list(objective.space.groups)]
     parts: dict[str, np.ndarray] = {}
     for each in rows:
-        part = np.sum((wanted @ each.rows.T)**2, axis=1)
+        part = np.sum((total @ each.rows.T)**2, axis=1)
         parts[each.cause] = parts.get(each.cause, 0.0) + part
     return parts
 

@@ -162,9 +162,9 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
     Raises:
         InputError: no motion is found, or the branch does not oscillate.
     """
-    way = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
+    travel = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
     # From the marker that moves farthest: others are disturbed while the branch is still held.
-    far = way[:, np.argmax(np.nan_to_num(way).max(axis=0))]
+    far = travel[:, np.argmax(np.nan_to_num(travel).max(axis=0))]
     far = np.where(np.isfinite(far), far, 0.0)
     if far.max() < 10 * seen.noise:
         raise InputError("The recording shows no swing.",
@@ -228,11 +228,11 @@ class _Swing:
         self.factor0 = (1 / period / frequency) ** 2
         self.omega, self.period = 2 * np.pi / period, period
         after = self.seen.times > released
-        way = np.nan_to_num(np.linalg.norm(
+        travel = np.nan_to_num(np.linalg.norm(
             self.seen.moved[after] - np.nanmean(self.seen.moved[-5:], axis=0), axis=2)).max(axis=1)
         times = self.seen.times[after]
         half = max(round(period / 2 / np.median(np.diff(times))), 1)
-        peaks = [way[k:k + half].max() for k in range(0, len(way) - half, half)][:6]
+        peaks = [travel[k:k + half].max() for k in range(0, len(travel) - half, half)][:6]
         fall = np.polyfit(np.arange(len(peaks)), np.log(np.maximum(peaks, 1e-9)), 1)[0]
         self.ratio0 = float(np.clip(-fall / np.pi, 2e-3, 0.3))
 

@@ -18,7 +18,7 @@ _JUMP, _LOUD, _ABOVE = 2.5, 0.2, 2.0
 _FLAT = 3
 """Equal readings in a row at a channel's limit."""
 
-_LARGEST = 1e15  # of any reading, in any unit
+_LARGEST = 1e15  # largest reading, in any unit
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ def ringing_columns(record: Stream) -> Stream:
     if not others:
         return record
     taken = ", ".join(record.columns[k] for k in used)
-    told = (f"Columns taken as readings, because they ring: {taken}. Not used, because they do "
-            f"not: {', '.join(others)}." if ringing else
-            f"No column rings clearly. Columns taken as readings, because they change: {taken}. "
-            f"Not used: {', '.join(others)}.")
+    message = (f"Columns taken as readings, because they ring: {taken}. Not used, because they do "
+               f"not: {', '.join(others)}." if ringing else
+               f"No column rings clearly. Columns taken as readings, because they change: {taken}. "
+               f"Not used: {', '.join(others)}.")
     return replace(record, values=record.values[:, used],
                    columns=tuple(record.columns[k] for k in used),
-                   warnings=(*record.warnings, told))
+                   warnings=(*record.warnings, message))
 
 
 def _is_counter(values: np.ndarray) -> bool:
@@ -124,7 +124,7 @@ def plucks(channels: np.ndarray, period: float) -> list[tuple[int, int]]:
     width, half = max(round(period), 8), max(round(period / 2), 4)
     if len(channels) < 4 * width:
         return [(0, len(channels))]
-    swing = _extent(channels, width)  # of the readings k .. k + width
+    swing = _extent(channels, width)  # extent of the readings k .. k + width
     after = _extent(channels, half)[width:]
     before, after = swing[:len(after)], after[:len(swing)]
     least = max(_LOUD * float(swing.max()), _ABOVE * float(np.quantile(swing, 0.1)))

@@ -143,7 +143,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     best = min(found, key=lambda one: float(one.frequency_deviations[0] / one.frequencies[0]))
     alike = [one for one in found
              if abs(one.frequencies[0] / best.frequencies[0] - 1) < _SAME]
-    return _told(_united(best, alike), len(parts), len(alike), int(cut.sum()))
+    return _cut_record(_united(best, alike), len(parts), len(alike), int(cut.sum()))
 
 
 def _too_short(count: int) -> InputError:
@@ -152,7 +152,7 @@ def _too_short(count: int) -> InputError:
                       "Record longer, or state the start of the decay with --start.")
 
 
-def _told(found: Ringing, count: int, used: int, cut: int) -> Ringing:
+def _cut_record(found: Ringing, count: int, used: int, cut: int) -> Ringing:
     """The vibrations, and warnings on the record for the user."""
     warnings = []
     if count > 1:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_STEP = 1e-6  # of the cloud's size: far finer than any scanner tells, far coarser than rounding
+_STEP = 1e-6  # fraction of the cloud's size: finer than any scanner resolves, coarser than rounding
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,13 @@ class OwnFrame:
     here are on a grid coarse enough to hide rounding.
 
     Attributes:
-        places: Points in this frame [m], shape [n, 3].
+        coordinates: Points in this frame [m], shape [n, 3].
         order: Index of each point in the cloud, shape [n].
         middle: The frame's origin [m], shape [3].
         axes: The frame's axes as columns, shape [3, 3].
     """
 
-    places: np.ndarray
+    coordinates: np.ndarray
     order: np.ndarray
     middle: np.ndarray
     axes: np.ndarray
@@ -38,17 +38,18 @@ class OwnFrame:
         middle = points[order].mean(axis=0)
         offset = points[order] - middle
         axes = own_axes(offset)
-        places = offset @ axes
-        step = 2.0**np.floor(np.log2(max(_STEP * np.linalg.norm(np.ptp(places, axis=0)), 1e-300)))
-        return cls(np.round(places / step) * step, order, middle, axes)
+        coordinates = offset @ axes
+        step = 2.0**np.floor(np.log2(max(_STEP * np.linalg.norm(np.ptp(coordinates, axis=0)),
+                                         1e-300)))
+        return cls(np.round(coordinates / step) * step, order, middle, axes)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return the positions of points in this frame, shape [..., 3]."""
         return (points - self.middle) @ self.axes
 
-    def outside(self, places: np.ndarray) -> np.ndarray:
+    def outside(self, coordinates: np.ndarray) -> np.ndarray:
         """Return the points at positions of this frame, shape [..., 3]."""
-        return places @ self.axes.T + self.middle
+        return coordinates @ self.axes.T + self.middle
 
 
 def own_order(points: np.ndarray) -> np.ndarray:

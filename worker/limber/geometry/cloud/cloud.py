@@ -15,7 +15,7 @@ POINTS = "\0points"
 """Name of the coordinates [n, 3] among columns of any name."""
 LEFT_OUT = "\0left_out"
 """Name of the number of points that a reader left out, in the same columns."""
-_LONGEST_TITLE = 1000  # characters of a title that a file's header repeats
+_LONGEST_TITLE = 1000  # characters of a title that a file's header may repeat
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def _bytes(color: np.ndarray) -> np.ndarray:
     top = values.max(initial=0.0)
     if top > 255:
         values = values / 257
-    elif top < 1.01 and color.dtype.kind == "f":  # rounded to a little over 1 by some programs
+    elif top < 1.01 and color.dtype.kind == "f":  # some programs round to a little over 1
         values = values * 255
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 

@@ -7,12 +7,12 @@ from limber.core.numerics.rigid import principal_axes
 from limber.geometry.cloud.canonical_frame import own_order
 
 _SAMPLE = 400
-_ENOUGH = 150  # points that tell a plane
-_REACH = 0.05  # of the cloud's diagonal: what is looked at around a point
-_FLAT, _WIDE = 0.01, 0.3  # variance across a sheet, and along its narrower side, over the next
+_ENOUGH = 150  # fewest points that define a plane
+_REACH = 0.05  # neighbourhood of a point, as a fraction of the cloud's diagonal
+_FLAT, _WIDE = 0.01, 0.3  # variance across and along a sheet, over the next larger
 _TRIES = 200
-_BROAD = 0.11  # least standard deviation of a sheet across, over the diagonal: leaves have 0.08
-_FILLED = 0.25  # least fraction of a sheet's own box that it fills
+_BROAD = 0.11  # smallest standard deviation across a sheet, over the diagonal; leaves have 0.08
+_FILLED = 0.25  # smallest fraction of its bounding box that a sheet fills
 
 
 def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:

@@ -11,7 +11,7 @@ MOST_POINTS = 5_000_000
 """Most points kept of a scan: a tenth of a millimetre apart on a branch of one metre."""
 PIECE_POINTS = 1_000_000
 """Points that readers take from a file at once."""
-_FINEST = 1e-5  # of the scan's size: the grid that is tried first
+_FINEST = 1e-5  # first grid step, as a fraction of the scan's size
 
 
 def gathered(pieces: Iterable[Cloud], most: int = MOST_POINTS) -> Cloud:

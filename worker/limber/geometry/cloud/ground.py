@@ -8,14 +8,14 @@ not ground: points continue above it.
 import numpy as np
 import scipy
 
-_CELL = 0.03  # of the cloud's diagonal
+_CELL = 0.03  # fraction of the cloud's diagonal
 _LEAST_CELLS = 40
-_BROAD, _FILLED = 0.11, 0.25  # least standard deviation across, over the diagonal; part of its box
+_BROAD, _FILLED = 0.11, 0.25  # smallest deviation across, over the diagonal; share of its box
 _STEEPEST = np.deg2rad(40.0)
-_ROUGH = 0.03  # of the diagonal, that ground may be off its plane
-_BELOW, _NOTHING = 4.0, 0.03  # standard deviations of that below the plane, where so few cells lie
-_LAYER = 3.5  # standard deviations of points around the ground of their cell that belong to it
-_ABOVE = 0.3  # fraction of cells that may have points in the next layer: plants
+_ROUGH = 0.03  # largest deviation of the ground from its plane, over the diagonal
+_BELOW, _NOTHING = 4.0, 0.03  # standard deviations below the plane; largest fraction of cells there
+_LAYER = 3.5  # standard deviations around a cell's ground within which points belong to it
+_ABOVE = 0.3  # largest fraction of cells with points in the next layer (plants)
 _ROUNDS = 10
 
 
@@ -34,9 +34,9 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     up = up / np.linalg.norm(up)
     across = np.linalg.svd(up[None])[2][1:]
     flat, height = points @ across.T, points @ up
-    place = np.floor((flat - flat.min(axis=0)) / (_CELL * diagonal)).astype(np.int64)
-    shape = tuple(place.max(axis=0) + 1)
-    _, cell = np.unique(np.ravel_multi_index(tuple(place.T), shape), return_inverse=True)
+    index = np.floor((flat - flat.min(axis=0)) / (_CELL * diagonal)).astype(np.int64)
+    shape = tuple(index.max(axis=0) + 1)
+    _, cell = np.unique(np.ravel_multi_index(tuple(index.T), shape), return_inverse=True)
     count = np.bincount(cell)
     middle = np.stack([np.bincount(cell, values) for values in flat.T], axis=1) / count[:, None]
     if not _is_broad(middle, diagonal):
@@ -53,7 +53,7 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     # lower.
     bumps = np.full(shape, np.nan)
     where = np.full(len(count), 0)
-    where[cell] = np.ravel_multi_index(tuple(place.T), shape)
+    where[cell] = np.ravel_multi_index(tuple(index.T), shape)
     bumps.ravel()[where] = np.clip(off, -_BELOW * rough, _BELOW * rough)
     bumps = scipy.ndimage.generic_filter(bumps, _known_median, size=3, mode="constant", cval=np.nan)
     over = height - plane(flat) - bumps.ravel()[where][cell]

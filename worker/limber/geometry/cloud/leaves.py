@@ -19,17 +19,17 @@ from scipy.spatial import cKDTree
 from limber.geometry.cloud.canonical_frame import OwnFrame
 from limber.geometry.cloud.preparation import voxel_thinned
 
-_CELL = 0.25  # of a scale: as finely is the cloud looked at there
-_FINEST = 4.0  # spacings of points
-_STEP = 1.5  # from scale to scale
+_CELL = 0.25  # cell size, as a fraction of the scale
+_FINEST = 4.0  # in point spacings
+_STEP = 1.5  # ratio between scales
 _SCALES = 8
-_WIDE = 0.3  # second over first variance, from which a neighbourhood is no line
-_FLAT = 0.06  # third over second, up to which it is flat
-_CURVED = 0.12  # likewise, at the scales after the one where it is wide and flat
-_AFTER = 3  # scales that are looked at after it
-_LEAST = 8  # points of a neighbourhood that tell anything
-_SMALLEST = 40  # points of a leaf
-_PATCH = 0.1  # of the largest leaf's area, up to which a piece is a patch of a stem
+_WIDE = 0.3  # second over first variance above which a neighbourhood is not a line
+_FLAT = 0.06  # third over second variance below which it is flat
+_CURVED = 0.12  # the same at the scales after the one where it is wide and flat
+_AFTER = 3  # number of scales examined after it
+_LEAST = 8  # fewest points of a neighbourhood
+_SMALLEST = 40  # fewest points of a leaf
+_PATCH = 0.1  # fraction of the largest leaf's area below which a piece is a patch of a stem
 # Largest area of a stretch of stem, in areas of the largest leaf, and its least thickness over
 # width: blades reach 0.14, stretches of stem and fork 0.34 and more.
 _STRETCH, _THICK = 0.5, 0.25
@@ -37,8 +37,8 @@ _STRETCH, _THICK = 0.5, 0.25
 # blade: blades reach 0.26, stretches of branch that only noise makes flat 0.49 and more.
 _BLADE, _ACROSS, _PLACES = 0.4, 0.6, 40
 _FILLS = 33  # a point and its neighbours, by whose distances a piece is a sheet or lines
-_NEAR = 3.0  # spacings, up to which points hang together
-_AGREE = 0.5  # of the neighbours, that make a point one of a leaf
+_NEAR = 3.0  # largest distance between connected points, in spacings
+_AGREE = 0.5  # fraction of the neighbours that makes a point part of a leaf
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
         points: Positions [m], shape [n, 3].
     """
     own = OwnFrame.of(points)
-    return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.places)]
+    return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.coordinates)]
 
 
 def _found(points: np.ndarray) -> list[Leaf]:
@@ -70,7 +70,7 @@ def _found(points: np.ndarray) -> list[Leaf]:
     spacing = float(np.median(cKDTree(points).query(points[::max(1, len(points) // 5000)], k=2)[0][
         :, 1]))
     if spacing <= 0:
-        return []  # Most points coincide with another: no neighbourhood tells a shape.
+        return []  # Most points coincide with another, so neighbourhoods have no shape.
     on_leaf = _on_sheets(points, spacing)
     tree = cKDTree(points)
     near = tree.query(points, k=min(16, len(points)))[1]
@@ -95,8 +95,8 @@ def _with_rims(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> np.ndar
     if len(stem):
         speck = np.flatnonzero(~large)
         blade = np.concatenate([points[on_leaf], points[rest[rim[label]]]])
-        to_leaf, to_stem = (cKDTree(there).query(points[rest[speck]])[0]
-                            for there in (blade, points[stem]))
+        to_leaf, to_stem = (cKDTree(found).query(points[rest[speck]])[0]
+                            for found in (blade, points[stem]))
         rim |= np.bincount(label[speck], to_leaf < to_stem, len(count)) > _AGREE * count
     found = on_leaf.copy()
     found[rest[rim[label]]] = True
@@ -119,11 +119,12 @@ def _on_sheets(points: np.ndarray, spacing: float) -> np.ndarray:
         chosen = voxel_thinned(points, _CELL * scale)
         values, count = _variances(points[chosen], scale)
         nearest = cKDTree(points[chosen]).query(points)[1]
-        told = count >= _LEAST
+        is_supported = count >= _LEAST
         broad = values[:, 1] > _WIDE * values[:, 2]
-        wide.append((told & broad)[nearest])
-        line.append((told & ~broad)[nearest])
-        flat.append(np.where(told, values[:, 0] / np.maximum(values[:, 1], 1e-300), 1.0)[nearest])
+        wide.append((is_supported & broad)[nearest])
+        line.append((is_supported & ~broad)[nearest])
+        flat.append(np.where(is_supported, values[:, 0] / np.maximum(values[:, 1], 1e-300),
+                             1.0)[nearest])
     wide, flat, line = np.array(wide), np.array(flat), np.array(line)
     found = np.zeros(len(points), bool)
     for step in range(_SCALES):
@@ -139,14 +140,14 @@ def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray
     one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     total = len(points)
     count = 1 + np.bincount(one, minlength=total)
-    way = points[other] - points[one]
-    first = np.stack([np.bincount(one, way[:, k], total) for k in range(3)], axis=1)
+    offset = points[other] - points[one]
+    first = np.stack([np.bincount(one, offset[:, k], total) for k in range(3)], axis=1)
     # Without a single pair, bincount returns integers, so there is no division in place.
     first = first / count[:, None]
     second = np.empty((total, 3, 3))
     for i in range(3):
         for j in range(i + 1):
-            moment = np.bincount(one, way[:, i] * way[:, j], total) / count
+            moment = np.bincount(one, offset[:, i] * offset[:, j], total) / count
             second[:, i, j] = second[:, j, i] = moment - first[:, i] * first[:, j]
     return np.maximum(np.linalg.eigvalsh(second), 0.0), count
 

@@ -32,7 +32,7 @@ def read_pixels(path: Path, what: str) -> np.ndarray:
                 return np.asarray(image.convert("L") if image.mode in ("1", "P") else image)
     except MemoryError:
         raise
-    except Exception as error:  # Pillow's readers raise whatever their parsers raise
+    except Exception as error:  # Pillow's readers raise the errors of their parsers
         raise InputError(f"{path} cannot be read as an image ({error}).",
                          f"{what[0].upper()}{what[1:]} was expected.", "Check the file.",
                          ) from error

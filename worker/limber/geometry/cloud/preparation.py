@@ -15,12 +15,12 @@ from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pi
 from limber.geometry.settings import PreparationSettings
 
 POINT_MINIMUM = 50
-_LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans as a branch
+_LARGEST_EXTENT = 40.0  # [m] tallest plant that is scanned as a branch
 _SMALLEST_EXTENT = 0.02
-_SHEET_LEAST = 0.08  # fraction of points that makes a wall or the ground
-_SHEETS_MOST = 6  # a box has no more
-_AT_ONCE = 200_000  # points whose neighbours are held in memory together
-_COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
+_SHEET_LEAST = 0.08  # smallest fraction of the points that makes a wall or the ground
+_SHEETS_MOST = 6  # a box has six
+_AT_ONCE = 200_000  # points whose neighbours are held in memory at a time
+_COARSEST_STEP = 5e-3  # fraction of the cloud's size: the thickness of its twigs
 
 
 @dataclass(frozen=True)
@@ -163,13 +163,13 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     """Drop flying pixels if one depth camera saw the cloud; also return its position."""
     eye = settings.camera_at if eye is None else eye
     if eye is None:
-        place, sight = _own_sight(cloud.points * scale)
+        scanner, sight = _own_sight(cloud.points * scale)
     else:
-        place = np.array(eye) * scale
-        sight = find_sight(cloud.points * scale, place)
+        scanner = np.array(eye) * scale
+        sight = find_sight(cloud.points * scale, scanner)
     if sight is None:
         return cloud, None
-    view = View(place, sight.pitch, sight.fill)
+    view = View(scanner, sight.pitch, sight.fill)
     if settings.flying_angle == 0:
         return cloud, view
     flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
@@ -184,11 +184,11 @@ def _own_sight(points: np.ndarray) -> tuple[np.ndarray, Sight | None]:
 
     Found from the order of its points, or as seen from the origin of the file's coordinates.
     """
-    told = scan_line_view(points)
-    if told is not None:
-        sight = find_sight(points - told[0], forward=told[1])
+    estimated = scan_line_view(points)
+    if estimated is not None:
+        sight = find_sight(points - estimated[0], forward=estimated[1])
         if sight is not None:
-            return told[0], sight
+            return estimated[0], sight
     return np.zeros(3), find_sight(points)
 
 
@@ -250,10 +250,10 @@ def _rounding(points: np.ndarray) -> float:
     """Step [m] to which coordinates are rounded, if it blurs branches; else 0."""
     steps = []
     for axis in points.T:
-        apart = np.diff(np.unique(np.round(axis, 9)))
-        if len(apart) < 3 or np.quantile(apart, 0.1) < 0.99 * np.median(apart):
+        step = np.diff(np.unique(np.round(axis, 9)))
+        if len(step) < 3 or np.quantile(step, 0.1) < 0.99 * np.median(step):
             return 0.0
-        steps.append(float(np.median(apart)))
+        steps.append(float(np.median(step)))
     near = float(np.median(cKDTree(points).query(points[::max(len(points) // 2000, 1)], k=2)[0][
         :, 1]))
     return steps[0] if max(steps) < 1.01 * min(steps) and near < 1.5 * steps[0] else 0.0

@@ -8,16 +8,16 @@ are known even if the cloud was moved or rotated since.
 
 import numpy as np
 
-_WINDOW, _STRIDE, _WINDOWS = 10, 5, 4000  # points in a row that show a plane; as many are looked at
-_PLANE = 1e-3  # across it over its narrower extent, up to which points lie in one
-_BENT = 0.02  # narrower extent over the longer one, from which that plane is known
-_LEAST, _SHARE = 20, 0.15  # number and fraction of windows that must show planes
-_APART = 0.03  # sine of the angles between planes, under which they are parallel: a sorted grid
-_NEAR = 3e-3  # by how much half of these planes may miss the camera, over the cloud's extent
-_TUKEY, _EXACT = 4.0, 1e-9  # how many times as far as the median what counts may miss; that is none
-_EVEN = 0.2  # of a pixel that evenly set ones may be off
+_WINDOW, _STRIDE, _WINDOWS = 10, 5, 4000  # points of a window; its stride; number of windows
+_PLANE = 1e-3  # thickness over the narrower extent below which points lie in a plane
+_BENT = 0.02  # narrower over longer extent above which the plane is well defined
+_LEAST, _SHARE = 20, 0.15  # number and fraction of windows that must be planar
+_APART = 0.03  # sine of the angle below which planes are parallel: a sorted grid
+_NEAR = 3e-3  # distance of the median plane from the camera, over the cloud's extent
+_TUKEY, _EXACT = 4.0, 1e-9  # cut-off in median distances; a median below it is zero
+_EVEN = 0.2  # fraction of a pixel by which regular points may deviate
 _ROUNDS = 20
-_TRIED, _RULERS = 300, 3000  # from how many a first place is taken, and on how many it is tried
+_TRIED, _RULERS = 300, 3000  # planes for a first estimate; planes on which it is tested
 
 
 def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -35,19 +35,19 @@ def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     if len(normals) < max(_LEAST, _SHARE * min(len(points) / _STRIDE, _WINDOWS)):
         return None
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    along, place = _common_line(normals, offsets, weight, extent)
+    along, point = _common_line(normals, offsets, weight, extent)
     if along is None:
         return None
-    way = points - place
-    forward = way.mean(axis=0) - (way.mean(axis=0) @ along) * along
+    offset = points - point
+    forward = offset.mean(axis=0) - (offset.mean(axis=0) @ along) * along
     distance = float(np.linalg.norm(forward))
     forward /= distance
-    depth = way @ forward
+    depth = offset @ forward
     if depth.min() <= 0.05 * distance:
         return None
-    eye = place + _even_place(way @ along, depth) * along
-    way = points - eye
-    column, row = way @ along / depth, way @ np.cross(forward, along) / depth
+    eye = point + _uniform_position(offset @ along, depth) * along
+    offset = points - eye
+    column, row = offset @ along / depth, offset @ np.cross(forward, along) / depth
     turn = _turn(column, row)
     if turn is None:
         return None
@@ -83,11 +83,11 @@ def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, e
         size = float(np.linalg.norm(along))
         if size < _APART:
             continue
-        place = np.linalg.lstsq(np.stack([normals[one], normals[other], along / size]),
+        point = np.linalg.lstsq(np.stack([normals[one], normals[other], along / size]),
                                 np.array([offsets[one], offsets[other], 0.0]), rcond=None)[0]
-        missed = _missed(normals, offsets, along / size, place, extent)
+        missed = _missed(normals, offsets, along / size, point, extent)
         if np.median(missed) < least:
-            best, least, miss = (along / size, place), float(np.median(missed)), missed
+            best, least, miss = (along / size, point), float(np.median(missed)), missed
     if best is None or least > _NEAR:
         return None, np.zeros(3)
     for _ in range(_ROUNDS):
@@ -96,22 +96,22 @@ def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, e
         axes = np.linalg.eigh((own * part[:, None]).T @ own)[1]
         along, across = axes[:, 0], axes[:, 1:]
         flat = own @ across
-        place = across @ np.linalg.solve((flat * part[:, None]).T @ flat,
+        point = across @ np.linalg.solve((flat * part[:, None]).T @ flat,
                                          (flat * part[:, None]).T @ offsets[near])
-        miss = _missed(normals, offsets, along, place, extent)
+        miss = _missed(normals, offsets, along, point, extent)
         if np.median(miss) > least:
             break
-        best, least = (along, place), float(np.median(miss))
+        best, least = (along, point), float(np.median(miss))
     return best
 
 
-def _missed(normals: np.ndarray, offsets: np.ndarray, along: np.ndarray, place: np.ndarray,
+def _missed(normals: np.ndarray, offsets: np.ndarray, along: np.ndarray, point: np.ndarray,
             extent: float) -> np.ndarray:
     """Distance by which planes miss a line, over the cloud's extent, and in radians, shape [w]."""
-    return np.abs(normals @ along) + np.abs(normals @ place - offsets) / extent
+    return np.abs(normals @ along) + np.abs(normals @ point - offsets) / extent
 
 
-def _even_place(side: np.ndarray, depth: np.ndarray) -> float:
+def _uniform_position(side: np.ndarray, depth: np.ndarray) -> float:
     """Position of the camera along that line [m]: from it, pixels in a row are evenly spaced."""
     image, inverse = side / depth, 1 / depth
     bend = image[:-2] - 2 * image[1:-1] + image[2:]
@@ -124,18 +124,19 @@ def _even_place(side: np.ndarray, depth: np.ndarray) -> float:
     # a position; the one that fits most triples is taken.
     tried = np.linspace(0, len(bend) - 1, _TRIED).astype(int)
     ruler = np.linspace(0, len(bend) - 1, _RULERS).astype(int)
-    place, most = 0.0, -1
+    position, most = 0.0, -1
     for start in bend[tried] / change[tried]:
         step = np.median(np.abs(image[ruler + 1] - image[ruler] - start * (
             inverse[ruler + 1] - inverse[ruler])))
         even = int((np.abs(bend[ruler] - start * change[ruler]) < _EVEN * step).sum())
         if even > most:
-            place, most = float(start), even
+            position, most = float(start), even
     for _ in range(_ROUNDS):
-        step = np.median(np.abs(np.diff(image - place * inverse)))
-        even = np.abs(bend - place * change) < _EVEN * step
-        place = float(bend[even] @ change[even] / max(float(change[even] @ change[even]), 1e-300))
-    return place
+        step = np.median(np.abs(np.diff(image - position * inverse)))
+        even = np.abs(bend - position * change) < _EVEN * step
+        position = float(bend[even] @ change[even] / max(float(change[even] @ change[even]),
+                                                         1e-300))
+    return position
 
 
 def _turn(column: np.ndarray, row: np.ndarray) -> float | None:

@@ -13,14 +13,14 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-_BESIDE = 1.6  # pixels up to which pixels are neighbours: the eight around
-_REGULAR = 0.6  # 5 % quantile over median of the distances to the nearest pixel; 0.27 for chance
-_AXIS = np.cos(np.radians(35.0))  # a camera frame's own axis is taken if it points so near
-_WIDEST = np.radians(75.0)  # off the middle of the view: no image is wider
-_TWO, _THERE = (1.8, 2.2), 0.4  # pixels between next but one; around a pixel's place
+_BESIDE = 1.6  # pixels: the eight around a pixel
+_REGULAR = 0.6  # 5 % quantile over median of the distances to the nearest pixel; 0.27 at random
+_AXIS = np.cos(np.radians(35.0))  # largest angle at which the camera frame's own axis is used
+_WIDEST = np.radians(75.0)  # largest angle from the view's centre; no image is wider
+_TWO, _THERE = (1.8, 2.2), 0.4  # pixels to the second neighbour; tolerance around a pixel
 _LEAST_FILL = 0.1
-_NOISE = 3.0  # standard deviations that neighbours may differ by
-_LEAST = 200  # readings under which nothing is told of an image
+_NOISE = 3.0  # standard deviations by which neighbours may differ
+_LEAST = 200  # fewest readings of an image
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Sight:
         if len(pairs) < _LEAST:
             return 1.0
         between = self.pixels[pairs].mean(axis=1)
-        there = tree.query(between, distance_upper_bound=_THERE)[0] < np.inf
-        return max(float(there.mean()), _LEAST_FILL)
+        is_near = tree.query(between, distance_upper_bound=_THERE)[0] < np.inf
+        return max(float(is_near.mean()), _LEAST_FILL)
 
 
 def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
@@ -95,9 +95,9 @@ def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
     right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
     right /= np.linalg.norm(right)
     image = np.stack([offset @ right, offset @ np.cross(forward, right)], axis=1) / depth[:, None]
-    apart = cKDTree(image).query(image, k=2)[0][:, 1]
-    pitch = float(np.median(apart))
-    if pitch <= 0 or (eye is None and np.quantile(apart, 0.05) < _REGULAR * pitch):
+    spacing = cKDTree(image).query(image, k=2)[0][:, 1]
+    pitch = float(np.median(spacing))
+    if pitch <= 0 or (eye is None and np.quantile(spacing, 0.05) < _REGULAR * pitch):
         return None
     return Sight(image / pitch, depth, pitch)
 

@@ -77,19 +77,20 @@ def read_cloud(path: Path, unit: str = "m") -> Cloud:
     return cloud.with_points(cloud.points * UNIT_METRES[unit_of(cloud, unit)[0]])
 
 
-def unit_of(cloud: Cloud, given: str | None) -> tuple[str, list[str]]:
+def unit_of(cloud: Cloud, requested: str | None) -> tuple[str, list[str]]:
     """Return the unit of a file's points, and a note for the user about it.
 
     Args:
         cloud: As read; its file may state a unit.
-        given: By the user. None and m, which need not be given, leave it to the file.
+        requested: By the user. None and m, which need not be given, leave it to the file.
     """
-    if cloud.unit is None or cloud.unit == given:
-        return given or "m", []
-    if given in (None, "m"):
+    if cloud.unit is None or cloud.unit == requested:
+        return requested or "m", []
+    if requested in (None, "m"):
         return cloud.unit, [f"The file states that its coordinates are in {cloud.unit}."]
-    return given, [f"The file states that its coordinates are in {cloud.unit}, but --unit {given} "
-                   "was used."]
+    return requested, [f"The file states that its coordinates are in {cloud.unit}, but --unit "
+                       f"{requested} "
+                       "was used."]
 
 
 def _read_text(path: Path) -> Cloud:

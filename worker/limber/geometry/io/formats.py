@@ -88,7 +88,7 @@ class Registry(Generic[Kind]):
             for entry in entry_points(group=self.group):
                 try:
                     self.register(entry.load())
-                except Exception as error:  # it must not stop work that does without it
+                except Exception as error:  # one format's failure must not stop the others
                     warnings.warn(f"The package of {entry.value} could not register a format of a "
                                   f"{self.what} ({type(error).__name__}: {error}).", stacklevel=2)
         return iter(tuple(self.formats))
@@ -178,11 +178,11 @@ def suffixes_of(formats: Iterable[Format]) -> tuple[str, ...]:
 
 def listed(formats: Iterable[Format]) -> str:
     """Return the suffixes of formats and their meaning, as a text for users."""
-    told: dict[str, list[str]] = {}
+    endings: dict[str, list[str]] = {}
     for one in formats:
-        told.setdefault(" ".join(one.suffixes), []).extend([one.about] if one.about else [])
+        endings.setdefault(" ".join(one.suffixes), []).extend([one.about] if one.about else [])
     return "; ".join(f"{suffixes} ({', '.join(abouts)})" if suffixes and abouts
-                     else suffixes or ", ".join(abouts) for suffixes, abouts in told.items())
+                     else suffixes or ", ".join(abouts) for suffixes, abouts in endings.items())
 
 
 def head_of(path: Path, count: int) -> bytes:

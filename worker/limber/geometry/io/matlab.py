@@ -54,8 +54,8 @@ def struct_arrays(path: Path, needed: tuple[str, ...], further: tuple[str, ...],
                 if found is not None and all(name in found for name in needed):
                     arrays = {name: _numbers(_own(found, name), most)
                               for name in (*needed, *further) if name in found}
-                    told = _own(_struct(file, _own(first, "rundata")), "creator")
-                    return arrays | {"creator": np.array(_text(told))}
+                    creator = _own(_struct(file, _own(first, "rundata")), "creator")
+                    return arrays | {"creator": np.array(_text(creator))}
     return {}
 
 

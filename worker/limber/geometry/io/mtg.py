@@ -85,8 +85,8 @@ def _header(path: Path, body: list[tuple[int, str]]) -> tuple[int, dict[str, int
     """Number of columns for codes, and the column of each feature."""
     cells = [cell.strip() for cell in body[0][1].split("\t")]
     features = {name: column for column, name in enumerate(cells) if name and column > 0}
-    places = next((names for names in _PLACE if all(name in features for name in names)), None)
-    if places is None:
+    columns = next((names for names in _PLACE if all(name in features for name in names)), None)
+    if columns is None:
         raise InputError(f"{path} has no columns XX, YY and ZZ.",
                          "Limber needs the positions of the vertices of an MTG.",
                          "Add these columns. The file has: "
@@ -96,7 +96,7 @@ def _header(path: Path, body: list[tuple[int, str]]) -> tuple[int, dict[str, int
         raise InputError(f"{path} has no column Radius or Diameter.",
                          "Limber needs the thickness of the branch at its vertices.",
                          f"Add one of these columns. The file has: {', '.join(features)}.")
-    used = dict(zip(("x", "y", "z"), (features[name] for name in places), strict=True))
+    used = dict(zip(("x", "y", "z"), (features[name] for name in columns), strict=True))
     return min(features.values()), used | {radius.lower(): features[radius]}
 
 
@@ -119,14 +119,14 @@ class _Reader:
             return
         values = self.values(number, cells)
         vertex: _Vertex | None = None
-        for place, (column, code) in enumerate(codes):
+        for index, (column, code) in enumerate(codes):
             if vertex is None:
                 stays = code.startswith("^")
                 vertex = self.last.get(column if stays else column - 1)
                 if vertex is None and (stays or column > 0):
                     raise self.wrong(number, code, "It refers to a vertex that does not exist.")
             vertex = self.chain(number, code.removeprefix("^"), vertex,
-                                values if place == len(codes) - 1 else None)
+                                values if index == len(codes) - 1 else None)
             self.last = {at: one for at, one in self.last.items() if at < column}
             self.last[column] = vertex
 
@@ -168,12 +168,12 @@ class _Reader:
         return found
 
     def node(self, number: int, code: str, parent: int, values: tuple[float, ...]) -> int:
-        *place, radius = values
+        *position, radius = values
         if np.isnan(radius):
             if parent < 0:
                 raise self.wrong(number, code, "The first vertex with a position has no radius.")
             radius = self.radius[parent]
-        self.nodes.append(tuple(place))
+        self.nodes.append(tuple(position))
         self.parent.append(parent)
         self.radius.append(radius)
         return len(self.nodes) - 1
@@ -187,11 +187,11 @@ class _Reader:
                 return float(text) if text not in ("", "-", "NA") else np.nan
             except ValueError as error:
                 raise self.wrong(number, text, "Positions and radii must be numbers.") from error
-        place = tuple(value(name) for name in "xyz")
-        if np.isnan(place).all():
+        position = tuple(value(name) for name in "xyz")
+        if np.isnan(position).all():
             return None
-        require_finite(self.path, {f"position in line {number}": np.array(place)}, _WHAT)
-        return *place, value(self.radius_column) * _RADII[self.radius_column]
+        require_finite(self.path, {f"position in line {number}": np.array(position)}, _WHAT)
+        return *position, value(self.radius_column) * _RADII[self.radius_column]
 
     def skeleton(self, scale: float) -> Skeleton:
         roots = self.parent.count(-1)

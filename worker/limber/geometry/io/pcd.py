@@ -13,7 +13,7 @@ from limber.core.files.declared_sizes import header_bytes
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
 
-_PADDING = "#$%&~~"  # how pypcd4 begins the names of fields that are called _
+_PADDING = "#$%&~~"  # prefix by which pypcd4 names fields that are called _
 
 
 def read_pcd(path: Path) -> Cloud:
@@ -44,26 +44,30 @@ def _stream(path: Path) -> tuple[Any, dict[str, str]]:
     special characters in the names of fields.
     """
     raw, body = header_bytes(path, b"\nDATA")
-    said = {words[0]: words[1:] for line in raw.decode("utf-8", "replace").splitlines()
-            if (words := line.split()) and not words[0].startswith("#")}
+    source_header = {words[0]: words[1:] for line in raw.decode("utf-8", "replace").splitlines()
+                     if (words := line.split()) and not words[0].startswith("#")}
     for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
-        if not said.get(key):
+        if not source_header.get(key):
             raise InputError(f"The header of {path} has no entry {key}.",
                              "A PCD header needs this entry.", "Export it again.")
-    fields = said["FIELDS"]
+    fields = source_header["FIELDS"]
     own = [title for title in fields if title != "_"]
     names = iter(property_names(own))
     renamed = [title if title == "_" else next(names) for title in fields]
-    size = int(said["WIDTH"][0]) * int(said.get("HEIGHT", "1")[0])
-    told = {"VERSION": ["0.7"], "FIELDS": renamed, "SIZE": said["SIZE"], "TYPE": said["TYPE"],
-            "COUNT": said.get("COUNT") or ["1"] * len(fields), "WIDTH": said["WIDTH"],
-            "HEIGHT": said.get("HEIGHT") or ["1"], "POINTS": said.get("POINTS") or [str(size)],
-            "DATA": said["DATA"]}
-    header = "".join(f"{key} {' '.join(words)}\n" for key, words in told.items()).encode()
+    size = int(source_header["WIDTH"][0]) * int(source_header.get("HEIGHT", "1")[0])
+    new_header = {"VERSION": ["0.7"], "FIELDS": renamed, "SIZE": source_header["SIZE"],
+                  "TYPE": source_header["TYPE"],
+                  "COUNT": source_header.get("COUNT") or ["1"] * len(fields),
+                  "WIDTH": source_header["WIDTH"],
+                  "HEIGHT": source_header.get("HEIGHT") or ["1"],
+                  "POINTS": source_header.get("POINTS")
+                  or [str(size)],
+                  "DATA": source_header["DATA"]}
+    header = "".join(f"{key} {' '.join(words)}\n" for key, words in new_header.items()).encode()
     with open(path, "rb") as stream:
         stream.seek(body)
         points = stream.read()
-    if said["DATA"][0] == "ascii":
+    if source_header["DATA"][0] == "ascii":
         points = b"\n".join(b" ".join(line.split()) for line in points.splitlines())
     return io.BytesIO(header + points), {
         name: title for name, title in zip(renamed, fields, strict=True) if name != title}

@@ -22,7 +22,7 @@ from limber.geometry.skeleton.skeleton import STATES, Skeleton
 _ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
     f"{end}{axis}": f"{end[0]}{axis}" for end in ("start", "end") for axis in "xyz"}}
 """Names of columns in rTwig and SimpleForest, in lower case and without underscores."""
-_HEAD = 4096  # bytes that a search for the format reads
+_HEAD = 4096  # bytes searched for the format
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:

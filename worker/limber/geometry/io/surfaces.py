@@ -45,7 +45,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
     found = crossings(surface)
     if len(found):
         raise InputError(f"{path} intersects itself at {len(found)} points, one of them at "
-                         f"{_place(found[0])}.",
+                         f"{_at_text(found[0])}.",
                          "The surface of a solid must not intersect itself.",
                          "Unite its parts (in Blender: a Boolean modifier with Self), then mesh "
                          "the surface again.")
@@ -90,19 +90,19 @@ def _check_edges(surface: Surface, path: Path) -> None:
     middle = surface.vertices[unique].mean(axis=1)
     if (counts == 1).any():
         raise InputError(f"{path} has holes: {int((counts == 1).sum())} open edges, one of them at "
-                         f"{_place(middle[counts == 1][0])}.", "The surface must be closed.",
+                         f"{_at_text(middle[counts == 1][0])}.", "The surface must be closed.",
                          "Close the holes (in Blender: select non-manifold, fill), then mesh the "
                          "surface again.")
     if (counts > 2).any():
         raise InputError(f"{path} has {int((counts > 2).sum())} edges with more than two faces, "
-                         f"one of them at {_place(middle[counts > 2][0])}.",
+                         f"one of them at {_at_text(middle[counts > 2][0])}.",
                          "Each edge of a solid has two faces.",
                          "Delete duplicate and inner faces (in Blender: Merge by Distance, then "
                          "select non-manifold), then mesh the surface again.")
     balance = np.bincount(inverse.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(counts))
     if balance.any():
         raise InputError(f"{path} has faces that point inwards and faces that point outwards, for "
-                         f"example at {_place(middle[balance != 0][0])}.",
+                         f"example at {_at_text(middle[balance != 0][0])}.",
                          "All faces must have the same orientation.",
                          "Recalculate the normals (in Blender: Shift N).")
 
@@ -121,7 +121,7 @@ def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
         if inner:
             raise InputError(f"{path} has {len(inner)} closed surfaces inside its largest one, one "
                              "of them at "
-                             f"{_place(parts[inner[0]].vertices[parts[inner[0]].faces[0, 0]])}.",
+                             f"{_at_text(parts[inner[0]].vertices[parts[inner[0]].faces[0, 0]])}.",
                              "A branch is a solid without cavities.",
                              "Delete the inner surfaces (in Blender: separate by loose parts), "
                              "then mesh the surface again.")
@@ -156,5 +156,5 @@ def _winding(surface: Surface, point: np.ndarray) -> float:
     return float(np.arctan2(over, under).sum() / (2 * np.pi))
 
 
-def _place(point: np.ndarray) -> str:
+def _at_text(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{v:.4f}" for v in point) + ") m"

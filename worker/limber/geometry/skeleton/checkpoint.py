@@ -60,12 +60,12 @@ class FoundSkeleton:
     def write(self, path: Path) -> None:
         """Write an NPZ file."""
         result = self.result
-        told = {name: getattr(result, name) for name in (
+        values = {name: getattr(result, name) for name in (
             "noise", "bridges", "split_off", "loops", "pruned", "second_base", "other_root",
             "leafy", "unlikely")} | {
             "iterations": result.contraction.iterations, "status": result.contraction.status,
             "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
-        np.savez(path, told=np.array(json.dumps(plain(told))), **asdict(result.skeleton),
+        np.savez(path, told=np.array(json.dumps(plain(values))), **asdict(result.skeleton),
                  node_of_point=result.node_of_point, residual=result.residual,
                  contracted=result.contraction.points, linearity=result.contraction.linearity,
                  leaf_points=np.concatenate([np.zeros(0, np.int64), *(
@@ -81,7 +81,7 @@ class FoundSkeleton:
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, _SKELETON | _POINTS, _WHAT)
         skeleton = Skeleton(**{name: arrays[name] for name in _SKELETON})
-        told = _told(path, arrays)
+        stored = _stored(path, arrays)
         if not _is_tree(skeleton.parent) or not _are_below(
                 arrays["node_of_point"], skeleton.node_count):
             raise _damaged(path, "Its nodes do not form a tree.")
@@ -89,14 +89,14 @@ class FoundSkeleton:
             raise _damaged(path, "Its nodes are not on unforked runs.")
         if not _is_possible(skeleton):
             raise _damaged(path, "Its axes have an impossible length, thickness or probability.")
-        contraction = Contraction(arrays["contracted"], arrays["linearity"], told.iterations,
-                                  told.status)
+        contraction = Contraction(arrays["contracted"], arrays["linearity"], stored.iterations,
+                                  stored.status)
         return cls(SkeletonResult(
-            skeleton, contraction, arrays["node_of_point"], arrays["residual"], told.noise,
-            [bridge.found() for bridge in told.bridges],
-            [piece.found() for piece in told.split_off], told.loops, told.pruned,
-            _place(told.second_base), _place(told.other_root), told.leafy,
-            [twig.found() for twig in told.unlikely]), _leaves(path, arrays, told))
+            skeleton, contraction, arrays["node_of_point"], arrays["residual"], stored.noise,
+            [bridge.found() for bridge in stored.bridges],
+            [piece.found() for piece in stored.split_off], stored.loops, stored.pruned,
+            _position_array(stored.second_base), _position_array(stored.other_root), stored.leafy,
+            [twig.found() for twig in stored.unlikely]), _leaves(path, arrays, stored))
 
 
 class _Part(BaseModel):
@@ -135,7 +135,7 @@ class _Leaf(BaseModel):
     area: float
 
 
-class _Told(BaseModel):
+class _Stored(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     noise: float
@@ -152,22 +152,22 @@ class _Told(BaseModel):
     leaves: list[_Leaf]
 
 
-def _told(path: Path, arrays: dict[str, np.ndarray]) -> _Told:
+def _stored(path: Path, arrays: dict[str, np.ndarray]) -> _Stored:
     text = arrays.get("told", np.zeros(0))
     if text.dtype.kind != "U" or text.ndim != 0:
         raise _damaged(path, "The report of the search is missing.")
-    return checked_as(path, _Told, json_content(str(text), path, _WHAT), _WHAT, strict=True)
+    return checked_as(path, _Stored, json_content(str(text), path, _WHAT), _WHAT, strict=True)
 
 
-def _leaves(path: Path, arrays: dict[str, np.ndarray], told: _Told) -> list[Leaf]:
+def _leaves(path: Path, arrays: dict[str, np.ndarray], stored: _Stored) -> list[Leaf]:
     points = arrays["leaf_points"]
-    ends = np.cumsum([leaf.count for leaf in told.leaves], dtype=np.int64)
+    ends = np.cumsum([leaf.count for leaf in stored.leaves], dtype=np.int64)
     total = int(ends[-1]) if len(ends) else 0
     if len(points) != total or len(np.unique(points)) != total or not _are_below(
             points, len(arrays["node_of_point"]) + total):
         raise _damaged(path, "Its leaves are not part of the scan.")
     return [Leaf(own, leaf.area) for own, leaf in zip(
-        np.split(points, ends[:-1]), told.leaves, strict=True)] if total else []
+        np.split(points, ends[:-1]), stored.leaves, strict=True)] if total else []
 
 
 def _is_tree(parent: np.ndarray) -> bool:
@@ -208,8 +208,8 @@ def _are_below(index: np.ndarray, count: int) -> bool:
     return index.dtype.kind == "i" and bool(((index >= 0) & (index < count)).all())
 
 
-def _place(place: _Place | None) -> np.ndarray | None:
-    return None if place is None else np.array(place)
+def _position_array(position: _Place | None) -> np.ndarray | None:
+    return None if position is None else np.array(position)
 
 
 def _damaged(path: Path, why: str) -> InputError:

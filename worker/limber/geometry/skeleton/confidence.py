@@ -12,8 +12,8 @@ from limber.geometry.skeleton.radii.unresolved import SPACINGS, point_spacing, w
 from limber.geometry.skeleton.skeleton import BRIDGED, STATES, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import stretches
 
-_GAP = 4.0  # radii without a point that are a gap, not a hole
-_BRIDGED_SIGMA = 0.15  # of a radius in a gap
+_GAP = 4.0  # radii without a point that make a gap
+_BRIDGED_SIGMA = 0.15  # fraction of a radius in a gap
 # Logistic models: a constant, then a slope for each column of the evidence. A twig exists where its
 # fork is true, a node where it lies inside the true wood. Both were fitted by maximum likelihood to
 # 1,056 side branches of 203 generated scans (seeds 7000 to 7215: round, one-sided with 1 to 3 mm
@@ -24,8 +24,8 @@ _BRIDGED_SIGMA = 0.15  # of a radius in a gap
 # points).
 _TWIG_ODDS = (-2.2, 0.97, 0.88, -1.3, -1.35, 0.0)
 _NODE_ODDS = (6.6, -0.8, -1.3, -3.4)
-_BACK = np.deg2rad(75.0), np.deg2rad(30.0)  # angle from which a twig starts backwards, and wholly
-_NOISE_MOST = 2.0  # radii of noise from which more tells nothing more
+_BACK = np.deg2rad(75.0), np.deg2rad(30.0)  # angle at which a twig starts backwards; range
+_NOISE_MOST = 2.0  # noise in radii above which it no longer matters
 
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
@@ -39,12 +39,15 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     spacing, count = _shown(skeleton, points, noise)
     # A quarter of a circle is off together; the four average.
     shared = shared_error(skeleton, points, noise) / 2
-    told = weighed(replace(skeleton, radius_sigma=np.hypot(skeleton.radius_sigma, shared)),
-                   spacing, noise)
-    gap = _gaps(told, count, spacing)
-    sigma = np.where(gap > 0, np.maximum(told.radius_sigma, _BRIDGED_SIGMA * told.radius),
-                     told.radius_sigma)
-    return _with_probability(replace(told, radius_sigma=sigma), count, gap, noise)
+    assessed_skeleton = weighed(replace(skeleton,
+                                        radius_sigma=np.hypot(skeleton.radius_sigma, shared)),
+                                spacing, noise)
+    gap = _gaps(assessed_skeleton, count, spacing)
+    sigma = np.where(gap > 0,
+                     np.maximum(assessed_skeleton.radius_sigma,
+                                _BRIDGED_SIGMA * assessed_skeleton.radius),
+                     assessed_skeleton.radius_sigma)
+    return _with_probability(replace(assessed_skeleton, radius_sigma=sigma), count, gap, noise)
 
 
 def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
@@ -81,29 +84,30 @@ def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
         tip and its ``probability``.
     """
     runs = skeleton.runs()
-    told = np.ones(len(runs))
+    probability = np.ones(len(runs))
     for run, members in enumerate(runs[1:], start=1):
-        told[run] = min(float(skeleton.probability[members[1:]].max()),
-                        told[skeleton.branch[members[0]]])
+        probability[run] = min(float(skeleton.probability[members[1:]].max()),
+                               probability[skeleton.branch[members[0]]])
     dropped = [{"length": float(np.linalg.norm(np.diff(skeleton.nodes[runs[run]], axis=0),
                                                axis=1).sum()),
-                "at": skeleton.nodes[runs[run][-1]], "probability": float(told[run])}
-               for run in np.flatnonzero(told < least)]
-    return (skeleton.subset(told[skeleton.branch] >= least) if dropped else skeleton), dropped
+                "at": skeleton.nodes[runs[run][-1]], "probability": float(probability[run])}
+               for run in np.flatnonzero(probability < least)]
+    return (skeleton.subset(probability[skeleton.branch] >= least) if dropped
+            else skeleton), dropped
 
 
-def given_carrier(skeleton: Skeleton) -> np.ndarray:
+def probability_given_carrier(skeleton: Skeleton) -> np.ndarray:
     """Probability of each run, given that its carrier exists, shape [runs]; 1 for the main run.
 
     The probability of a run's nodes includes that of its carriers.
     """
     runs = skeleton.runs()
     stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
-    given = np.ones(len(runs))
+    probability = np.ones(len(runs))
     for run, members in enumerate(runs[1:], start=1):
         carrier = int(skeleton.branch[members[0]])
-        given[run] = stated[run] / (max(float(stated[carrier]), 1e-12) if carrier else 1.0)
-    return np.minimum(given, 1.0)
+        probability[run] = stated[run] / (max(float(stated[carrier]), 1e-12) if carrier else 1.0)
+    return np.minimum(probability, 1.0)
 
 
 def shares(skeleton: Skeleton) -> dict[str, float]:
@@ -121,17 +125,17 @@ def _twig_evidence(skeleton: Skeleton, count: np.ndarray, noise: float) -> np.nd
     its radius, and whether it starts backwards, 0 to 1: where a fork is misplaced, a twig comes
     back to it.
     """
-    told = np.zeros((skeleton.branch_count, 5))
+    rows = np.zeros((skeleton.branch_count, 5))
     runs = skeleton.runs()
     for run, members in enumerate(runs[1:], start=1):
         own, carrier = members[1:], runs[int(skeleton.branch[members[0]])]
         away = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[own])[0]
-        told[run] = (np.log1p(count[own].sum() / 10),
+        rows[run] = (np.log1p(count[own].sum() / 10),
                      np.log1p(away.max() / max(float(skeleton.radius[members[0]]), 1e-12)),
                      float(np.mean(skeleton.radius_state[own] == BRIDGED)),
                      min(noise / max(float(np.median(skeleton.radius[own])), 1e-12), _NOISE_MOST),
                      np.clip((start_angle(skeleton, members) - _BACK[0]) / _BACK[1], 0.0, 1.0))
-    return told
+    return rows
 
 
 def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndarray:
@@ -148,9 +152,10 @@ def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndar
 def _with_probability(skeleton: Skeleton, count: np.ndarray, gap: np.ndarray, noise: float,
                       ) -> Skeleton:
     state = np.where(gap > 0, BRIDGED, skeleton.radius_state).astype(np.int8)
-    told = replace(skeleton, radius_state=state)
-    return replace(told, probability=_probability(
-        told, _twig_evidence(told, count, noise), _node_evidence(told, gap, noise)))
+    with_state = replace(skeleton, radius_state=state)
+    return replace(with_state, probability=_probability(
+        with_state, _twig_evidence(with_state, count, noise),
+        _node_evidence(with_state, gap, noise)))
 
 
 def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:

@@ -8,10 +8,10 @@ import numpy as np
 from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, stretches
 
-_LIKELY = 0.8  # probability from which a branch is not listed
-KINK = np.deg2rad(70.0)  # a turn within a branch that wood does not make
-_BACKWARDS = np.deg2rad(110.0)  # of a twig against its carrier, likewise
-_CHORD = 2.0  # radii on each side of a node that tell its turn
+_LIKELY = 0.8  # probability above which a branch is not listed
+KINK = np.deg2rad(70.0)  # wood does not turn this sharply within a branch
+_BACKWARDS = np.deg2rad(110.0)  # the same for a twig against its carrier
+_CHORD = 2.0  # radii on each side of a node over which its turn is measured
 
 
 class DoubtfulKind(StrEnum):
@@ -98,8 +98,8 @@ def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
     along = arc_lengths(nodes)
     chord = _CHORD * skeleton.radius[members]
 
-    def at(place: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(place, along, nodes[:, k]) for k in range(3)], axis=1)
+    def at(position: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(position, along, nodes[:, k]) for k in range(3)], axis=1)
     before, after = nodes - at(along - chord), at(along + chord) - nodes
     angle = _angles(before, after)
     angle[(along < chord) | (along > along[-1] - chord)] = 0.0

@@ -24,9 +24,9 @@ from limber.core.json_values import validated
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 
 Place = tuple[float, float, float]
-_FAR = 4.0  # radii from an axis, from which a place is none on it
-_KNOWN = 0.02  # of a radius that a user gave
-_SAME = 1e-3  # radii within which a place is the same: files round
+_FAR = 4.0  # radii from an axis beyond which a point is not on it
+_KNOWN = 0.02  # standard deviation of a radius that a user gave, over the radius
+_SAME = 1e-3  # radii within which two positions are the same; files round
 
 
 class _Edit(BaseModel):
@@ -43,10 +43,10 @@ class _Edit(BaseModel):
         return self._placed(alignment.undo, 1.0 / alignment.scale)
 
     def _placed(self, taken: Callable[[np.ndarray], np.ndarray], factor: float) -> Self:
-        places = {name: tuple(taken(np.array(getattr(self, name))).tolist())
-                  for name in ("at", "to") if getattr(self, name, None) is not None}
+        positions = {name: tuple(taken(np.array(getattr(self, name))).tolist())
+                     for name in ("at", "to") if getattr(self, name, None) is not None}
         sizes = {"radius": self.radius * factor} if hasattr(self, "radius") else {}
-        return self.model_copy(update=places | sizes)
+        return self.model_copy(update=positions | sizes)
 
 
 class MoveNode(_Edit):
@@ -120,9 +120,9 @@ def read_edits(path: Path) -> list[Edit]:
         return validated(list[Edit], read_json(path, "a JSON file of edits"))
     except ValidationError as error:
         first = error.errors()[0]
-        place = first["loc"]
-        where = f"edit {place[0] + 1}: " if place and isinstance(place[0], int) else ""
-        field = ".".join(str(part) for part in place[2:])
+        key = first["loc"]
+        where = f"edit {key[0] + 1}: " if key and isinstance(key[0], int) else ""
+        field = ".".join(str(part) for part in key[2:])
         raise InputError(
             f"{path}: {where}{field + ': ' if field else ''}{first['msg']}.",
             "Edits are a JSON list of objects such as {\"do\": \"delete\", \"at\": [x, y, z]}. The "
@@ -155,10 +155,10 @@ def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None 
         try:
             skeleton = doing[edit.do](skeleton, edit)
         except InputError as error:
-            told = InputError(f"Edit {number} ({edit.do}): {error.seen}", error.why, error.fix)
+            refusal = InputError(f"Edit {number} ({edit.do}): {error.seen}", error.why, error.fix)
             if misfits is None:
-                raise told from error
-            misfits.append(str(told))
+                raise refusal from error
+            misfits.append(str(refusal))
     return skeleton
 
 
@@ -202,7 +202,7 @@ def _merged(skeleton: Skeleton, edit: MergeBranch) -> Skeleton:
     members = skeleton.runs()[run][1:]
     gone = np.zeros(skeleton.node_count, bool)
     gone[members[members <= node]] = True
-    if gone[_way_down(skeleton, onto)].any():
+    if gone[_path_to_root(skeleton, onto)].any():
         raise _circle()
     parent = skeleton.parent.copy()
     hosts = np.flatnonzero(skeleton.branch == other)
@@ -225,11 +225,11 @@ def _split(skeleton: Skeleton, edit: SplitBranch) -> Skeleton:
 
 def _hung(skeleton: Skeleton, node: int, onto: int) -> Skeleton:
     """Attach a node, with all that it carries, to another one; nodes are added along a long gap."""
-    if node in _way_down(skeleton, onto):
+    if node in _path_to_root(skeleton, onto):
         raise _circle()
-    way = skeleton.nodes[node] - skeleton.nodes[onto]
+    vector = skeleton.nodes[node] - skeleton.nodes[onto]
     thick = skeleton.radius[node]
-    count = int(np.linalg.norm(way) / (2 * max(thick, 1e-12)))
+    count = int(np.linalg.norm(vector) / (2 * max(thick, 1e-12)))
     share = (np.arange(count) + 1)[:, None] / (count + 1)
     parent = skeleton.parent.copy()
     chain = skeleton.node_count + np.arange(count)
@@ -238,7 +238,7 @@ def _hung(skeleton: Skeleton, node: int, onto: int) -> Skeleton:
     filled = {"radius_sigma": data["radius_sigma"][node], "radius_state": BRIDGED,
               "probability": data["probability"][node]}
     return Skeleton.from_edges(
-        np.vstack([skeleton.nodes, skeleton.nodes[onto] + share * way]),
+        np.vstack([skeleton.nodes, skeleton.nodes[onto] + share * vector]),
         np.concatenate([parent, np.concatenate([[onto], chain[:-1]])[:count]]),
         np.concatenate([skeleton.radius, np.full(count, thick)]),
         **{name: np.concatenate([values, np.full(count, filled[name], values.dtype)])
@@ -257,8 +257,8 @@ def _with_radius(skeleton: Skeleton, edit: SetRadius) -> Skeleton:
     node = _nearest(skeleton, edit.at)
     chosen = [node]
     if edit.to is not None:
-        one = _way_down(skeleton, node)
-        other = _way_down(skeleton, _nearest(skeleton, edit.to))
+        one = _path_to_root(skeleton, node)
+        other = _path_to_root(skeleton, _nearest(skeleton, edit.to))
         # The path between two nodes: the nodes on only one of their paths to the root, and the
         # fork.
         fork = next(step for step in one if step in other)
@@ -273,17 +273,17 @@ def _confirmed(skeleton: Skeleton, edit: ConfirmBranch) -> Skeleton:
     node = _nearest(skeleton, edit.at)
     probability = skeleton.probability.copy()
     probability[skeleton.branch == skeleton.branch[node]] = 1.0
-    probability[_way_down(skeleton, node)] = 1.0
+    probability[_path_to_root(skeleton, node)] = 1.0
     return replace(skeleton, probability=probability)
 
 
-def _way_down(skeleton: Skeleton, node: int) -> list[int]:
+def _path_to_root(skeleton: Skeleton, node: int) -> list[int]:
     """Nodes from one to the root, both included."""
-    way = []
+    nodes = []
     while node >= 0:
-        way.append(node)
+        nodes.append(node)
         node = int(skeleton.parent[node])
-    return way
+    return nodes
 
 
 def _circle() -> InputError:

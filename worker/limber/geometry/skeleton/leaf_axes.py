@@ -11,7 +11,7 @@ from limber.geometry.skeleton.repair.resampling import resampled
 from limber.geometry.skeleton.repair.run_radii import limited, tapered
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 
-_EVENED = 3  # rounds
+_EVENED = 3  # rounds of smoothing
 
 
 def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,

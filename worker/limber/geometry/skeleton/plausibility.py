@@ -14,9 +14,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 Where = Callable[[np.ndarray], np.ndarray]
 """Transforms positions, shape [..., 3], to the coordinates of the scan's file."""
 
-_STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
-_ROUND = 0.3  # of the radius, up to which points may scatter and show what is round
-_NAMED = 3  # gaps and loops that are named one by one
+_STOUT = 0.13  # median distance from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
+_ROUND = 0.3  # fraction of the radius by which points of a round branch may scatter
+_NAMED = 3  # gaps and loops named one by one
 _FIX = ("Crop the scan to one branch (--crop-low, --crop-high), or provide a skeleton "
         "(--skeleton).")
 
@@ -52,7 +52,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
     for plant in graph.plants:
         raise InputError(
             f"The scan contains two plants, {plant['distance']:.3g} m apart at "
-            f"{_place(where(plant['at']))} in the scan's coordinates. "
+            f"{_position_text(where(plant['at']))} in the scan's coordinates. "
             f"{100 * plant['points'] / count:.0f} % of the points have a base of their own.",
             "A branch belongs to one plant, and the scan does not show which one is meant.",
             f"{_FIX} Or use the larger plant (--plants largest), or join them (--plants joined)."
@@ -62,8 +62,8 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
         if share > 0.2 and piece["distance"] > 0.25 * diagonal:
             raise InputError(
                 f"The scan contains two distant clusters. {100 * share:.0f} % of the points lie "
-                f"{piece['distance']:.3g} m from the rest, at {_place(where(piece['at']))} in the "
-                "scan's coordinates.", "A branch must be connected.",
+                f"{piece['distance']:.3g} m from the rest, at {_position_text(where(piece['at']))} "
+                "in the scan's coordinates.", "A branch must be connected.",
                 f"{_FIX} Or use the larger cluster (--plants largest).").at(where(piece["at"]))
 
 
@@ -133,7 +133,7 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
     longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
     for bridge in longest[:_NAMED]:
         texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
-                     f"{_place(where(bridge['to']))}.")
+                     f"{_position_text(where(bridge['to']))}.")
     if len(longest) > _NAMED:
         texts.append(f"{len(longest) - _NAMED} shorter gaps were bridged "
                      f"(up to {1000 * longest[_NAMED]['length']:.0f} mm).")
@@ -144,7 +144,7 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
         texts.append(
             f"{len(result.split_off)} pieces ({share:.1f} % of the points) were discarded, "
             "because they are too far from the rest for their size. The largest is "
-            f"{1000 * largest['distance']:.0f} mm away, at {_place(where(largest['at']))}.")
+            f"{1000 * largest['distance']:.0f} mm away, at {_position_text(where(largest['at']))}.")
     for loop in sorted(result.loops)[::-1][:_NAMED]:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened where branches touch.")
     if len(result.loops) > _NAMED:
@@ -160,12 +160,14 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
         texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were "
                      "discarded, because they probably do not exist (--twig-probability).")
     if result.second_base is not None:
-        texts.append(f"The plant has a second base at {_place(where(result.second_base))}. Do two "
+        texts.append(f"The plant has a second base at {_position_text(where(result.second_base))}. "
+                     "Do two "
                      "plants touch? Then crop the scan to one of them (--crop-low, --crop-high).")
     if result.other_root is not None:
-        texts.append(f"The end at {_place(where(result.other_root))} is about as likely to be the "
-                     f"root as the end at {_place(where(result.skeleton.nodes[0]))}. If it is the "
-                     "root, state it with --root.")
+        texts.append(f"The end at {_position_text(where(result.other_root))} is about as likely to "
+                     "be the "
+                     f"root as the end at {_position_text(where(result.skeleton.nodes[0]))}. If it "
+                     "is the root, state it with --root.")
     return texts
 
 
@@ -213,7 +215,8 @@ def check_explained(result: Any, limit: float, points: np.ndarray, where: Where)
     place = where(stray[np.argmin(np.linalg.norm(stray - np.median(stray, axis=0), axis=1))])
     raise InputError(
         f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
-        f"{100 * limit:.0f} %), among them those at {_place(place)} in the scan's coordinates.",
+        f"{100 * limit:.0f} %), among them those at {_position_text(place)} in the scan's "
+        "coordinates.",
         "Leaves or a second plant would become rods, and the radii there are unreliable. A pot, a "
         "stake or a wire counts too.", "Remove these points from the scan (--crop-low, "
         "--crop-high, or in another program), remove leaves (--leaves cut), or accept the axes as "
@@ -227,5 +230,5 @@ def _unexplained(result: Any) -> np.ndarray:
     return np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)
 
 
-def _place(point: np.ndarray) -> str:
+def _position_text(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{v:.3f}" for v in point) + ")"

@@ -66,9 +66,10 @@ def diameters_at_heights(skeleton: Skeleton) -> list[dict[str, float]]:
     """Diameter and its standard deviation [m] at HEIGHTS, fractions of the main path."""
     total = float(skeleton.arc_length[skeleton.main_path()[-1]])
     along = total * np.array(HEIGHTS)
-    return [{"share": share, "along_m": float(place), "diameter_m": float(row[0]),
+    return [{"share": share, "along_m": float(distance), "diameter_m": float(row[0]),
              "sigma_m": float(row[1])}
-            for share, place, row in zip(HEIGHTS, along, diameters(skeleton, along), strict=True)]
+            for share, distance, row
+            in zip(HEIGHTS, along, diameters(skeleton, along), strict=True)]
 
 
 def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[str, Any]]:
@@ -86,11 +87,11 @@ def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[s
         raise InputError(
             f"A caliper value is at {outside[0]:.3g} m, but the main path is {total:.3g} m long.",
             "along_m is measured from the root along the main path, in metres.", "Correct along_m.")
-    ours = diameters(skeleton, along)
+    estimated = diameters(skeleton, along)
     return [{"along_m": one.along, "measured_m": one.diameter, "diameter_m": float(row[0]),
              "sigma_m": float(row[1]), "difference": float(row[0] / one.diameter - 1),
              "sigmas": float((row[0] - one.diameter) / row[1]) if row[1] > 0 else None}
-            for one, row in zip(measured, ours, strict=True)]
+            for one, row in zip(measured, estimated, strict=True)]
 
 
 def read_calipers(path: Path) -> list[Caliper]:

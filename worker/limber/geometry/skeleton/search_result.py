@@ -68,8 +68,8 @@ class SkeletonResult:
                              "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
         split_off, unlikely = ([part | {"at": move(part["at"][None])[0]} for part in parts]
                                for parts in (self.split_off, self.unlikely))
-        base, other = (None if place is None else move(place[None])[0]
-                       for place in (self.second_base, self.other_root))
+        base, other = (None if position is None else move(position[None])[0]
+                       for position in (self.second_base, self.other_root))
         return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
                        bridges=bridges, split_off=split_off, unlikely=unlikely, second_base=base,
                        other_root=other)
@@ -86,7 +86,7 @@ class SkeletonResult:
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 
 
-def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
+def result_of_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
     """Wrap a user's own skeleton, in the cloud's frame; it is not changed."""
     segment, residual = nearest_cylinders(skeleton, points)
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))

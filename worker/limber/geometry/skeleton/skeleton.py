@@ -156,8 +156,8 @@ class Skeleton:
         """Position [m], shape [3], at a fraction of the main path's length."""
         path = self.main_path()
         along = self.arc_length[path]
-        wanted = float(fraction) * along[-1]
-        return np.array([np.interp(wanted, along, self.nodes[path, k]) for k in range(3)])
+        distance = float(fraction) * along[-1]
+        return np.array([np.interp(distance, along, self.nodes[path, k]) for k in range(3)])
 
     def radius_at(self, fraction: float) -> float:
         """Radius [m] at a fraction of the main path's length."""

@@ -60,11 +60,11 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
     found = _of_ordered(own, settings or SkeletonSettings(),
                         None if root is None else own.inside(root), up @ own.axes, camera,
-                        where or (lambda place: place), progress)
-    place, drawn = np.argsort(own.order), found.contraction
+                        where or (lambda original_order: original_order), progress)
+    original_order, drawn = np.argsort(own.order), found.contraction
     return replace(found.moved(own.outside), contraction=replace(
         drawn, points=own.outside(drawn.points), drawn=own.outside(drawn.drawn)),
-        node_of_point=found.node_of_point[place], residual=found.residual[place])
+        node_of_point=found.node_of_point[original_order], residual=found.residual[original_order])
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class _Search:
 def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
                 up: np.ndarray, camera: bool, where: Where, progress: Progress) -> SkeletonResult:
     """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
-    points = own.places
+    points = own.coordinates
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
     thin = points[thinned(points, settings.contraction_points)]
     check_no_sheet(thin)

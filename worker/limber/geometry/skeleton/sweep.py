@@ -2,7 +2,7 @@
 
 import numpy as np
 
-_SAME = 1e-13  # of the coordinates: nodes that close are at one place
+_SAME = 1e-13  # fraction of the coordinates; closer nodes coincide
 
 
 def arc_lengths(points: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = 
         across = points[i + 1] - points[i]
         square = across @ across
         if square < _SAME**2 * max(float(points[i] @ points[i]), 1e-300):
-            across, square = tangent[i], 1.0  # two nodes at one place: on along the tangent
+            across, square = tangent[i], 1.0  # two nodes coincide: continue along the tangent
         reflected = normals[i] - (2 / square) * (across @ normals[i]) * across
         turned = tangent[i] - (2 / square) * (across @ tangent[i]) * across
         second = tangent[i + 1] - turned
@@ -109,9 +109,9 @@ def resample(points: np.ndarray, radius: np.ndarray, spacing: np.ndarray | float
              ) -> tuple[np.ndarray, np.ndarray]:
     """Resample points and radii along a polyline at ``spacing`` (a number, or one per point)."""
     along = arc_lengths(points)
-    wanted = np.broadcast_to(np.asarray(spacing, float), along.shape)
+    spacings = np.broadcast_to(np.asarray(spacing, float), along.shape)
     # Equal steps in the integral of 1/spacing follow a spacing that varies along the path.
-    density = np.concatenate([[0], np.cumsum(np.diff(along) * 2 / (wanted[1:] + wanted[:-1]))])
+    density = np.concatenate([[0], np.cumsum(np.diff(along) * 2 / (spacings[1:] + spacings[:-1]))])
     count = max(round(density[-1]), 1)
     at = np.interp(np.linspace(0, density[-1], count + 1), density, along)
     centres = np.stack([np.interp(at, along, points[:, k]) for k in range(3)], axis=1)

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from limber.geometry.skeleton.confidence import given_carrier
+from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.qsm_tables import cylinders
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
-_TOGETHER = 10.0  # median radii of a run, over which errors of its radii go together
-_COMMON = 0.1  # of the volume: those surest of their radii tell what all of them share
-_BRIDGED = 0.1  # of its length, to which the way through a gap is known
+_TOGETHER = 10.0  # length, in median radii of a run, over which radius errors are correlated
+_COMMON = 0.1  # fraction of the volume: its most certain radii show the common error
+_BRIDGED = 0.1  # fraction of its length to which the path through a gap is known
 _SURE = 1.96  # standard deviations to each side of an interval that covers 95 %
 
 
@@ -108,7 +108,7 @@ def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray) -> tuple
         own: Contribution of each run if it exists, shape [runs].
         variance: Variance of that, shape [runs].
     """
-    chance = given_carrier(skeleton)
+    chance = probability_given_carrier(skeleton)
     mean, spread = own.astype(float), variance.astype(float)
     # A run carried by another one has a higher number.
     runs = skeleton.runs()

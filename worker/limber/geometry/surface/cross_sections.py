@@ -9,21 +9,21 @@ SPACING = 1.5
 "Distance between cross-sections in local radii."
 
 _SIDES, _MOST_SIDES = 12, 48
-_FACET = 0.025  # how far a carrier's facets may be off its circle, in radii of its thinnest twig
+_FACET = 0.025  # deviation of a carrier's facets from its circle, in radii of its thinnest twig
 
 
-def sides_of_runs(skeleton: Skeleton, given: int | None = None) -> list[int]:
+def sides_of_runs(skeleton: Skeleton, requested: int | None = None) -> list[int]:
     """Sides of each run's cross-section: given, or enough to hide facets beside a twig.
     """
-    if given is not None:
-        return [given] * skeleton.branch_count
+    if requested is not None:
+        return [requested] * skeleton.branch_count
     sides = [_SIDES] * skeleton.branch_count
     for members in skeleton.runs()[1:]:
         carrier = int(skeleton.branch[members[0]])
         ratio = skeleton.radius[members[0]] / max(skeleton.radius[members[1]], 1e-300)
         # polygon_factor(n) is about 1 + pi^2 / (3 n^2).
-        wanted = 2 * int(np.ceil(np.pi * np.sqrt(ratio / (3 * _FACET)) / 2))
-        sides[carrier] = min(max(sides[carrier], wanted), _MOST_SIDES)
+        needed = 2 * int(np.ceil(np.pi * np.sqrt(ratio / (3 * _FACET)) / 2))
+        sides[carrier] = min(max(sides[carrier], needed), _MOST_SIDES)
     return sides
 
 

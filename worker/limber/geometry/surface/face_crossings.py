@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-_EDGE = 1e-7  # touching is not crossing: a union's faces meet at rounding distance
+_EDGE = 1e-7  # touching is not crossing: faces of a union meet at rounding distance
 
 
 @njit(cache=True)
@@ -84,7 +84,7 @@ def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.n
 def _compare(vertices: np.ndarray, faces: np.ndarray, one: int, other: int, found: list) -> None:
     """Add the points where edges of ``one`` pass through ``other`` (Moeller and Trumbore 1997)."""
     o, p, q = faces[other, 0], faces[other, 1], faces[other, 2]
-    common, number = 0, 0  # corners of ``one`` that ``other`` has too, a bit each
+    common, number = 0, 0  # shared corners of ``one`` and ``other``, a bit each
     for i in range(3):
         corner = faces[one, i]
         if corner == o or corner == p or corner == q:

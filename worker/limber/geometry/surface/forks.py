@@ -29,13 +29,13 @@ ROUNDING = 0.5
 """Radius of a fillet, in radii of its twig or of its parent, whichever is thinner."""
 
 VOLUME_CHANGE = 0.02
-_STEP = 0.7  # of the lattice, in radii of the fillet
-_COARSENED = 0.06  # by how much a fillet's triangles may then be off, in radii of the fillet
-_REACH = 2.5  # how far from the crease a fillet's solid goes, in radii of the fillet
-_RIM = 2.2  # where it lies lowest under the cylinders
-_MARGIN = 0.02  # how far it lies over them near the crease and under them at the rim, in fillets
-_LONGEST = 8.0  # crease of a twig along its parent, in radii of both together
-_SCALES = (1.0, 0.83, 1.21)  # of the lattice's step, in turn
+_STEP = 0.7  # lattice step, in fillet radii
+_COARSENED = 0.06  # deviation of coarsened triangles, in fillet radii
+_REACH = 2.5  # extent of a fillet's solid from the crease, in fillet radii
+_RIM = 2.2  # position where it is deepest under the cylinders
+_MARGIN = 0.02  # height above them near the crease, depth at the rim, in fillet radii
+_LONGEST = 8.0  # crease of a twig along its parent, in radii of both
+_SCALES = (1.0, 0.83, 1.21)  # lattice steps tried in turn
 
 
 def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = None,
@@ -115,10 +115,10 @@ def _box(fillet: Any) -> tuple[np.ndarray, np.ndarray]:
     return low - margin, high + margin
 
 
-def _holds(fillet: Any, places: np.ndarray) -> bool:
+def _holds(fillet: Any, points: np.ndarray) -> bool:
     """Whether any of the positions [m], shape [n, 3], is in the box around a fillet."""
     low, high = _box(fillet)
-    return bool(((places > low) & (places < high)).all(axis=1).any())
+    return bool(((points > low) & (points < high)).all(axis=1).any())
 
 
 def _meet(one: Any, other: Any) -> bool:
@@ -135,10 +135,10 @@ class _Fork:
     others: tuple[np.ndarray, ...]
     excess: np.ndarray
     base: np.ndarray
-    wide: float  # how far from the root's middle the cut may matter [m]
+    wide: float  # largest distance from the root's centre at which the cut matters [m]
     rounding: float
-    axis: np.ndarray  # the stretch's points [m] and radii [m], shape [k, 4]
-    end: float  # where along the twig the fillet fades out, if the two do not part
+    axis: np.ndarray  # points [m] and radii [m] of the run, shape [k, 4]
+    end: float  # position along the twig where the fillet fades out, if they do not separate
 
     def fillet(self, scale: float) -> Surface | None:
         """The solid of the rounded union around the crease; None if there is no crease."""
@@ -202,9 +202,9 @@ def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
     """Position where a twig leaves its carrier; None if it stays within."""
     along = np.append(twig[:, 8], twig[-1, 8] + twig[-1, 9])
     count = max(int(4 * along[-1] / axis[1].mean()), 8)
-    place = np.linspace(0, along[-1], count + 1)
-    points = np.stack([np.interp(place, along, axis[0][:, k]) for k in range(3)], axis=1)
-    radius = np.interp(place, along, axis[1])
+    arc = np.linspace(0, along[-1], count + 1)
+    points = np.stack([np.interp(arc, along, axis[0][:, k]) for k in range(3)], axis=1)
+    radius = np.interp(arc, along, axis[1])
     found = [distances(other, points) for other in others]
     which = np.argmin([distance for distance, _ in found], axis=0)
     outside = np.min([distance for distance, _ in found], axis=0)
@@ -218,11 +218,11 @@ def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
     begin = np.flatnonzero(outside > -reach)[0]
     clear = np.flatnonzero(outside[begin:] > reach[begin:])
     end = begin + clear[0] if len(clear) else count
-    longest = place[begin] + _LONGEST * (radius[at] + thick)
-    fades = place[end] > longest
+    longest = arc[begin] + _LONGEST * (radius[at] + thick)
+    fades = arc[end] > longest
     stretch = np.column_stack([points, radius])[begin:end + 1]
     if fades:
-        stretch = stretch[place[begin:end + 1] <= longest + 2 * radius[at]]
+        stretch = stretch[arc[begin:end + 1] <= longest + 2 * radius[at]]
     return _Fork(run, twig, others, excess, base, wide, rounding, stretch,
                  float(longest) if fades else np.inf)
 

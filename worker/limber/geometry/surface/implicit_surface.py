@@ -11,8 +11,8 @@ _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0],
 # Six tetrahedra around the diagonal 0-7 of a cube (Kuhn): the same in each cube, so faces match.
 _TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7],
                   [0, 5, 1, 7]])
-_ROUNDS = 2  # in which vertices are evened out
-_NEAR = 0.05  # of the step: a lattice point closer to the surface would make a sliver
+_ROUNDS = 2  # rounds of smoothing of the vertices
+_NEAR = 0.05  # fraction of the step; a closer lattice point would make a sliver
 
 
 def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray,
@@ -36,7 +36,7 @@ def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, hi
     value = np.where(np.abs(value) < _NEAR * step, np.where(value < 0, -1, 1) * _NEAR * step,
                      value)
     grid = value.reshape(count)
-    for axis in range(3):  # the box closes whatever it cuts
+    for axis in range(3):  # the box closes cut surfaces
         for end in (0, -1):
             face = [slice(None)] * 3
             face[axis] = end
@@ -99,7 +99,7 @@ def _evened(surface: Surface, level: Callable[[np.ndarray], np.ndarray], step: f
     from scipy.sparse import coo_matrix
 
     vertices, faces = surface.vertices, surface.faces
-    rows, columns = faces.ravel(), faces[:, [1, 2, 0]].ravel()  # each edge once in each direction
+    rows, columns = faces.ravel(), faces[:, [1, 2, 0]].ravel()  # each edge, once in each direction
     near = coo_matrix((np.ones(len(rows)), (rows, columns)), (len(vertices),) * 2).tocsr()
     degree = np.asarray(near.sum(axis=1))
     for _ in range(_ROUNDS):

@@ -75,7 +75,7 @@ class Surface:
             # Programs write a vertex once for each of its normals and texture coordinates.
             if isinstance(mesh, trimesh.Trimesh):
                 mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        except Exception as error:  # trimesh's readers raise whatever their parsers raise
+        except Exception as error:  # trimesh's readers raise the errors of their parsers
             raise InputError(f"{path} cannot be read as a surface ({error}).",
                              "STL, PLY, OBJ or OFF was expected.", "Export it again.") from error
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:

@@ -44,7 +44,8 @@ class SurfaceCheck:
         """
         if not self.watertight:
             raise MeshingError(f"The surface has {len(self.open_edges)} open edges or edges with "
-                               f"more than two faces, one of them at {_place(self.open_edges[0])} "
+                               "more than two faces, one of them at "
+                               f"{_position_text(self.open_edges[0])} "
                                "m.", "The surface must be closed.",
                                "Prune the skeleton there, or close the holes of the surface.")
         if not self.oriented:
@@ -53,7 +54,7 @@ class SurfaceCheck:
                                "Make the normals consistent.")
         if len(self.crossings):
             raise MeshingError(f"The surface intersects itself at {len(self.crossings)} points, "
-                               f"one of them at {_place(self.crossings[0])} m.",
+                               f"one of them at {_position_text(self.crossings[0])} m.",
                                "The surface of a solid must not intersect itself.",
                                "Edit the skeleton there, or smooth it.")
         return self
@@ -114,5 +115,5 @@ def crossings(surface: Surface) -> np.ndarray:
                    counts, keys[order], owner[order])
 
 
-def _place(point: np.ndarray) -> str:
+def _position_text(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{v:.4f}" for v in point) + ")"

@@ -24,7 +24,7 @@ class Tube:
     flat_start: bool
 
 
-_CAP = np.deg2rad([35.0, 65.0])  # where the rings of a rounded end lie on its half sphere
+_CAP = np.deg2rad([35.0, 65.0])  # angles of a rounded end's rings on its half sphere
 _CORNER = np.deg2rad(30.0)
 
 
@@ -49,8 +49,8 @@ def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: flo
     in_pieces: set[int] = set()
     for _ in range(4):
         surface = _union(tubes, in_pieces, count, 0.02 * float(skeleton.radius.min()))
-        places = crossings(surface)
-        more = _runs_near(tubes, places) - in_pieces
+        points = crossings(surface)
+        more = _runs_near(tubes, points) - in_pieces
         if not more:
             return surface
         # A tube that loops through itself is not a solid, whatever the union makes of it. Convex
@@ -104,13 +104,13 @@ def _pieces(tube: Tube, vertices: np.ndarray, sides: int) -> list:
     return [manifold3d.Manifold.hull_points(np.ascontiguousarray(hull)) for hull in hulls]
 
 
-def _runs_near(tubes: dict[int, list[Tube]], places: np.ndarray) -> set[int]:
-    if len(places) == 0:
+def _runs_near(tubes: dict[int, list[Tube]], points: np.ndarray) -> set[int]:
+    if len(points) == 0:
         return set()
     near = set()
     for run, parts in tubes.items():
         for tube in parts:
-            distance, _ = cKDTree(places).query(tube.centres)
+            distance, _ = cKDTree(points).query(tube.centres)
             if (distance < 3 * tube.radius).any():
                 near.add(run)
     return near

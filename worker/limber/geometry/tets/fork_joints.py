@@ -73,11 +73,11 @@ def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, cor
     local = np.where(backwards[:, None, None], sides - 1 - local, local)
     block, quality = _blocks(nodes, local)
     found = []
-    for place in np.flatnonzero(quality >= FLAT):
-        order = patch.loop[::-1] if backwards[place] else patch.loop
+    for k in np.flatnonzero(quality >= FLAT):
+        order = patch.loop[::-1] if backwards[k] else patch.loop
         numbers = np.concatenate([order, -1 - np.arange(sides + 1)])
-        found.append(Joint(float(start[place]), tangent[place], turn[place],
-                             numbers[block[place]], float(quality[place])))
+        found.append(Joint(float(start[k]), tangent[k], turn[k],
+                             numbers[block[k]], float(quality[k])))
     return found
 
 

@@ -53,5 +53,5 @@ class RunAxis:
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance of points from the axis [m], and position of the foot along it [m]."""
         where = np.linspace(0, self.length, max(8 * len(self.points), 50))
-        distance, place = cKDTree(self.at(where)).query(points)
-        return distance, where[place]
+        distance, index = cKDTree(self.at(where)).query(points)
+        return distance, where[index]

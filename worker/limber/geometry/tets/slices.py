@@ -8,8 +8,8 @@ import numpy as np
 
 from limber.geometry.tets.run_axis import RunAxis
 
-_CLAMP_SLICES = (1.0, 3.0)  # where the first slices end, in radii of the root
-_TAPERED, _THINNEST = 2.5, 0.06  # radius ratio from which rings are graded; down to which
+_CLAMP_SLICES = (1.0, 3.0)  # ends of the first slices, in root radii
+_TAPERED, _THINNEST = 2.5, 0.06  # radius ratio above which rings are graded; smallest ratio
 
 
 @dataclass
@@ -36,11 +36,11 @@ class Window:
         out = np.flatnonzero(distance > axis.radius_at(foot))
         if len(out) == 0:
             return None
-        exit_point, place = twig.at(where[out[0]]), foot[out[0]]
-        outward = exit_point - axis.at(place)
+        exit_point, foot_arc = twig.at(where[out[0]]), foot[out[0]]
+        outward = exit_point - axis.at(foot_arc)
         outward /= max(np.linalg.norm(outward), 1e-300)
         half = 1.25 * float(twig.radius_at(where[out[0]]))
-        return cls(run, place - half, place + half, outward)
+        return cls(run, foot_arc - half, foot_arc + half, outward)
 
 
 def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> list[Window]:
@@ -70,19 +70,20 @@ def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> l
     return placed
 
 
-def ring_places(axis: RunAxis, start: float, windows: list[Window], spacing: float) -> np.ndarray:
+def ring_positions(axis: RunAxis, start: float, windows: list[Window],
+                   spacing: float) -> np.ndarray:
     """Positions of rings along an axis from ``start`` [m], ``spacing`` radii apart, shape [r].
     """
     fixed = sorted({round(v, 12) for w in windows for v in (w.low, w.high)})
     marks = [start, *[v for v in fixed if start < v < axis.length], axis.length]
     inside = {(round(w.low, 12), round(w.high, 12)) for w in windows}
-    places = [start]
+    positions = [start]
     if start == 0.0 and len(marks) > 1:
         # Short slices at the clamp, which keeps the section from narrowing under tension: long ones
         # there made a cantilever 0.4 % too stiff, at any length elsewhere.
         near = [g * float(axis.radius[0]) for g in _CLAMP_SLICES]
-        places += [v for v in near if v + near[0] < marks[1]]
-        marks[0] = places[-1]
+        positions += [v for v in near if v + near[0] < marks[1]]
+        marks[0] = positions[-1]
     for low, high in itertools.pairwise(marks):
         size = spacing * float(axis.radius_at((low + high) / 2))
         within = any(a <= low + 1e-9 and high <= b + 1e-9 for a, b in inside)
@@ -90,10 +91,10 @@ def ring_places(axis: RunAxis, start: float, windows: list[Window], spacing: flo
         between = np.linspace(low, high, count + 1)
         if not within and _is_tapered(axis, low, high):
             between = _graded(axis, low, high, spacing)
-        places += list(between[1:])
-    if len(places) < 3:
-        places = list(np.linspace(start, axis.length, 3))
-    return np.array(places)
+        positions += list(between[1:])
+    if len(positions) < 3:
+        positions = list(np.linspace(start, axis.length, 3))
+    return np.array(positions)
 
 
 def _is_tapered(axis: RunAxis, low: float, high: float) -> bool:

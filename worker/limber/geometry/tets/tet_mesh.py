@@ -179,7 +179,7 @@ class TetMesh:
             mesh = vtu.read(path)
         except MemoryError:
             raise
-        except Exception as error:  # of XML, base64, zlib, numpy and its own
+        except Exception as error:  # errors of XML, base64, zlib, numpy and its own
             raise InputError(f"{path} cannot be read as a mesh ({error}).",
                              "A VTU file with tetrahedra was expected.",
                              "Check the file, or make the mesh again.") from error

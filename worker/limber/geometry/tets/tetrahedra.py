@@ -19,7 +19,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetwild_process import run_tetwild
 
 _CACHE_VERSION = 1
-_LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTetWild's time
+_LEFT_OUT_LIMIT = 0.02  # fraction of the volume; thinner twigs are not worth fTetWild's time
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
                                   or _share(skeleton, swept.left_out) < _LEFT_OUT_LIMIT):
             return swept
     try:
-        mesh, mesher, told = _wild(skeleton, settings, progress)
-        return MeshResult(mesh, mesher, warnings + told)
+        mesh, mesher, mesh_warnings = _wild(skeleton, settings, progress)
+        return MeshResult(mesh, mesher, warnings + mesh_warnings)
     except (MeshingError, MissingDependencyError) as error:
         if swept is None and settings.mesher == "auto":
             raise
@@ -134,14 +134,14 @@ def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
         MissingDependencyError: pytetwild is not installed.
     """
     settings = settings or MeshSettings()
-    place = _cache_place(surface, edge_length, epsilon, stop_energy, coarsen)
-    cached = _from_cache(place)
+    path = _cache_path(surface, edge_length, epsilon, stop_energy, coarsen)
+    cached = _from_cache(path)
     if cached is None:
         nodes, tets = run_tetwild(
             surface.vertices, surface.faces, edge_length=edge_length, epsilon=epsilon,
             stop_energy=stop_energy, coarsen=coarsen, time_limit=settings.mesh_time_limit,
             memory_limit_mb=settings.mesh_memory_limit_mb, progress=progress)
-        _to_cache(place, nodes, tets)
+        _to_cache(path, nodes, tets)
     else:
         nodes, tets = cached
     return _checked(nodes, tets, surface), cached is not None
@@ -177,7 +177,7 @@ def _largest_piece(mesh: TetMesh) -> TetMesh:
     return TetMesh(mesh.nodes[used], inverse.reshape(-1, 4))
 
 
-def _cache_place(surface: Surface, *numbers: float) -> Path:
+def _cache_path(surface: Surface, *numbers: float) -> Path:
     digest = hashlib.sha256()
     for array in (surface.vertices, surface.faces.astype(np.int64),
                   np.array([_CACHE_VERSION, *map(float, numbers)])):
@@ -185,23 +185,23 @@ def _cache_place(surface: Surface, *numbers: float) -> Path:
     return cache_folder() / "tetrahedra" / f"{digest.hexdigest()}.npz"
 
 
-def _from_cache(place: Path) -> tuple[np.ndarray, np.ndarray] | None:
+def _from_cache(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     try:
-        stored = read_arrays(place, "tetrahedra")
-        require_shapes(place, stored, {"nodes": ("n", 3), "tets": ("t", 4)}, "tetrahedra")
+        stored = read_arrays(path, "tetrahedra")
+        require_shapes(path, stored, {"nodes": ("n", 3), "tets": ("t", 4)}, "tetrahedra")
     except InputError:
         return None  # missing or truncated: the mesh is made again
     return stored["nodes"], stored["tets"]
 
 
-def _to_cache(place: Path, nodes: np.ndarray, tets: np.ndarray) -> None:
-    part = place.with_name(f".{os.getpid()}-{place.name}")
+def _to_cache(path: Path, nodes: np.ndarray, tets: np.ndarray) -> None:
+    part = path.with_name(f".{os.getpid()}-{path.name}")
     # A cache that cannot be written costs time, not results.
     with contextlib.suppress(OSError):
         try:
-            place.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             np.savez(part, nodes=nodes, tets=tets)
-            os.replace(part, place)
-            trim(place.parent, TETRAHEDRA_BYTES)
+            os.replace(part, path)
+            trim(path.parent, TETRAHEDRA_BYTES)
         finally:
             part.unlink(missing_ok=True)

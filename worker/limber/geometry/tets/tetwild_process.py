@@ -71,9 +71,9 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
 
 def _load_tetrahedralize():
     """Import pytetwild's numpy interface without pyvista, which only its package file needs."""
-    places = importlib.util.find_spec("pytetwild").submodule_search_locations
+    folders = importlib.util.find_spec("pytetwild").submodule_search_locations
     package = types.ModuleType("pytetwild")
-    package.__path__ = list(places)
+    package.__path__ = list(folders)
     sys.modules["pytetwild"] = package
     from pytetwild.pytetwild import tetrahedralize
 
@@ -82,14 +82,14 @@ def _load_tetrahedralize():
 
 def _main(source: str, target: str, parent_id: str) -> None:
     end_by_kernel(int(parent_id))
-    with np.load(source) as given:
+    with np.load(source) as arrays:
         # The wrapper refuses integers for floats and arrays that are not its own.
         nodes, tets = _load_tetrahedralize()(
-            np.array(given["vertices"], np.float64, order="C"),
-            np.array(given["faces"], np.int32, order="C"),
-            edge_length_abs=float(given["edge_length"]), epsilon=float(given["epsilon"]) / float(
-                np.linalg.norm(np.ptp(given["vertices"], axis=0))),
-            stop_energy=float(given["stop_energy"]), coarsen=bool(given["coarsen"]),
+            np.array(arrays["vertices"], np.float64, order="C"),
+            np.array(arrays["faces"], np.int32, order="C"),
+            edge_length_abs=float(arrays["edge_length"]), epsilon=float(arrays["epsilon"]) / float(
+                np.linalg.norm(np.ptp(arrays["vertices"], axis=0))),
+            stop_energy=float(arrays["stop_energy"]), coarsen=bool(arrays["coarsen"]),
             num_threads=1, quiet=True)
     np.savez(target, nodes=nodes, tets=tets)
 

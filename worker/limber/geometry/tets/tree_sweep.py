@@ -21,13 +21,13 @@ from limber.geometry.tets.slices import Window, without_overlap
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.unfolded_tube import unfolded
 
-_STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # where a twig's first ring is tried, and how far it leans
-_NEAR = 2.5  # radii beyond the first place that will do, within which the best one is taken
-_STRAIGHTENED = (0.0, 3.0, 6.0, 12.0)  # radii of a twig's start that may be led straight
+_STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # positions tried for a twig's first ring; its lean
+_NEAR = 2.5  # radii beyond the first possible position within which the best one is used
+_STRAIGHTENED = (0.0, 3.0, 6.0, 12.0)  # radii of a twig's start that may be straightened
 # Angles of the main run's corners, tried in turn while a twig cannot be joined. In large trees,
 # where some twig always fails, only one is tried.
 _TURNS, _TURNED_MOST = tuple(np.deg2rad([0.0, 30.0, 15.0, 45.0])), 60
-_THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
+_THICK_TWIG = 0.5  # fraction of its carrier; such a twig uses two side faces and has six sides
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
 class _Swept:
     axis: RunAxis
     where: np.ndarray
-    node: np.ndarray  # first node index of each ring: the centre; its corners follow
+    node: np.ndarray  # first node index of each ring: the centre, then its corners
     sides: int
-    windows: dict[int, int]  # run of the twig -> slice
+    windows: dict[int, int]  # slice by run of the twig
     taken: set[tuple[int, int]] = field(default_factory=set)
 
 
@@ -116,9 +116,9 @@ class _TreeSweep:
         """Direction of the main run's first corner; None: any."""
         if self._turn == 0:
             return None
-        way = self._axes[0].points[1] - self._axes[0].points[0]
-        normal = any_normal(way)
-        other = np.cross(way / np.linalg.norm(way), normal)
+        vector = self._axes[0].points[1] - self._axes[0].points[0]
+        normal = any_normal(vector)
+        other = np.cross(vector / np.linalg.norm(vector), normal)
         return np.cos(self._turn) * normal + np.sin(self._turn) * other
 
     def _sweep(self, run: int, start: float, sides: int, first_normal: np.ndarray | None,

@@ -6,10 +6,10 @@ from limber.geometry.skeleton.sweep import bending_factor, frames, rings, tangen
 from limber.geometry.tets.cylinder_mesh import tube
 from limber.geometry.tets.quality import FLAT, shapes
 from limber.geometry.tets.run_axis import RunAxis
-from limber.geometry.tets.slices import Window, ring_places
+from limber.geometry.tets.slices import Window, ring_positions
 from limber.geometry.tets.tet_mesh import TetMesh
 
-_SHIFTS = (1, -1, 2, -2, 3, -3)  # where else a twig's slice may go, in its own lengths
+_SHIFTS = (1, -1, 2, -2, 3, -3)  # shifts tried for a twig's slice, in its own lengths
 
 
 def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spacing: float,
@@ -33,7 +33,7 @@ def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spa
     """
     moves = dict.fromkeys((window.run for window in windows), 0)
     first_low = {window.run: window.low for window in windows}
-    where, ends = ring_places(axis, start, windows, spacing), [start, axis.length]
+    where, ends = ring_positions(axis, start, windows, spacing), [start, axis.length]
     for _ in range(4 * len(where) + 20):
         mesh = _tube_mesh(axis, where, sides, first_normal, first_tangent)
         flat = shapes(mesh.nodes[mesh.tets]) < FLAT
@@ -48,7 +48,7 @@ def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spa
             where = np.delete(where, loose[-1])
         elif touching:
             _move_on(touching[0], windows, moves, first_low[touching[0].run], *ends)
-            where = ring_places(axis, start, windows, spacing)
+            where = ring_positions(axis, start, windows, spacing)
         else:
             break
     return where, mesh

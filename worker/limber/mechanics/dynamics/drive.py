@@ -134,13 +134,13 @@ class Drive:
     def _checked_grasp_forces(self, forces: np.ndarray | None) -> np.ndarray | None:
         if forces is None:
             return None
-        wanted = (len(self.times), len(self.grasps), 3)
+        expected = (len(self.times), len(self.grasps), 3)
         values = np.asarray(forces, float)
-        if not self.grasps or values.size != np.prod(wanted) or not np.isfinite(values).all():
+        if not self.grasps or values.size != np.prod(expected) or not np.isfinite(values).all():
             raise InputError(f"The grasp forces have shape {values.shape}.",
                              f"{len(self.times)} times and {len(self.grasps)} grasps need shape "
-                             f"{wanted}.", "Give three numbers [N] for each.")
-        return values.reshape(wanted)
+                             f"{expected}.", "Give three numbers [N] for each.")
+        return values.reshape(expected)
 
 
 def _checked_times(times: np.ndarray) -> np.ndarray:

@@ -238,7 +238,7 @@ class _Run:
         if self.tangents:
             change = stacked("reaction_change")
             derivatives = DynamicSensitivities(
-                self.tangents.wanted.labels(), stacked("displacement_change"),
+                self.tangents.requested.labels(), stacked("displacement_change"),
                 change[:, 0] if self.drive.single else change)
         return DynamicResult(
             status=Status.converged if complete else self.stepper.status,

@@ -23,7 +23,7 @@ class LoadCase:
         grasp: The gripper that pulls.
         follows_pose: Whether it follows poses; otherwise it exerts ``grasp_force``.
         holds: Other grippers and ties; they stay in their initial positions.
-        way: Poses of the gripper [m, rad], shape [frames, 6]; unused if it exerts a force.
+        poses_along: Poses of the gripper [m, rad], shape [frames, 6]; unused if it exerts a force.
         grasp_force: Force at the end of the pull [N], shape [3].
         loads: Other forces on the nodes at the end of the pull [N], shape [node_count, 3].
         times: Times of the frames [s], shape [frames].
@@ -35,7 +35,7 @@ class LoadCase:
     grasp: Grasp
     follows_pose: bool
     holds: tuple[Grasp, ...]
-    way: np.ndarray
+    poses_along: np.ndarray
     grasp_force: np.ndarray
     loads: np.ndarray
     times: np.ndarray
@@ -50,7 +50,8 @@ class LoadCase:
         """Poses of the grasps in :attr:`held` [m, rad], shape [frames, held, 6]."""
         pose = present(self.start.pose, "pose of the grasps")
         still = np.tile(pose[1:], (len(self.times), 1, 1))
-        return np.concatenate([self.way[:, None], still], axis=1) if self.follows_pose else still
+        return np.concatenate([self.poses_along[:, None], still],
+                              axis=1) if self.follows_pose else still
 
     def nodal_forces(self) -> np.ndarray:
         """All forces at the end of the pull [N], shape [node_count, 3]."""

@@ -23,13 +23,13 @@ class MotionTangents:
     """Derivatives of the current state with respect to the parameters.
 
     Args:
-        wanted: The requested parameters.
+        requested: The requested parameters.
         followed: Nodes whose derivatives are stored at the frames; None: all.
     """
 
-    def __init__(self, drive: Drive, settings: NewmarkSettings, wanted: ParameterSet,
+    def __init__(self, drive: Drive, settings: NewmarkSettings, requested: ParameterSet,
                  followed: np.ndarray | None):
-        self.drive, self.settings, self.wanted = drive, settings, wanted
+        self.drive, self.settings, self.requested = drive, settings, requested
         self.model, self.equations = drive.model, drive.equations
         self._followed = (np.arange(self.model.mesh.node_count) if followed is None
                           else np.asarray(followed))
@@ -41,14 +41,14 @@ class MotionTangents:
         zero = np.zeros_like(start.displacement)
         empty = np.zeros_like(start.strain)
         self._states = [MotionState(0.0, zero.copy(), zero.copy(), zero.copy(), empty, empty)
-                        for _ in self.wanted.labels()]
+                        for _ in self.requested.labels()]
         if equilibrium is None:
             return
-        drive, wanted = self.drive, self.wanted
+        drive, requested = self.drive, self.requested
         found = static_sensitivities(
-            self.model, equilibrium, drive.grasps or None, wanted.weights, wanted.names,
-            is_held=drive.path is not None, control_young=wanted.control_young,
-            shares=wanted.shares)
+            self.model, equilibrium, drive.grasps or None, requested.weights, requested.names,
+            is_held=drive.path is not None, control_young=requested.control_young,
+            shares=requested.shares)
         for column, tangent in enumerate(self._states):
             tangent.displacement = found.displacement[:, :, column].copy()
             if self.model.damping.stiffness:
@@ -59,7 +59,7 @@ class MotionTangents:
         """Return the explicit derivatives of forces; pinned patches make them jump."""
         if not self.equations.pinned:
             return []
-        return explicit_forces(self.model, self.wanted, state.displacement, motion=state,
+        return explicit_forces(self.model, self.requested, state.displacement, motion=state,
                                viscous=viscous)
 
     def jump(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
@@ -75,7 +75,7 @@ class MotionTangents:
         beta, gamma = settings.beta, settings.gamma
         rate, inertia = gamma / (beta * dt), 1 / (beta * dt**2)
         formula, alpha = old.rate_formula(dt), model.damping.mass
-        partials = explicit_forces(model, self.wanted, new.displacement, motion=new,
+        partials = explicit_forces(model, self.requested, new.displacement, motion=new,
                                    viscous=viscous)
 
         def force(change: np.ndarray) -> np.ndarray:
@@ -119,6 +119,6 @@ class MotionTangents:
         return moved, force
 
     def _first_out(self, state: MotionState) -> list[np.ndarray]:
-        partials = explicit_forces(self.model, self.wanted, state.displacement, motion=state)
+        partials = explicit_forces(self.model, self.requested, state.displacement, motion=state)
         return [partial + self.model.tangent_times(state.displacement, tangent.displacement)
                 for partial, tangent in zip(partials, self._states, strict=True)]

@@ -34,21 +34,21 @@ class PosePath:
                  poses: np.ndarray):
         from scipy.interpolate import CubicSpline
 
-        wanted = (len(times), len(grasps), 6)
+        expected = (len(times), len(grasps), 6)
         poses = np.asarray(poses, float)
-        if poses.size != np.prod(wanted) or not np.isfinite(poses).all():
+        if poses.size != np.prod(expected) or not np.isfinite(poses).all():
             raise InputError(f"The poses have shape {poses.shape} or are not finite.",
-                             f"{len(times)} times and {len(grasps)} grasps need shape {wanted}.",
+                             f"{len(times)} times and {len(grasps)} grasps need shape {expected}.",
                              "Give x, y, z [m] and a rotation vector [rad] for each.")
         self.grasps, self._rest = list(grasps), rest
-        self.poses = unwrapped(poses.reshape(wanted))
+        self.poses = unwrapped(poses.reshape(expected))
         self.clamped = [g for g in self.grasps if g.mode == "clamped"]
         self.pinned = [g for g in self.grasps if g.mode == "pinned"]
         self._spline = None
         if len(times) > 1:
             self._spline = CubicSpline(times, self.poses, axis=0,
-                                       bc_type=((1, np.zeros(wanted[1:])),
-                                                (2, np.zeros(wanted[1:]))))
+                                       bc_type=((1, np.zeros(expected[1:])),
+                                                (2, np.zeros(expected[1:]))))
 
     def at(self, instant: float) -> tuple[list[list[np.ndarray]], list[np.ndarray]]:
         """Return displacement, velocity and acceleration at a time.

@@ -101,8 +101,8 @@ def _check_orientation(mesh: TetMesh, determinant: np.ndarray) -> None:
     volumes = 6 * mesh.volumes
     bad = np.flatnonzero((determinant <= 1e-12 * scale).any(axis=1) | (volumes <= 1e-12 * scale))
     if len(bad):
-        place = ", ".join(f"{x:.4g}" for x in mesh.centroids[bad[0]])
+        centroid = ", ".join(f"{x:.4g}" for x in mesh.centroids[bad[0]])
         raise InputError(
             f"{len(bad)} tetrahedra are inverted or have no volume; the first is number {bad[0]} "
-            f"at ({place}) m.", "Their stiffness is not defined.",
+            f"at ({centroid}) m.", "Their stiffness is not defined.",
             "Orient the mesh (TetMesh.oriented) or mesh the surface again.")

@@ -30,7 +30,7 @@ class Fronts:
         first: First node of each supernode, and the node count at the end, shape [count + 1].
         row_start: Start of each supernode's nodes below in ``rows``, shape [count + 1].
         rows: Node numbers below, ascending.
-        places: Position of each of ``rows`` in the parent's front, counted in nodes.
+        row_positions: Position of each of ``rows`` in the parent's front, counted in nodes.
         panel: Start of each supernode's columns in the factor, shape [count + 1].
         children, child_start: Children of each supernode.
         work: Start of each update matrix in its work space; there is one work space for even depths
@@ -44,7 +44,7 @@ class Fronts:
     first: np.ndarray
     row_start: np.ndarray
     rows: np.ndarray
-    places: np.ndarray
+    row_positions: np.ndarray
     panel: np.ndarray
     children: np.ndarray
     child_start: np.ndarray
@@ -96,15 +96,15 @@ def make_fronts(starts: np.ndarray, rows: np.ndarray) -> Fronts:
     panel = np.concatenate([[0], np.cumsum(3 * widths * heights)])
     children = np.argsort(parents, kind="stable")
     child_start = np.searchsorted(parents[children], np.arange(len(widths) + 1))
-    depth, work, work_size = _work_places(parents, _padded(3 * lengths) * 3 * lengths,
-                                          children, child_start)
-    places = _places(first, row_start, front_rows, parents)
+    depth, work, work_size = _work_offsets(parents, _padded(3 * lengths) * 3 * lengths,
+                                           children, child_start)
+    row_positions = _row_positions(first, row_start, front_rows, parents)
     targets = _targets(starts, rows, first, row_start, front_rows, owner)
     value_start = 9 * starts[first] - 3 * first
     tall = (3 * (widths + lengths)).astype(float)
     flops = sum(float((np.maximum(tall - k, 0) ** 2 * (3 * widths > k)).sum())
                 for k in range(int(3 * widths.max())))
-    return Fronts(first, row_start, front_rows.astype(np.int32), places, panel,
+    return Fronts(first, row_start, front_rows.astype(np.int32), row_positions, panel,
                   children, child_start, work, depth, work_size, value_start, targets, flops)
 
 
@@ -240,7 +240,7 @@ def _supernodes(parent, lengths, widest, zeros_allowed):
 
 
 @compiled
-def _work_places(parents, sizes, children, child_start):
+def _work_offsets(parents, sizes, children, child_start):
     """Return depth modulo 2, the start of each update matrix, and the sizes of the work spaces.
 
     Supernodes are in postorder, so the update matrices of one parity of depth form a stack: a
@@ -263,8 +263,8 @@ def _work_places(parents, sizes, children, child_start):
 
 
 @compiled
-def _places(first, row_start, rows, parents):
-    places = np.empty(len(rows), np.int32)
+def _row_positions(first, row_start, rows, parents):
+    positions = np.empty(len(rows), np.int32)
     where = np.empty(first[-1], np.int64)
     for s in range(len(parents)):
         above = parents[s]
@@ -275,8 +275,8 @@ def _places(first, row_start, rows, parents):
             where[rows[p]] = width + p - row_start[above]
         for p in range(row_start[s], row_start[s + 1]):
             inside = rows[p] < first[above + 1]
-            places[p] = rows[p] - first[above] if inside else where[rows[p]]
-    return places
+            positions[p] = rows[p] - first[above] if inside else where[rows[p]]
+    return positions
 
 
 @compiled

@@ -45,7 +45,7 @@ class SupernodalFactor:
         """
         f = self._fronts
         if not _factorise(values, f.value_start, f.targets, f.first, f.row_start, f.panel,
-                          f.places, f.children, f.child_start, f.work, f.depth, self._even,
+                          f.row_positions, f.children, f.child_start, f.work, f.depth, self._even,
                           self._odd, self._factor, self._inverse):
             raise NotPositiveDefiniteError("a pivot is not positive")
 
@@ -83,7 +83,7 @@ class SupernodalFactor:
 
 
 @compiled
-def _factorise(values, value_start, targets, first, row_start, panel, places, children,
+def _factorise(values, value_start, targets, first, row_start, panel, row_positions, children,
                child_start, work, depth, even, odd, factor, inverse):
     for s in range(len(first) - 1):
         width = 3 * (first[s + 1] - first[s])
@@ -103,7 +103,7 @@ def _factorise(values, value_start, targets, first, row_start, panel, places, ch
             size = 3 * (end - begin)
             size = (size + PAD - 1) // PAD * PAD
             _extend(theirs[work[child]:work[child] + size * 3 * (end - begin)], size,
-                    places[begin:end], width, pivots, padded, columns, update)
+                    row_positions[begin:end], width, pivots, padded, columns, update)
         if not _eliminate(columns, width, pivots + padded, inverse[3 * first[s]:]):
             return False
         for j in range(0, below, 3):
@@ -114,32 +114,32 @@ def _factorise(values, value_start, targets, first, row_start, panel, places, ch
 
 
 @compiled
-def _extend(source, size, places, width, pivots, padded, columns, update):
+def _extend(source, size, rows, width, pivots, padded, columns, update):
     """Add a child's update matrix to the front."""
     three, height = _COUNT(3), _COUNT(pivots + padded)
-    nodes, count = _COUNT(width) // three, _COUNT(len(places))
+    nodes, count = _COUNT(width) // three, _COUNT(len(rows))
     size, gap, padded = _COUNT(size), _COUNT(pivots) - three * nodes, _COUNT(padded)
     inner = _COUNT(0)
-    while inner < count and places[inner] < nodes:
+    while inner < count and rows[inner] < nodes:
         inner += _COUNT(1)
     for kj in range(count):
-        place = _COUNT(places[kj])
+        row = _COUNT(rows[kj])
         for jj in range(three):
             at = (three * kj + jj) * size
             if kj < inner:
-                base = (three * place + jj) * height
-                _add_rows(source, at, places, kj, inner, columns, base)
-                _add_rows(source, at, places, inner, count, columns, base + gap)
+                base = (three * row + jj) * height
+                _add_rows(source, at, rows, kj, inner, columns, base)
+                _add_rows(source, at, rows, inner, count, columns, base + gap)
             else:
                 # Rows of the update matrix are counted from its first row.
-                base = (three * (place - nodes) + jj) * padded - three * nodes
-                _add_rows(source, at, places, kj, count, update, base)
+                base = (three * (row - nodes) + jj) * padded - three * nodes
+                _add_rows(source, at, rows, kj, count, update, base)
 
 
 @compiled
-def _add_rows(source, at, places, begin, end, target, base):
+def _add_rows(source, at, rows, begin, end, target, base):
     for k in range(begin, end):
-        to, of = base + _COUNT(3) * _COUNT(places[k]), at + _COUNT(3) * k
+        to, of = base + _COUNT(3) * _COUNT(rows[k]), at + _COUNT(3) * k
         target[to] += source[of]
         target[to + _COUNT(1)] += source[of + _COUNT(1)]
         target[to + _COUNT(2)] += source[of + _COUNT(2)]
@@ -273,7 +273,7 @@ def _down_one(first, row_start, rows, panel, factor, inverse, x):
         start, width, pivots, below, padded, height = _sizes(first, row_start, s)
         own = x[start:start + width]
         if not own.any():
-            continue  # forces on a patch: nothing comes down to most fronts
+            continue  # forces act on a patch: most fronts receive nothing
         t[:padded] = 0.0
         for j in range(0, width, 3):
             one, two, three = _columns(factor, panel[s] + j * height, height)
@@ -325,7 +325,7 @@ def _down_three(first, row_start, rows, panel, factor, inverse, x, y, z):
         own, other, last = (x[start:start + width], y[start:start + width],
                             z[start:start + width])
         if not (own.any() or other.any() or last.any()):
-            continue  # forces on a patch: nothing comes down to most fronts
+            continue  # forces act on a patch: most fronts receive nothing
         t[:padded] = 0.0
         u[:padded] = 0.0
         v[:padded] = 0.0

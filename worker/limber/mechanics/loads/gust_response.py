@@ -82,11 +82,11 @@ def swaying(model: BranchModel, displacement: np.ndarray, force: np.ndarray, tip
     """
     tangent = model.equations(()).tangent(model, displacement)
     static = tangent.solve(force)[tip]
-    way = static / np.linalg.norm(static)
+    direction = static / np.linalg.norm(static)
     modes = lowest_modes(model, _MODES, displacement)
     omega = 2 * np.pi * modes.frequencies
     loads = np.einsum("kni,ni->k", modes.shapes, force)
-    shares = modes.shapes[:, tip] @ way * loads / omega**2 / float(static @ way)
+    shares = modes.shapes[:, tip] @ direction * loads / omega**2 / float(static @ direction)
     share = (damping.mass / omega + damping.stiffness * omega) / 2
     if air is not None:
         flat = modes.shapes.reshape(len(omega), -1)

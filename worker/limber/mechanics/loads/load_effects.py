@@ -73,13 +73,13 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     tip = tip_node(outdoors)
 
-    def told(bent: Bent) -> dict[str, float]:
+    def figures(bent: Bent) -> dict[str, float]:
         return {"sag_m": float(bent.displacement[tip] @ down),
                 "greatest_strain": float(bent.strains.max()),
                 "first_frequency_hz": float(bent.frequencies[0])}
     progress(0.0, "equilibrium under the loads")
     bent = outdoors.bent(required_rest(outdoors))
-    own = told(bent)
+    own = figures(bent)
     result: dict[str, Any] = _NOT_KNOWN | {
         "tip_displacement_m": bent.displacement[tip], "sag_m": own["sag_m"],
         "greatest_strain": own["greatest_strain"],
@@ -93,7 +93,7 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
     progress(0.3, "interval")
     rests = [(other, other.rest()) for other in others.values()]
     if rests and all(found.converged for _, found in rests):
-        ends = [told(other.bent(found)) for other, found in rests]
+        ends = [figures(other.bent(found)) for other, found in rests]
         result |= {name: sorted(end[key] for end in ends) for name, key in (
             ("sag_interval_m", "sag_m"), ("greatest_strain_interval", "greatest_strain"),
             ("first_frequency_interval_hz", "first_frequency_hz"))}

@@ -135,9 +135,10 @@ class LoadedOutdoors:
 
     def sways(self, result: StaticResult, tip: int, damping: RayleighDamping) -> Swaying:
         """Return the response of node ``tip`` to a varying wind about a state."""
-        middle, ways, radius = self._cylinders
+        middle, vectors, radius = self._cylinders
         at = point_operator(self._plain.mesh, middle)
-        air = at.T @ _air_damping(ways, radius, np.array(self._loads.wind), self._loads.drag) @ at
+        air = at.T @ _air_damping(vectors, radius, np.array(self._loads.wind),
+                                  self._loads.drag) @ at
         return swaying(self._model_under(1.0), result.displacement, self._wind, tip, damping, air)
 
     def rest(self, share: float = 1.0) -> StaticResult:
@@ -162,9 +163,9 @@ class LoadedOutdoors:
         path = self.skeleton.main_path()
         length = self.skeleton.arc_length[path]
         nearest = cKDTree(self.skeleton.nodes).query(self._plain.mesh.centroids)[1]
-        place = np.full(self.skeleton.node_count, -1.0)
-        place[path] = length
-        at = place[nearest]
+        arc = np.full(self.skeleton.node_count, -1.0)
+        arc[path] = length
+        at = arc[nearest]
         cuts = np.linspace(0.0, length[-1], count + 1)
         found = []
         for low, high in pairwise(cuts):
@@ -187,28 +188,28 @@ class LoadedOutdoors:
             PointMass(one.position, share * one.mass) for one in self._masses)
 
 
-def wind_forces(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
+def wind_forces(vectors: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
                 ) -> np.ndarray:
     """Return the drag on cylinders [N], shape [n, 3], from the flow across each (Morison).
 
     Args:
-        ways: Vectors from start to end [m], shape [n, 3].
+        vectors: Vectors from start to end [m], shape [n, 3].
         radius: [m], shape [n].
         wind: [m/s], shape [3].
         drag: Drag coefficient of a cylinder across the flow.
     """
-    length = np.linalg.norm(ways, axis=1)
-    tangent = ways / np.maximum(length, 1e-300)[:, None]
+    length = np.linalg.norm(vectors, axis=1)
+    tangent = vectors / np.maximum(length, 1e-300)[:, None]
     across = wind - (tangent @ wind)[:, None] * tangent
     speed = np.linalg.norm(across, axis=1)
     return (0.5 * AIR_DENSITY * drag * 2 * radius * length * speed)[:, None] * across
 
 
-def _air_damping(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
+def _air_damping(vectors: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
                  ) -> sp.spmatrix:
     """Return the derivative of the drag on cylinders to the wind [N s/m], block diagonal."""
-    length = np.linalg.norm(ways, axis=1)
-    tangent = ways / np.maximum(length, 1e-300)[:, None]
+    length = np.linalg.norm(vectors, axis=1)
+    tangent = vectors / np.maximum(length, 1e-300)[:, None]
     across = wind - (tangent @ wind)[:, None] * tangent
     speed = np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None, None]
     plane = np.eye(3) - tangent[:, :, None] * tangent[:, None, :]
@@ -217,12 +218,12 @@ def _air_damping(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: f
     return sp.block_diag(list(blocks), format="csr")
 
 
-def _snow(model: BranchModel, middle: np.ndarray, ways: np.ndarray, radius: np.ndarray,
+def _snow(model: BranchModel, middle: np.ndarray, vectors: np.ndarray, radius: np.ndarray,
           load: float) -> list[PointMass]:
     if load <= 0 or not model.gravity.any():
         return []
     down = model.gravity / np.linalg.norm(model.gravity)
-    flat = np.linalg.norm(ways - (ways @ down)[:, None] * down, axis=1)
+    flat = np.linalg.norm(vectors - (vectors @ down)[:, None] * down, axis=1)
     return [PointMass((float(x), float(y), float(z)), float(mass))
             for (x, y, z), mass in zip(middle, load * 2 * radius * flat, strict=True) if mass > 0]
 
@@ -230,12 +231,12 @@ def _snow(model: BranchModel, middle: np.ndarray, ways: np.ndarray, radius: np.n
 def _beyond(skeleton: Skeleton, cuts: Sequence[tuple[float, float, float]]) -> np.ndarray:
     """Which nodes of the axes are cut off, shape [n] of bool."""
     gone = np.zeros(skeleton.node_count, bool)
-    for place in cuts:
-        node = int(np.linalg.norm(skeleton.nodes - np.array(place), axis=1).argmin())
-        distance = float(np.linalg.norm(skeleton.nodes[node] - np.array(place)))
+    for cut in cuts:
+        node = int(np.linalg.norm(skeleton.nodes - np.array(cut), axis=1).argmin())
+        distance = float(np.linalg.norm(skeleton.nodes[node] - np.array(cut)))
         is_away = distance > max(3 * skeleton.radius[node], 0.02)
         if node == 0 or is_away:
-            raise InputError(f"The cut at {place} m is invalid.",
+            raise InputError(f"The cut at {cut} m is invalid.",
                              f"It is {1e3 * distance:.0f} mm away from the branch." if is_away
                              else "It lies at the base.",
                              "Give a position on the branch, in its frame [m].")

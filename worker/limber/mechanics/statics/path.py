@@ -341,10 +341,10 @@ class Path:
 
     def _softening(self) -> str:
         """Warn if the material law collapses rather than the branch."""
-        told = self.model.material.softening
-        if not told or self.state.min_det_f > _SOFT_DET_F:
+        advice = self.model.material.softening
+        if not advice or self.state.min_det_f > _SOFT_DET_F:
             return ""
-        return f"; it is compressed to {100 * self.state.min_det_f:.0f} % of its volume, {told}"
+        return f"; it is compressed to {100 * self.state.min_det_f:.0f} % of its volume, {advice}"
 
 
 def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:

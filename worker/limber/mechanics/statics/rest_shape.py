@@ -123,8 +123,8 @@ class _Search:
         out = equations.free_part(candidate.weight_force - candidate.internal(u).force)
         moved = tangent.solve(out)
         inverse = np.linalg.inv(deformation_gradients(candidate, u))
-        wanted = -inverse @ _gradients(candidate, moved)
-        return _straight(self.model.mesh, _integrated(candidate, wanted))
+        newton_step = -inverse @ _gradients(candidate, moved)
+        return _straight(self.model.mesh, _integrated(candidate, newton_step))
 
     def _loaded(self, rest: np.ndarray, target: np.ndarray,
                 settings: StaticSettings) -> StaticResult:

@@ -10,7 +10,7 @@ from limber.planning.certificate.grid import COARSEST, Grid, spread
 from limber.planning.certificate.subsolution import Terrain, corner_values, second_differences
 from limber.planning.path_problem import GentleProblem
 
-_BEYOND = 1.2  # on the steepest measured growth of the goal's distance
+_BEYOND = 1.2  # factor on the steepest measured growth of the goal's distance
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     corners = tuple(map(slice, low, high + 1))
     rate = np.where(ground.level[box], ground.floor,
                     corner_values(ground.rate[corners]).mean(axis=0))
-    cost = _way_left(distance / growth, goal.tolerance / growth, rate, h)
+    cost = _cost_left(distance / growth, goal.tolerance / growth, rate, h)
     curved = CURVATURE_FACTOR / 8.0 * sum(
         scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * h * np.sqrt(3.0)
@@ -75,7 +75,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
                       whole(filled <= growth * (half + 6.0 * h * COARSEST)))
 
 
-def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:
+def _cost_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:
     """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with an
     edge of ``h`` [m]; nan where not known.
 
@@ -87,8 +87,8 @@ def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> n
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
     growing = sum(np.gradient(rate, h, axis=axis) * np.gradient(length, h, axis=axis)
                   for axis in range(3))
-    half_way = rate - 0.5 * length * np.nan_to_num(growing)
-    return flat * np.where(length > 0.0, np.clip(half_way, 0.5 * rate, 1.5 * rate), rate)
+    mid_rate = rate - 0.5 * length * np.nan_to_num(growing)
+    return flat * np.where(length > 0.0, np.clip(mid_rate, 0.5 * rate, 1.5 * rate), rate)
 
 
 def _growth(distance: np.ndarray, near: np.ndarray, h: float) -> float:

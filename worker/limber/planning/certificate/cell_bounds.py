@@ -22,7 +22,7 @@ from limber.core.numerics.compiled import compiled
 CURVATURE_FACTOR = 2.0
 """Factor on second differences at a cell's corners that bounds derivatives inside."""
 
-_NEARER = 12  # steps towards the point of a hull that is nearest to zero
+_NEARER = 12  # steps towards the point of a hull nearest to zero
 
 
 @compiled
@@ -57,10 +57,10 @@ def least_between(values, slopes, cells):
     """
     out = np.full(cells.shape, -np.inf)
     turned = turns(slopes, cells)
-    places = np.argwhere(cells)
+    indices = np.argwhere(cells)
     curved = np.empty(3)
-    for n in range(len(places)):
-        i, j, k = places[n, 0], places[n, 1], places[n, 2]
+    for n in range(len(indices)):
+        i, j, k = indices[n, 0], indices[n, 1], indices[n, 2]
         least = np.inf
         curved[:] = 0.0
         for p in range(i, i + 2):
@@ -87,10 +87,10 @@ def least_size(vectors, cells):
     1, ny + 1, nz + 1, 3] at the corners; 0 where not known.
     """
     out = np.zeros(cells.shape)
-    places = np.argwhere(cells)
+    indices = np.argwhere(cells)
     corners, curved, step = np.empty((8, 3)), np.empty(3), np.empty(3, np.int64)
-    for n in range(len(places)):
-        i, j, k = places[n, 0], places[n, 1], places[n, 2]
+    for n in range(len(indices)):
+        i, j, k = indices[n, 0], indices[n, 1], indices[n, 2]
         curved[:] = 0.0
         number = 0
         for p in range(i, i + 2):
@@ -150,9 +150,9 @@ def _off_zero(corners):
             break
         part, whole = 0.0, 0.0
         for c in range(3):
-            apart = corners[at, c] - best[c]
-            part -= apart * best[c]
-            whole += apart * apart
+            component = corners[at, c] - best[c]
+            part -= component * best[c]
+            whole += component * component
         share = min(max(part / whole, 0.0), 1.0)
         for c in range(3):
             best[c] += share * (corners[at, c] - best[c])

@@ -20,18 +20,18 @@ def neighbours(active):
     steps = np.array([shape[1] * shape[2], shape[2], 1])
     flat = active.ravel()
     numbers = np.full(flat.size, -1, np.int32)
-    places = np.flatnonzero(flat)
-    for k in range(len(places)):
-        numbers[places[k]] = k
-    near = np.full((len(places), 6), -1, np.int32)
-    for k in range(len(places)):
+    indices = np.flatnonzero(flat)
+    for k in range(len(indices)):
+        numbers[indices[k]] = k
+    near = np.full((len(indices), 6), -1, np.int32)
+    for k in range(len(indices)):
         for axis in range(3):
-            at = places[k] // steps[axis] % shape[axis]
+            at = indices[k] // steps[axis] % shape[axis]
             if at > 0:
-                near[k, 2 * axis] = numbers[places[k] - steps[axis]]
+                near[k, 2 * axis] = numbers[indices[k] - steps[axis]]
             if at + 1 < shape[axis]:
-                near[k, 2 * axis + 1] = numbers[places[k] + steps[axis]]
-    return numbers.reshape(active.shape), places, near
+                near[k, 2 * axis + 1] = numbers[indices[k] + steps[axis]]
+    return numbers.reshape(active.shape), indices, near
 
 
 @compiled
@@ -49,16 +49,16 @@ def march(rate, near, known, values, spacing):
     u = np.full(count, np.inf)
     done = np.zeros(count, np.bool_)
     heap = np.empty(count, np.int32)
-    place = np.full(count, -1, np.int32)
+    heap_index = np.full(count, -1, np.int32)
     used = np.empty((3, 3))
     size = 0
     for node in range(count):
         if known[node]:
             u[node] = values[node]
-            size = _push(heap, place, u, size, node)
+            size = _push(heap, heap_index, u, size, node)
     while size > 0:
         node = heap[0]
-        size = _pop(heap, place, u, size)
+        size = _pop(heap, heap_index, u, size)
         done[node] = True
         for side in range(6):
             other = near[node, side]
@@ -67,10 +67,10 @@ def march(rate, near, known, values, spacing):
             cost = _arrival(other, u, done, rate[other] * spacing, near, used)
             if cost < u[other]:
                 u[other] = cost
-                if place[other] < 0:
-                    size = _push(heap, place, u, size, other)
+                if heap_index[other] < 0:
+                    size = _push(heap, heap_index, u, size, other)
                 else:
-                    _rise(heap, place, u, place[other])
+                    _rise(heap, heap_index, u, heap_index[other])
     return u
 
 
@@ -119,31 +119,31 @@ def _arrival(node, u, done, step, near, used):
 
 
 @compiled
-def _push(heap, place, u, size, node):
+def _push(heap, heap_index, u, size, node):
     heap[size] = node
-    place[node] = size
-    _rise(heap, place, u, size)
+    heap_index[node] = size
+    _rise(heap, heap_index, u, size)
     return size + 1
 
 
 @compiled
-def _rise(heap, place, u, index):
+def _rise(heap, heap_index, u, index):
     node = heap[index]
     while index > 0:
         parent = (index - 1) // 2
         if u[heap[parent]] <= u[node]:
             break
         heap[index] = heap[parent]
-        place[heap[index]] = index
+        heap_index[heap[index]] = index
         index = parent
     heap[index] = node
-    place[node] = index
+    heap_index[node] = index
 
 
 @compiled
-def _pop(heap, place, u, size):
+def _pop(heap, heap_index, u, size):
     size -= 1
-    place[heap[0]] = -2
+    heap_index[heap[0]] = -2
     node = heap[size]
     index = 0
     while True:
@@ -155,9 +155,9 @@ def _pop(heap, place, u, size):
         if u[node] <= u[heap[child]]:
             break
         heap[index] = heap[child]
-        place[heap[index]] = index
+        heap_index[heap[index]] = index
         index = child
     if size > 0:
         heap[index] = node
-        place[node] = index
+        heap_index[node] = index
     return size

@@ -28,14 +28,14 @@ from limber.planning.field.trust import nearest_of
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.path_problem import GentleProblem, least_over
 
-_ALONG, _ACROSS = 20, 40  # cells along the shell, each way, and off it
-_EVEN = 26  # each way where there is no shell
-_MOST_CELLS = 100_000  # that are asked at once
-_DOUBTED = 0.5  # of the axis with the most doubt, from which on another is cut with it
-_FINE = 0.001  # [m] between points of a way
+_ALONG, _ACROSS = 20, 40  # cells along the surface in each direction; across it
+_EVEN = 26  # cells in each direction without a surface
+_MOST_CELLS = 100_000  # most cells evaluated at once
+_DOUBTED = 0.5  # fraction of the most uncertain axis above which another axis is cut too
+_FINE = 0.001  # [m] between points of a path
 _MOST_NEAREST = 500  # of the reached cells, those nearest to the goal
 _NOWHERE = np.empty((0, 3))
-_WIDE = 1 << 20  # more cells than there are along any axis
+_WIDE = 1 << 20  # more cells than along any axis
 _CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 _STENCIL = np.unique(np.concatenate([_CORNERS + side * step for step in np.eye(3, dtype=int)
                                      for side in (-1, 0, 1)]), axis=0)
@@ -79,13 +79,13 @@ class _Cells:
         """Return the positions [m, 3] of all corners and of those next to them along an axis, and
         the numbers of each cell's in ``_STENCIL``, [n, 32]."""
         keys, where = np.unique(_keys(self.numbers[:, None] + _STENCIL), return_inverse=True)
-        places = np.stack([keys // _WIDE**2, keys // _WIDE % _WIDE, keys % _WIDE], axis=1) - 1
-        return (self.chart.curved(self.low + places * self.edges),
+        indices = np.stack([keys // _WIDE**2, keys // _WIDE % _WIDE, keys % _WIDE], axis=1) - 1
+        return (self.chart.curved(self.low + indices * self.edges),
                 where.reshape(len(self.numbers), -1))
 
-    def holding(self, place: np.ndarray) -> np.ndarray:
-        """Return which cells contain ``place`` [3] or touch the cell that does, bool [n]."""
-        number = np.floor((self.chart.map(place)[0] - self.low) / self.edges)
+    def holding(self, point: np.ndarray) -> np.ndarray:
+        """Return which cells contain ``point`` [3] or touch the cell that does, bool [n]."""
+        number = np.floor((self.chart.map(point)[0] - self.low) / self.edges)
         return (np.abs(self.numbers - number) <= 1).all(axis=1)
 
     def prestress(self, some: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ class _Cells:
         together = connected_components(self._neighbours(), directed=False)[1]
         return np.isin(together, together[some])
 
-    def way(self, begin: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
+    def path(self, begin: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
         """Return the cells [k] of the shortest path from ``begin`` to ``ends``; None if not
         connected.
         """
@@ -115,14 +115,14 @@ class _Cells:
         order = np.argsort(keys)
         rows, columns, lengths = [], [], []
         for step in _AHEAD:
-            wanted = _keys(self.numbers + step)
-            found = order[np.searchsorted(keys, wanted, sorter=order).clip(max=len(keys) - 1)]
-            beside = np.flatnonzero(keys[found] == wanted)
+            shifted = _keys(self.numbers + step)
+            found = order[np.searchsorted(keys, shifted, sorter=order).clip(max=len(keys) - 1)]
+            beside = np.flatnonzero(keys[found] == shifted)
             rows.append(beside)
             columns.append(found[beside])
             lengths.append(np.full(len(beside), np.linalg.norm(step * self.edges)))
-        places = np.concatenate(rows), np.concatenate(columns)
-        return coo_matrix((np.concatenate(lengths), places), shape=2 * (len(keys),)).tocsr()
+        pairs = np.concatenate(rows), np.concatenate(columns)
+        return coo_matrix((np.concatenate(lengths), pairs), shape=2 * (len(keys),)).tocsr()
 
     @property
     def chart(self) -> Chart:
@@ -133,7 +133,7 @@ class _Cells:
 @dataclass(frozen=True)
 class Verdict:
     """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
-    there is no path; a ``way`` [k, 3] through cells that keep all limits at their corners, if any;
+    there is no path; a ``path`` [k, 3] through cells that keep all limits at their corners, if any;
     the ``wall`` [k, 3], middles of the cells that block the path, those least over a limit first;
     and, where the field does not know the target's position exactly, ``nearest`` [k, 3]: middles of
     reached cells, those that come nearest to the goal first.
@@ -141,7 +141,7 @@ class Verdict:
 
     edges: np.ndarray
     proven: bool = False
-    way: np.ndarray | None = None
+    path: np.ndarray | None = None
     wall: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     nearest: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
@@ -187,15 +187,15 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
         free = kept[open_cells][:, _AT].all(axis=1)
         reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
         inner = cells.take(free)
-        way = inner.way(begin[free], reached[free])
-        if way is not None:
-            last = open_cells[free][way[-1]]
+        path = inner.path(begin[free], reached[free])
+        if path is not None:
+            last = open_cells[free][path[-1]]
             end = nodes[last, _AT[np.argmin(away[last, _AT])]]
             chart = inner.chart
-            flat = np.concatenate([chart.map(problem.start), inner.middles()[0][way],
+            flat = np.concatenate([chart.map(problem.start), inner.middles()[0][path],
                                    chart.map(positions[end])])
             # Along the shell: the chord of a curved cell may be well off it.
-            return Verdict(cells.edges, way=chart.curved(resample(flat, _FINE)))
+            return Verdict(cells.edges, path=chart.curved(resample(flat, _FINE)))
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
                            (bends / tolerance)[open_cells][ends].sum(axis=0))
         parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
@@ -280,10 +280,10 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
         bends = _bends(force)
         over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit - spare
         # Between corners it may be any value between theirs.
-        apart = force[:, _AT].reshape(-1, 2, 2, 2, 3)
-        apart = np.stack([np.linalg.norm(np.diff(apart, axis=axis), axis=-1).max(axis=(1, 2, 3))
-                          for axis in (1, 2, 3)], axis=1)
-        uncertainty = np.maximum(uncertainty, (bends + apart) / limit)
+        corners = force[:, _AT].reshape(-1, 2, 2, 2, 3)
+        corners = np.stack([np.linalg.norm(np.diff(corners, axis=axis), axis=-1).max(axis=(1, 2, 3))
+                            for axis in (1, 2, 3)], axis=1)
+        uncertainty = np.maximum(uncertainty, (bends + corners) / limit)
     return over, uncertainty
 
 

@@ -7,11 +7,11 @@ import numpy as np
 from limber.planning.certificate.subsolution import RIM
 from limber.planning.path_problem import GentleProblem
 
-_FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
+_FIRST_CELLS = 12_000  # cells of the first grid, over the whole sampled region
 FINEST, COARSEST = 1.0 / 3.0, 0.75
 """Ratio of cell edges from one grid to the next: least and greatest."""
-_ROUND_OFF = 1e-9  # of a cell
-_PAD = RIM + 1  # closed cells about the grid, for the coefficients and second differences there
+_ROUND_OFF = 1e-9  # fraction of a cell
+_PAD = RIM + 1  # closed cells around the grid, for its coefficients and second differences
 
 
 @dataclass
@@ -41,10 +41,10 @@ class Grid:
         return spread(tuple(n + 1 for n in self.open_cells.shape), corners, values)
 
 
-def spread(shape: tuple[int, ...], places: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return ``values`` [n, ...] at ``places`` [n, 3] in an array of a shape, nan elsewhere."""
+def spread(shape: tuple[int, ...], indices: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return ``values`` [n, ...] at ``indices`` [n, 3] in an array of a shape, nan elsewhere."""
     whole = np.full((*shape, *values.shape[1:]), np.nan)
-    whole[tuple(places.T)] = values
+    whole[tuple(indices.T)] = values
     return whole
 
 
@@ -80,8 +80,8 @@ def refined(grid: Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarr
 
     The start stays in the centre of a cell. A new cell that overlaps a kept one is open.
     """
-    places, centre = np.argwhere(keep), cell + 0.5
-    low, high = np.minimum(places.min(axis=0), cell), np.maximum(places.max(axis=0), cell) + 1
+    indices, centre = np.argwhere(keep), cell + 0.5
+    low, high = np.minimum(indices.min(axis=0), cell), np.maximum(indices.max(axis=0), cell) + 1
     before = np.ceil((centre - low) / ratio - 0.5 - _ROUND_OFF).astype(int) + _PAD
     after = np.ceil((high - centre) / ratio - 0.5 - _ROUND_OFF).astype(int) + _PAD + 1
     first = centre - (before + 0.5) * ratio
@@ -108,8 +108,8 @@ def descent(grid: Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
     reach = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     reach = reach[np.abs(reach).sum(axis=1) > 0]
     length = np.linalg.norm(reach, axis=1)
-    way, here = [cell], cell
-    while u[tuple(here)] > 0.0 and len(way) < sum(u.shape):
+    path, here = [cell], cell
+    while u[tuple(here)] > 0.0 and len(path) < sum(u.shape):
         near = here + reach
         within = ((near >= 0) & (near < u.shape)).all(axis=1)
         drop = (u[tuple(here)] - u[tuple(near[within].T)]) / length[within]
@@ -117,5 +117,5 @@ def descent(grid: Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
         if not drop[best] > 0.0:
             break
         here = near[within][best]
-        way.append(here)
-    return grid.points(np.array(way) + 0.5)
+        path.append(here)
+    return grid.points(np.array(path) + 0.5)

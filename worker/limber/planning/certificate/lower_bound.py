@@ -38,15 +38,15 @@ from limber.planning.path_problem import (
     GentleProblem,
     NoWayError,
     least_over,
-    no_way,
+    no_path_error,
     not_found,
 )
 from limber.planning.search_files import CostToGo
 
-_MOST_CELLS = 450_000  # of any grid's tube; the next refinement is left away
+_MOST_CELLS = 450_000  # in any grid's tube; a further refinement is skipped
 _LEVELS = 6
-_RESERVE = 0.8  # of the edge that would do
-ENOUGH = 0.015  # gap below which no further refinement is worth its time
+_RESERVE = 0.8  # fraction of the edge that would suffice
+ENOUGH = 0.015  # gap below which refinement is not worth its time
 _NEAR = np.ones((3, 3, 3))
 COST, ENERGY = "cost", "energy_integral_jm"
 """Quantity that a certificate bounds: the planner's cost, or the integral of energy [J m]."""
@@ -155,7 +155,7 @@ class _Search:
         if self.to_go is None:
             self.to_go = found.to_go(self.grid)
         if level == 0:
-            self.upper = self.improve(None)  # after a bound that may prove that there is none
+            self.upper = self.improve(None)  # after a bound that may prove that there is no path
         self.upper = min(self.upper, self.improve(found.rough_path))
         self.lower = max(self.lower, min(found.lower, self.upper))
         self._note(int(found.open_cells.sum()))
@@ -279,7 +279,7 @@ def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
     offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
                for axis, (n, k) in enumerate(zip(ground.open_cells.shape, cell, strict=True))]
     away = h * np.sqrt(sum(offset**2 for offset in offsets))
-    rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a blunt tip: no kink
+    rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a rounded tip, without a kink
     nothing = np.zeros(ground.open_cells.shape, bool)
     u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)
     # At the start, the spline exceeds the zero of its blunt tip by at most its error there.
@@ -328,6 +328,7 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, corners:
 def _separated(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, wall: np.ndarray,
                ) -> NoWayError:
     share = 100.0 * open_cells.mean()
-    return no_way(problem, f"This is proven on a grid of {1e3 * grid.spacing:.1f} mm: forbidden "
-                  f"cells separate the start from the goal ({share:.0f} % of the region's box is "
-                  "open).").behind(least_over(problem, wall))
+    return no_path_error(problem,
+                         f"This is proven on a grid of {1e3 * grid.spacing:.1f} mm: forbidden "
+                         f"cells separate the start from the goal ({share:.0f} % of the region's "
+                         "box is open).").behind(least_over(problem, wall))

@@ -39,11 +39,11 @@ from limber.planning.certificate.fast_marching import march, neighbours
 RIM = 2
 """Closed cells around the open ones that have coefficients as well."""
 
-_ROUNDS = 8  # of local reweighting; ends when nothing is over by more than _CLOSE
+_ROUNDS = 8  # rounds of local reweighting; ends when nothing exceeds by more than _CLOSE
 _CLOSE = 1.0005
-_IDLE = 2  # rounds one after the other that bring nothing end it as well,
-_WORTH = 1.004  # times less is what a round has to bring; less is not worth its time
-_LARGE = 100_000  # one alone where so many cells are asked: it takes a third of a second there
+_IDLE = 2  # consecutive rounds without gain that end it,
+_WORTH = 1.004  # the factor that counts as a gain
+_LARGE = 100_000  # a single round for so many cells: it takes a third of a second
 
 
 class Terrain(NamedTuple):
@@ -135,8 +135,8 @@ def _bends(values, cells):
                                 if np.isnan(second):
                                     second = 0.0
                                 most, least = max(most, second), min(least, second)
-                                place = i if axis == 0 else (j if axis == 1 else k)
-                                if place <= at[axis] <= place + 1:
+                                index = i if axis == 0 else (j if axis == 1 else k)
+                                if index <= at[axis] <= index + 1:
                                     size = max(size, abs(second))
                     bend = min(2.0 * most - least, CURVATURE_FACTOR * size)
                     out[axis, i, j, k] = 0.25 * max(bend, 0.0)
@@ -200,21 +200,21 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     u = np.full(active.shape, np.inf)
     if not around.any():
         return u, 0.0
-    numbers, places, near = neighbours(active)
-    bound = _middles(ground.rate, places, active.shape)
+    numbers, indices, near = neighbours(active)
+    bound = _middles(ground.rate, indices, active.shape)
     u[around] = shape[around]
     steep = float(_excess(u, *ground, np.argwhere(around & ground.open_cells)).max(initial=0.0))
     asked = np.argwhere(ground.open_cells & ~free_cells)
     own = numbers[tuple(asked.T)]
-    held, about = around.ravel()[places], widened(around).ravel()[places]
-    lengths = shape.ravel()[places]
+    held, about = around.ravel()[indices], widened(around).ravel()[indices]
+    lengths = shape.ravel()[indices]
     factor = 1.0 / steep if steep > 0.0 else float(bound[held].min())
     rate, beside = bound, held
     least, best, of_best, idle = np.inf, bound, factor, 0
     for _ in range(rounds):
         values = march(rate, near, held, factor * lengths, ground.spacing)
-        u.ravel()[places] = values
-        over = np.ones(len(places))
+        u.ravel()[indices] = values
+        over = np.ones(len(indices))
         over[own] = np.maximum(_excess(u, *ground, asked), 1.0)
         worst = float(over.max())
         idle = 0 if worst < least / _WORTH else idle + 1
@@ -226,19 +226,19 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
         beside = about
         over[held] = 1.0
         # The largest of the neighbours: cell by cell would cause a chequerboard pattern.
-        rate = rate / _most_about(over, numbers, places)
+        rate = rate / _most_about(over, numbers, indices)
     # The rescaling makes it a proof; the rounds before only keep it small.
-    u.ravel()[places] = best / least
+    u.ravel()[indices] = best / least
     return u, of_best / least
 
 
 @compiled
-def _middles(values, places, shape):
-    """Return the mean of the values at the corners of the cells ``places`` [n] of a grid."""
-    out = np.empty(len(places))
-    for n in range(len(places)):
-        i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
-            places[n] % shape[2])
+def _middles(values, indices, shape):
+    """Return the mean of the values at the corners of the cells ``indices`` [n] of a grid."""
+    out = np.empty(len(indices))
+    for n in range(len(indices)):
+        i, j, k = indices[n] // (shape[1] * shape[2]), indices[n] // shape[2] % shape[1], (
+            indices[n] % shape[2])
         out[n] = values[i:i + 2, j:j + 2, k:k + 2].sum() / 8.0
     return out
 
@@ -274,9 +274,9 @@ def least_in_cells(u, cells):
     """Return a lower bound of the spline in each of ``cells``: its least Bernstein coefficient."""
     out = np.full(u.shape, np.inf)
     one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    places = np.argwhere(cells)
-    for n in range(len(places)):
-        i, j, k = places[n, 0], places[n, 1], places[n, 2]
+    indices = np.argwhere(cells)
+    for n in range(len(indices)):
+        i, j, k = indices[n, 0], indices[n, 1], indices[n, 2]
         _along_last(u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2], one)
         _along_middle(one, two)
         _along_first(two, three)

@@ -23,13 +23,13 @@ from limber.planning.constraints.limits import Limits, sizes
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 
-_POSES = 10  # along the motion where a limit is near, besides those where one is nearest
-_NEAR = 0.3  # of a limit: what is farther below is taken to keep it
-_HIGH = 0.6  # of the peak of what a limit is on: poses of less are not the first to break it
-_FAR = (2.0, 1.0)  # standard deviations off, where the branch is solved; the next if it is not
-_CROSSED = 6  # axes of the posterior, those of most variance, whose products count
-_DEGREES = {"strain": 0.0}  # how a value grows with all moduli; 1 where not told
-_DRAWS_LOG2 = 14  # quasi-random draws: the chance of 0.95 is off by some 0.0005
+_POSES = 10  # poses along the motion where a limit is near, beside the nearest ones
+_NEAR = 0.3  # fraction of a limit below which it is taken as kept
+_HIGH = 0.6  # fraction of the peak value: smaller ones do not break the limit first
+_FAR = (2.0, 1.0)  # standard deviations at which the branch is solved; the next if it fails
+_CROSSED = 6  # posterior axes of largest variance whose products are used
+_DEGREES = {"strain": 0.0}  # exponent in a common factor of all moduli; default 1
+_DRAWS_LOG2 = 14  # quasi-random draws (log2): the probability of 0.95 is within 0.0005
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Risk:
             name: share * getattr(limits, name) / float(np.abs(standing[name]).max())
             for name, share in self.excess.items()})
 
-    def told(self) -> list[str]:
+    def exceeded_limits(self) -> list[str]:
         """Describe the limits that do not hold at the given confidence."""
         return [f"at the requested confidence, {name.replace('_', ' ')} may reach "
                 f"{100 * share:.0f} % of its limit"
@@ -82,14 +82,14 @@ class Surface:
     degree: float
 
     @classmethod
-    def through(cls, axes: np.ndarray, pairs: np.ndarray, places: np.ndarray, values: np.ndarray,
+    def through(cls, axes: np.ndarray, pairs: np.ndarray, steps: np.ndarray, values: np.ndarray,
                 degree: float) -> "Surface":
-        """Fit it to ``values`` [m, n, parts] at ``places`` [m, r] in standard deviations along
+        """Fit it to ``values`` [m, n, parts] at ``steps`` [m, r] in standard deviations along
         ``axes`` [K, r]; as many places as weights.
         """
-        grown = _growth(places @ axes.T, degree)
-        right = (values / grown[:, None, None]).reshape(len(places), -1)
-        weights = np.linalg.solve(_features(places, pairs), right)
+        grown = _growth(steps @ axes.T, degree)
+        right = (values / grown[:, None, None]).reshape(len(steps), -1)
+        weights = np.linalg.solve(_features(steps, pairs), right)
         return cls(np.linalg.pinv(axes), pairs, weights.reshape(values.shape), degree)
 
     def sizes(self, logs: np.ndarray) -> np.ndarray:
@@ -103,9 +103,9 @@ def _growth(logs: np.ndarray, degree: float) -> np.ndarray:
     return np.exp(degree * logs.mean(axis=1))
 
 
-def _features(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.ones(len(places)), places,
-                            places[:, pairs[:, 0]] * places[:, pairs[:, 1]]])
+def _features(steps: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.ones(len(steps)), steps,
+                            steps[:, pairs[:, 0]] * steps[:, pairs[:, 1]]])
 
 
 @dataclass(frozen=True)
@@ -195,12 +195,12 @@ class YoungUncertainty:
         chosen = whole.take(_chosen(whole, asked))
         axes = _axes(self.covariance)
         for number, far in enumerate(_FAR):
-            places, pairs = _design(axes.shape[1], far)
+            steps, pairs = _design(axes.shape[1], far)
             try:
                 found = [chosen]
-                for place in places[1:]:
-                    progress(len(found) / len(places), "limits with other moduli")
-                    found.append(self.solved(grasp_model, axes @ place, chosen))
+                for step in steps[1:]:
+                    progress(len(found) / len(steps), "limits with other moduli")
+                    found.append(self.solved(grasp_model, axes @ step, chosen))
                 break
             except ConvergenceError:
                 if number == len(_FAR) - 1:
@@ -210,7 +210,7 @@ class YoungUncertainty:
             near = np.flatnonzero(known[name] > _NEAR * limit)
             if len(near):
                 values = np.array([_parts(states, name)[near] for states in found])
-                surfaces[name] = Surface.through(axes, pairs, places, values,
+                surfaces[name] = Surface.through(axes, pairs, steps, values,
                                                  _DEGREES.get(name, 1.0))
         return Exposure(asked, surfaces)
 
@@ -225,10 +225,10 @@ class YoungUncertainty:
         for pose, displacement in zip(states.poses, states.displacements, strict=True):
             result = other.follow(pose[None, :3], displacement)[0]
             if reason := refusal(result):
-                place = ", ".join(f"{x:.3f}" for x in pose[:3])
+                position = ", ".join(f"{x:.3f}" for x in pose[:3])
                 raise ConvergenceError(
                     f"With another Young's modulus the branch has no acceptable solution "
-                    f"({reason}) at ({place}) m.",
+                    f"({reason}) at ({position}) m.",
                     "It is therefore unknown whether the limits hold.",
                     "Choose a gentler goal, or omit --confidence.")
             results.append(result)

@@ -28,8 +28,8 @@ class Broken:
     position: np.ndarray
 
     def __str__(self) -> str:
-        place = ", ".join(f"{x:.3f}" for x in self.position)
-        return f"{self.name} {self.value:.4g} exceeds the limit {self.limit:.4g} at ({place}) m"
+        position = ", ".join(f"{x:.3f}" for x in self.position)
+        return f"{self.name} {self.value:.4g} exceeds the limit {self.limit:.4g} at ({position}) m"
 
 
 class Constraint(Protocol):

@@ -23,15 +23,15 @@ from limber.core.errors import InputError
 from limber.core.numerics.compiled import compiled
 from limber.mechanics.materials.species import SPECIES, STRENGTH_OVER_YOUNG
 
-_FEWEST = 5  # tests
+_FEWEST = 5  # break tests
 _DRAWS = 500
 _COLUMN = "strain_at_break"
-_STEPS = 60  # of Newton's method, at most
+_STEPS = 60  # most steps of Newton's method
 _SPREAD = 0.27
 """Coefficient of variation of a species' strain at rupture: those of modulus of rupture, 16 %, and
 of elasticity, 22 %, combined (Wood Handbook, FPL-GTR-190, table 5-6).
 """
-_RADII = np.array([-1.8, -1.1, -0.4, 0.4, 1.1, 1.8])  # deviations of the radius, evenly likely
+_RADII = np.array([-1.8, -1.1, -0.4, 0.4, 1.1, 1.8])  # deviations of the radius, equally likely
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 
 _APART = 0.01  # [m] between states of a path that become samples
-_MOST_LEARNT = 12  # of them a round
-_ROUND_OFF = 1e-12  # of the samples' largest energy
-_SLACK = 1e-3  # share of the goal's tolerance that is round-off
+_MOST_LEARNT = 12  # most of them in a round
+_ROUND_OFF = 1e-12  # fraction of the samples' largest energy
+_SLACK = 1e-3  # fraction of the goal's tolerance that is rounding
 
 
 def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: np.ndarray,
@@ -29,18 +29,18 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
         goal: Where it must end.
         nodes: Nodes of the mesh at rest [m], shape [n, 3].
     """
-    told = []
+    faults = []
     for position, reason in zip(path.unsolved, path.reasons, strict=True):
-        place = ", ".join(f"{x:.3f}" for x in position)
-        told.append(f"no acceptable solution ({reason}) at ({place}) m")
-    told = told[:1] + ([f"and at {len(told) - 1} more poses"] if len(told) > 1 else [])
+        point_text = ", ".join(f"{x:.3f}" for x in position)
+        faults.append(f"no acceptable solution ({reason}) at ({point_text}) m")
+    faults = faults[:1] + ([f"and at {len(faults) - 1} more poses"] if len(faults) > 1 else [])
     whole = path.approach.joined(path.solved)
-    told += [str(broken) for broken in limits.broken(whole)]
+    faults += [str(broken) for broken in limits.broken(whole)]
     if path.is_whole:
         off = goal.missed_by(path.solved)
         if off > goal.tolerance * _SLACK:
-            told.append(f"{goal.what} ends {1e3 * off:.1f} mm outside its goal")
-    return told + limits.met(whole.poses[:, :3], nodes + whole.displacements)
+            faults.append(f"{goal.what} ends {1e3 * off:.1f} mm outside its goal")
+    return faults + limits.met(whole.poses[:, :3], nodes + whole.displacements)
 
 
 def field_error(field: EnergyField, states: SolvedPoses) -> float:
@@ -67,10 +67,10 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
     chosen: list[int] = []
     known = field.samples.positions
     for index in order:
-        place = whole.poses[index, :3]
+        position = whole.poses[index, :3]
         others = np.concatenate([known, whole.poses[chosen, :3]])
         if len(chosen) < _MOST_LEARNT and (
-                np.linalg.norm(others - place, axis=1).min() > 0.5 * _APART):
+                np.linalg.norm(others - position, axis=1).min() > 0.5 * _APART):
             chosen.append(int(index))
     found = _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved,
                         field.samples)

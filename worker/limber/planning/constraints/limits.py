@@ -20,10 +20,10 @@ from limber.planning.field.local_error import LocalError, slack_of
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 
-_COVERED = 0.95  # of the samples near a limit
-_NEAR = (0.5, 1.3)  # times the limit
-_FEWEST = 12  # samples near it; else all are asked
-_MOST = 0.3  # of the limit: where the field is worse, the check on the full model has to tell
+_COVERED = 0.95  # fraction of the samples near a limit
+_NEAR = (0.5, 1.3)  # fractions of the limit that count as near
+_FEWEST = 12  # fewest samples near it; otherwise all are used
+_MOST = 0.3  # fraction of the limit; where the field is worse, the check on the full model decides
 
 
 CONSTRAINTS: list[Callable[[PlanSettings], Constraint | None]] = []
@@ -216,8 +216,8 @@ class Limits:
         underestimates, -1.
         """
         inner, above = ~known.region.is_face(), self.above(known)
-        places = known.region.chart.plain.map(known.samples.positions)[inner]
-        return {name: LocalError.of(places, side * above[name][inner], covered, limit)
+        mapped = known.region.chart.plain.map(known.samples.positions)[inner]
+        return {name: LocalError.of(mapped, side * above[name][inner], covered, limit)
                 for name, limit in most.items()}
 
     def beyond(self, known: EnergyField) -> FieldArrays:
@@ -233,21 +233,21 @@ class Limits:
 
     def broken(self, states: SolvedPoses) -> list[Broken]:
         """Return the limits that states of the full model break, each at its worst state."""
-        places = states.poses[:, :3]
-        outside = np.maximum(self.low - places, places - self.high).max(axis=1)
+        positions = states.poses[:, :3]
+        outside = np.maximum(self.low - positions, positions - self.high).max(axis=1)
         asked = [(f"{name.replace('_', ' ')} [{UNITS[name]}]".replace(" []", ""), size,
                   getattr(self, name)) for name, size in sizes(states).items()]
         asked.append(("distance outside the workspace [m]", outside, 1e-6))
-        return [Broken(name, float(values.max()), limit, places[values.argmax()])
+        return [Broken(name, float(values.max()), limit, positions[values.argmax()])
                 for name, values, limit in asked if values.max() > limit]
 
     def kept(self, states: SolvedPoses) -> np.ndarray:
         """Return which states keep all limits, bool [n]."""
-        places = states.poses[:, :3]
+        positions = states.poses[:, :3]
         within = [size <= getattr(self, name) for name, size in sizes(states).items()]
         return (np.logical_and.reduce(within)
-                & (places >= self.low - 1e-6).all(axis=1)
-                & (places <= self.high + 1e-6).all(axis=1))
+                & (positions >= self.low - 1e-6).all(axis=1)
+                & (positions <= self.high + 1e-6).all(axis=1))
 
 
 def sampled_sizes(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
@@ -261,10 +261,10 @@ def with_unit(name: str) -> str:
     return f"{name}_{UNITS[name].lower()}".rstrip("_")
 
 
-def limits_in_file(told: dict[str, dict[str, float]]) -> Limits:
+def limits_in_file(entries: dict[str, dict[str, float]]) -> Limits:
     """Return the limits in a plan's file, by the keys of :func:`with_unit`."""
-    return Limits(**{name: float(told[with_unit(name)]["limit"]) for name in UNITS
-                     if with_unit(name) in told})
+    return Limits(**{name: float(entries[with_unit(name)]["limit"]) for name in UNITS
+                     if with_unit(name) in entries})
 
 
 def sizes(states: SolvedPoses) -> dict[str, np.ndarray]:

@@ -24,12 +24,12 @@ from limber.planning.field.limited_quantities import UNITS
 from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.timing import Pace, poses_at, time_law
 
-_FINE = 1 / 60  # [s] a step while speed changes, at most
-_RAMP_STEPS = 8  # in the time from rest to full speed, at least
-_SETTLE = 0.3  # [s] after speed has changed, and at the end: lowest vibrations peak within it
-_CHANGES = 0.02  # share of the largest acceleration that counts as a change of speed
+_FINE = 1 / 60  # [s] longest step while speed changes
+_RAMP_STEPS = 8  # fewest steps from rest to full speed
+_SETTLE = 0.3  # [s] after speed has changed and at the end: the lowest vibrations peak within it
+_CHANGES = 0.02  # fraction of the largest acceleration that counts as a change of speed
 _LEAST_SLOWING, _MOST_SLOWING = 1.25, 4.0
-_TOWARDS = 0.8  # of what a limit leaves to inertia that the next pace shall take
+_TOWARDS = 0.8  # fraction of a limit's reserve for inertia that the next pace uses
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,15 @@ def check_motion(grasp_model: GraspModel, path: ResolvedPath, limits: Limits, pa
         path: Keeps the limits at standstill at every pose.
         slowings: Most times to slow down and try again.
     """
-    there = path.ahead
-    standing = {name: float(np.abs(size).max()) for name, size in sizes(there).items()}
-    ways = [(there.poses, there.displacements[0]),
-            (there.poses[::-1], there.displacements[-1])]
+    ahead = path.ahead
+    standing = {name: float(np.abs(size).max()) for name, size in sizes(ahead).items()}
+    paths = [(ahead.poses, ahead.displacements[0]),
+             (ahead.poses[::-1], ahead.displacements[-1])]
     steps, began = 0, perf_counter()
     for attempt in range(slowings + 1):
         part = progress.part(attempt / (slowings + 1), (attempt + 1) / (slowings + 1))
         moved = run_tasks(_moved, [(grasp_model, poses, start, pace, limits)
-                                   for poses, start in ways],
+                                   for poses, start in paths],
                           workers=workers, progress=part, message="the motion in time")
         steps += sum(one.step_count for one in moved)
         peaks = {name: max(one.peaks.get(name, 0.0) for one in moved) for name in limits.asked()
@@ -108,19 +108,19 @@ class _Moved:
 
 def _moved(grasp_model: GraspModel, poses: np.ndarray, start: np.ndarray, pace: Pace,
            limits: Limits, progress: Progress = SILENT) -> _Moved:
-    times, places = _drive(poses, pace)
+    times, grasps = _drive(poses, pace)
     found = simulate_dynamics(
         grasp_model.model, grasp=grasp_model.grasp, times=times, start=start,
-        poses=np.hstack([places, np.zeros_like(places)]),
+        poses=np.hstack([grasps, np.zeros_like(grasps)]),
         settings=NewmarkSettings(max_step=float(np.diff(times).max())), progress=progress)
     values = _sizes(grasp_model, found, limits)
     broken = [str(Broken(f"{name.replace('_', ' ')} in motion [{UNITS[name]}]".replace(" []", ""),
-                         float(size.max()), getattr(limits, name), places[size.argmax()]))
+                         float(size.max()), getattr(limits, name), grasps[size.argmax()]))
               for name, size in values.items() if size.max() > getattr(limits, name)]
     broken += [f"in motion {words}" for words in limits.met(
-        places[:len(found.displacement)], grasp_model.mesh.nodes + found.displacement)]
+        grasps[:len(found.displacement)], grasp_model.mesh.nodes + found.displacement)]
     if not found.converged:
-        where = ", ".join(f"{x:.3f}" for x in places[len(found.times) - 1])
+        where = ", ".join(f"{x:.3f}" for x in grasps[len(found.times) - 1])
         broken.append(f"in motion the branch cannot follow the gripper ({found.message}) at "
                       f"({where}) m")
     return _Moved({name: float(size.max()) for name, size in values.items()}, broken,

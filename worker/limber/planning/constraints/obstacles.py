@@ -9,8 +9,8 @@ from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.surface import Surface
 from limber.planning.constraints.constraint import Constraint
 
-_SCALE = 0.1  # [m] by which closeness falls to a third
-_CHUNK = 2_000_000  # point and face pairs whose solid angles are summed at a time
+_SCALE = 0.1  # [m] in which closeness falls to a third
+_CHUNK = 2_000_000  # point and face pairs whose solid angles are summed together
 
 
 class Obstacle(Protocol):
@@ -88,11 +88,11 @@ class Obstacles(Constraint):
         if (hit := closest(self.bodies, nodes.reshape(-1, 3), kept)) is None:
             return None
         name, depth, where = hit
-        place = ", ".join(f"{x:.3f}" for x in where)
+        position = ", ".join(f"{x:.3f}" for x in where)
         if depth < kept:
-            return (f"the branch is {1e3 * (kept - depth):.1f} mm away from {name} at ({place}) m, "
-                    f"less than the clearance of {1e3 * kept:.1f} mm")
-        return f"the branch is {1e3 * (depth - kept):.1f} mm inside {name} at ({place}) m"
+            return (f"the branch is {1e3 * (kept - depth):.1f} mm away from {name} at ({position}) "
+                    f"m, less than the clearance of {1e3 * kept:.1f} mm")
+        return f"the branch is {1e3 * (depth - kept):.1f} mm inside {name} at ({position}) m"
 
 
 def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,

@@ -17,15 +17,15 @@ from scipy.spatial import Delaunay
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.guess import foretold_by, half_way
+from limber.planning.field.guess import extrapolated, midpoint_blend
 from limber.planning.field.solved import Solved, taken
 from limber.planning.field.solver_pool import SolverPool
 
-_JUMP = 0.01  # of the branch's length, by which neighbours' slopes foretell differently
-_ONE = 0.003  # of it: nearer shapes are one
-_NEARER = 0.4  # of a jump is left half-way, at most, where the branch surely is the neighbours'
-_LEAST = 0.02  # of it: neighbours nearer than this are asked no more
-_ROUNDS = 4  # each knows what the ones before have found
+_JUMP = 0.01  # fraction of the branch's length by which predictions of two neighbours differ
+_ONE = 0.003  # fraction of it below which shapes are the same
+_NEARER = 0.4  # largest fraction of a jump left half-way where the neighbours' state is certain
+_LEAST = 0.02  # fraction of it; nearer neighbours are not examined further
+_ROUNDS = 4  # each uses what the earlier ones found
 _SHARE_PAIRS = 6
 """Pairs of one task; must not depend on the number of processes."""
 _CORNERS = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
@@ -54,9 +54,9 @@ def ask_between(
     known, begun, asked = list(known), len(known), 0
     torn = np.empty((0, 3))
     for number in range(_ROUNDS):
-        wanted = round(most * (number + 1) / _ROUNDS) - asked
+        budget = round(most * (number + 1) / _ROUNDS) - asked
         pairs = disagreeing(known, chart, usual, solvers.grasp_model.reach.arc_length)
-        chosen = _apart(pairs, known, torn, chart)[:wanted]
+        chosen = _apart(pairs, known, torn, chart)[:budget]
         if not chosen:
             break
         asked += len(chosen)
@@ -67,7 +67,7 @@ def ask_between(
                          progress=progress.part(number / _ROUNDS, (number + 1) / _ROUNDS),
                          message="between neighbouring poses")
         known += [one for added, _ in found for one in added]
-        torn = np.concatenate([torn, *(places for _, places in found)])
+        torn = np.concatenate([torn, *(middles for _, middles in found)])
     return known[begun:], torn
 
 
@@ -87,8 +87,8 @@ def disagreeing(known: Sequence[Solved], chart: Chart, usual: np.ndarray, length
     number = number.reshape(len(sides), 6)
     weight = np.bincount(number.ravel(), np.repeat(crowd, 6), len(edges))
     jumps = _jumps(known, edges)
-    apart = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
-    worth = np.where((jumps > _JUMP * length) & (apart > _LEAST * length), jumps * weight, 0.0)
+    distance = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
+    worth = np.where((jumps > _JUMP * length) & (distance > _LEAST * length), jumps * weight, 0.0)
     return [(int(edges[k, 0]), int(edges[k, 1]), np.flatnonzero((number == k).any(axis=1)))
             for k in np.argsort(-worth, kind="stable")[:int((worth > 0.0).sum())]]
 
@@ -110,14 +110,14 @@ def jump(first: Solved, second: Solved) -> float:
 
 def _jumps(known: Sequence[Solved], edges: np.ndarray) -> np.ndarray:
     """Return the distances for pairs of numbers [e, 2] in ``known``, shape [e]."""
-    places = np.array([one.pose[:3] for one in known])
+    positions = np.array([one.pose[:3] for one in known])
     shapes = np.array([one.shape[3:] for one in known])
     slopes = np.array([one.shape_slopes[:, 3:] for one in known])
     sure = np.isfinite(slopes).all(axis=(1, 2))
     slopes[~sure] = 0.0
     first, second = edges.T
     count = np.maximum(sure[first].astype(int) + sure[second], 1)
-    change = np.einsum("ek,ekc->ec", places[second] - places[first],
+    change = np.einsum("ek,ekc->ec", positions[second] - positions[first],
                        (slopes[first] + slopes[second]) / count[:, None, None])
     off = (shapes[second] - shapes[first] - change).reshape(len(edges), -1, 3)
     return np.linalg.norm(off, axis=2).max(axis=1)
@@ -141,12 +141,12 @@ def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], to
     return chosen
 
 
-def _ask(grasp_model: GraspModel, places: list[tuple[Pair, np.ndarray]],
+def _ask(grasp_model: GraspModel, pairs: list[tuple[Pair, np.ndarray]],
          progress: Progress = SILENT) -> tuple[list[Solved], np.ndarray]:
     added, torn = [], [np.empty((0, 3))]
-    for number, ((first, second), middle) in enumerate(places):
-        progress(number / len(places), "between neighbouring poses")
-        found = _half_way(grasp_model, first, second, middle)
+    for number, ((first, second), middle) in enumerate(pairs):
+        progress(number / len(pairs), "between neighbouring poses")
+        found = _solved_midpoint(grasp_model, first, second, middle)
         if found is None:
             torn.append(middle)
         else:
@@ -154,26 +154,26 @@ def _ask(grasp_model: GraspModel, places: list[tuple[Pair, np.ndarray]],
     return added, np.concatenate(torn)
 
 
-def _half_way(grasp_model: GraspModel, first: Solved, second: Solved, middle: np.ndarray,
-              ) -> Solved | None:
+def _solved_midpoint(grasp_model: GraspModel, first: Solved, second: Solved, middle: np.ndarray,
+                     ) -> Solved | None:
     """Return the state at ``middle`` [1, 3] that both neighbours reach, None if there is none."""
-    found, apart = None, jump(first, second)
-    if (guess := half_way(grasp_model, first, second, middle[0])) is not None:
-        there = grasp_model.follow(middle, first.displacement, guess, snap=False)[0]
-        if not refusal(there):
-            found = taken(grasp_model, there)
-            if max(jump(first, found), jump(found, second)) < _NEARER * apart:
+    found, jumped = None, jump(first, second)
+    if (guess := midpoint_blend(grasp_model, first, second, middle[0])) is not None:
+        result = grasp_model.follow(middle, first.displacement, guess, snap=False)[0]
+        if not refusal(result):
+            found = taken(grasp_model, result)
+            if max(jump(first, found), jump(found, second)) < _NEARER * jumped:
                 return found
     back = grasp_model.follow(middle, second.displacement,
-                              foretold_by(grasp_model, second, middle[0]), snap=False)[0]
+                              extrapolated(grasp_model, second, middle[0]), snap=False)[0]
     if refusal(back):
         return None
     back = taken(grasp_model, back)
     if found is not None and _are_one(found, back, grasp_model):
         return found
-    there = grasp_model.follow(middle, first.displacement,
-                               foretold_by(grasp_model, first, middle[0]), snap=False)[0]
-    if refusal(there) or not _are_one(taken(grasp_model, there), back, grasp_model):
+    result = grasp_model.follow(middle, first.displacement,
+                                extrapolated(grasp_model, first, middle[0]), snap=False)[0]
+    if refusal(result) or not _are_one(taken(grasp_model, result), back, grasp_model):
         return None
     return back
 
@@ -183,5 +183,5 @@ def _are_one(first: Solved, second: Solved, grasp_model: GraspModel) -> bool:
     return bool(off <= _ONE * grasp_model.reach.arc_length)
 
 
-def _nearest(place: np.ndarray, others: np.ndarray) -> float:
-    return float(np.linalg.norm(others - place, axis=1).min())
+def _nearest(position: np.ndarray, others: np.ndarray) -> float:
+    return float(np.linalg.norm(others - position, axis=1).min())

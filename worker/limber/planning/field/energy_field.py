@@ -43,11 +43,11 @@ KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("mult
 CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
                 (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005))
 """Stretch and depth; they depend on the curvature off the shell, for any kernel."""
-_FINALISTS = 3  # charts, the best with the first kernel, that the others are tried on
-_SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites round-off
+_FINALISTS = 3  # best charts with the first kernel; the other kernels are tried on them
+_SMOOTHING = 1e-6  # fraction of the scaled system; more blurs, less invites rounding errors
 _CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
-_MOST = 0.95  # of the samples are no farther off
-_MOST_TIPS = 0.9  # likewise; what is beyond lies where the branch may go aside either way
+_MOST = 0.95  # quantile of the samples
+_MOST_TIPS = 0.9  # the same; beyond it the branch may buckle either way
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
              "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
@@ -73,7 +73,7 @@ _OPTIONAL_SHAPES = {
            "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
 """Shapes of the arrays in a file; equal letters are equal lengths."""
 """In any unit here: with larger numbers, sums would not be finite."""
-_CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
+_CHOOSE_FROM = 150  # most samples; more change the choice little but take time
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ class EnergyField:
         first = 3 if target is None else 6 + 3 * target
         return self._value(self.shape_fit, points, slice(first, first + 3), True)
 
-    def place_error(self, target: int | None = None) -> float:
+    def position_error(self, target: int | None = None) -> float:
         """Return the largest error of the field's position of the tip, or a target [m].
 
         The largest distance at left-out samples, inside the samples' hull; infinite if none is
@@ -250,13 +250,13 @@ class EnergyField:
 
     def place_errors(self, target: int | None, points: np.ndarray) -> np.ndarray:
         """Return the possible error of the tip's position, or a target's, with the grasp at
-        ``points`` [n, 3]: no left-out sample exceeded it, nowhere more than :meth:`place_error`
+        ``points`` [n, 3]: no left-out sample exceeded it, nowhere more than :meth:`position_error`
         [m], shape [n].
         """
         inner, chart = ~self.region.is_face(), self.region.chart.plain
         error = LocalError.of(chart.map(self.samples.positions)[inner],
                               self.misplaced[inner, 0 if target is None else 1 + target], 1.0,
-                              self.place_error(target))
+                              self.position_error(target))
         return error.at(chart.map(_rows(points)))
 
     def tip_gradient(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
@@ -338,7 +338,7 @@ class EnergyField:
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
                 **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
-            if "chart_layers" not in arrays:  # of an older program
+            if "chart_layers" not in arrays:  # written by an older version
                 return fit_field(samples, arrays["chart_base_m"])
             if arrays.get("load_fit_value_weights", np.empty((0, 0))).shape[1] != len(LOADS):
                 return fit_field(samples, arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
@@ -390,7 +390,7 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     bending, inside = some.take(sure), ~face[sure]
 
     def energy_missed(choice: FitChoice) -> float:
-        errors = left_out_errors(some, choice.on(chart), choice, face)[0]
+        errors = cross_validated_errors(some, choice.on(chart), choice, face)[0]
         # Each relative to its own value: a few stiff poses, compressed and buckled, dominate means.
         return float(np.prod([errors[name] for name in _CHOSEN_BY]))
 
@@ -424,9 +424,10 @@ def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, f
 def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
                ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``missed`` and ``misplaced`` from a file; nan if it does not contain them."""
-    places = 1 + (0 if samples.targets is None else samples.targets.shape[1])
+    column_count = 1 + (0 if samples.targets is None else samples.targets.shape[1])
     found = []
-    for name, columns in (("left_out_errors", 4 + len(LOADS)), ("left_out_place_errors_m", places)):
+    for name, columns in (("left_out_errors", 4 + len(LOADS)),
+                          ("left_out_place_errors_m", column_count)):
         whole = np.full((len(samples.poses), columns), np.nan)
         known = arrays.get(name, np.empty((len(whole), 0)))
         if known.ndim != 2 or len(known) != len(whole) or known.shape[1] > columns:
@@ -499,8 +500,8 @@ def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate([np.flatnonzero(face), picked]))
 
 
-def left_out_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
-                    ) -> tuple[dict[str, float], np.ndarray]:
+def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
+                           ) -> tuple[dict[str, float], np.ndarray]:
     """Return errors on each sample of the fit to all the others, in closed form.
 
     Only samples inside the hull count: the planner never leaves it.
@@ -516,9 +517,9 @@ def left_out_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face
         raise WorkError(f"{len(samples.poses)} grasp poses are too few for cross-validation.",
                         "The error of the energy field cannot be measured.",
                         "Sample more poses.")
-    places = chart.map(samples.positions)
+    in_chart = chart.map(samples.positions)
     missed = RadialInterpolant.leave_one_out(
-        places, samples.energies, chart.push_forward(samples.positions, samples.forces),
+        in_chart, samples.energies, chart.push_forward(samples.positions, samples.forces),
         kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, :, 0]
     energy = np.maximum(samples.energies - missed[:, 0], 0.0)
     off = -chart.pull_back(samples.positions, missed[:, 1:])
@@ -539,21 +540,21 @@ def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
         over the half of the samples with the least energy, where gentle paths run;
         ``held_out_count``.
     """
-    wanted = np.maximum(truth.energies, 0.0)
-    energy_off = np.abs(energy - wanted)
+    true_energies = np.maximum(truth.energies, 0.0)
+    energy_off = np.abs(energy - true_energies)
     force_off = np.linalg.norm(force - truth.forces, axis=1)
     size = np.linalg.norm(truth.forces, axis=1)
-    felt = (wanted > 1e-3 * wanted.max()) & (size > 1e-3 * size.max())
-    gentle = wanted <= np.median(wanted)
-    energy_share, force_share = energy_off[felt] / wanted[felt], force_off[felt] / size[felt]
+    felt = (true_energies > 1e-3 * true_energies.max()) & (size > 1e-3 * size.max())
+    gentle = true_energies <= np.median(true_energies)
+    energy_share, force_share = energy_off[felt] / true_energies[felt], force_off[felt] / size[felt]
     return {
-        "energy_error": _rms(energy_off) / _rms(wanted),
+        "energy_error": _rms(energy_off) / _rms(true_energies),
         "force_error": _rms(force_off) / _rms(size),
         "energy_error_median": float(np.median(energy_share)),
         "force_error_median": float(np.median(force_share)),
         "energy_error_most": float(np.quantile(energy_share, _MOST)),
         "force_error_most": float(np.quantile(force_share, _MOST)),
-        "gentle_energy_error": _rms(energy_off[gentle]) / _rms(wanted[gentle]),
+        "gentle_energy_error": _rms(energy_off[gentle]) / _rms(true_energies[gentle]),
         "held_out_count": float(len(energy)),
     }
 
@@ -561,20 +562,20 @@ def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
 def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: TrustRegion,
             ) -> EnergyField:
     chart = choice.on(region.chart)
-    errors, missed = left_out_errors(samples, chart, choice, region.is_face())
-    places = chart.map(samples.positions)
+    errors, missed = cross_validated_errors(samples, chart, choice, region.is_face())
+    in_chart = chart.map(samples.positions)
     forces = chart.push_forward(samples.positions, samples.forces)
-    energy = RadialInterpolant.fit(places, samples.energies, forces, kernel=choice.kernel,
+    energy = RadialInterpolant.fit(in_chart, samples.energies, forces, kernel=choice.kernel,
                                    shape=choice.shape, smoothing=_SMOOTHING)
     shape_chart = bent.on(region.chart)
-    places = shape_chart.map(samples.positions)
+    in_chart = shape_chart.map(samples.positions)
     options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": _SMOOTHING}
     sure = _with_slopes(samples)
     bending = samples.take(sure)
-    shape = RadialInterpolant.fit(places[sure], bending.shape, _slopes_on(shape_chart, bending),
+    shape = RadialInterpolant.fit(in_chart[sure], bending.shape, _slopes_on(shape_chart, bending),
                                   **options)
-    loads = RadialInterpolant.fit(places, samples.load_table, **options)
-    off = -RadialInterpolant.leave_one_out(places, samples.load_table, **options)[:, 0]
+    loads = RadialInterpolant.fit(in_chart, samples.load_table, **options)
+    off = -RadialInterpolant.leave_one_out(in_chart, samples.load_table, **options)[:, 0]
     off[:, [one is None for one in samples.loads.values()]] = np.nan
     found = _misplaced(bending, bent, region.chart, slice(None))
     misplaced = np.full((len(samples.poses), found.shape[1]), np.nan)

@@ -33,7 +33,7 @@ from limber.mechanics.strain import peak_load
 # A pose that needs finer steps than this is beyond a snap. It is rejected early.
 _SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False, keeps_factor=True)
 _STEADY = replace(_SETTINGS, snap=False)
-_DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differentiated
+_DIFFERENCE = 1e-6  # [m] displacement of the grasp for differences of rotations
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class Reach:
     def of(cls, skeleton: Skeleton, centre: np.ndarray) -> "Reach":
         """Measure along the skeleton's main path up to the grasp's ``centre`` [3]."""
         path = skeleton.main_path()
-        place = int(np.argmin(np.linalg.norm(skeleton.nodes[path] - centre, axis=1)))
-        nearest = path[place]
-        along = skeleton.nodes[path[min(place + 1, len(path) - 1)]] - skeleton.nodes[
-            path[max(place - 1, 0)]]
+        index = int(np.argmin(np.linalg.norm(skeleton.nodes[path] - centre, axis=1)))
+        nearest = path[index]
+        along = skeleton.nodes[path[min(index + 1, len(path) - 1)]] - skeleton.nodes[
+            path[max(index - 1, 0)]]
         base = skeleton.nodes[path[0]]
         chord = float(np.linalg.norm(centre - base))
         return cls(base, max(float(skeleton.arc_length[nearest]), chord), chord,
@@ -141,8 +141,8 @@ class GraspModel:
         loose = solve_static(self.model, grasp=self.grasp, grasp_force=force, start=start)
         if refusal(loose):
             return loose
-        place = self.pose(loose.displacement)[:3]
-        return self.follow(place[None], loose.displacement, Guess(loose.displacement))[0]
+        position = self.pose(loose.displacement)[:3]
+        return self.follow(position[None], loose.displacement, Guess(loose.displacement))[0]
 
     def pose(self, displacement: np.ndarray) -> np.ndarray:
         """Return position and natural rotation of the grasped piece, shape [6]."""

@@ -14,20 +14,20 @@ from limber.planning.field.grasp_model import GraspModel, Guess
 from limber.planning.field.radial import RadialInterpolant
 from limber.planning.field.solved import Solved
 
-_STATES = 6  # about a place that are asked
-_SURE = 0.02  # of the branch's length, that they may say otherwise than the nearest alone
-_APART = 0.002  # of it, that two of them lie apart
+_STATES = 6  # states around a position that are used
+_SURE = 0.02  # fraction of the length by which they may differ from the nearest state
+_APART = 0.002  # fraction of the length by which two states differ
 _KERNEL = {"kernel": "cubic", "smoothing": 1e-9}
-_STRAIGHT = 0.9  # cosine of the turn of a way, below which it does not go on
-_DIFFERENCE = 1e-4  # of a state's change, by which that of its strain is measured
+_STRAIGHT = 0.9  # cosine of a path's turn below which it is not continued
+_DIFFERENCE = 1e-4  # fraction of a state's change by which its strain's change is measured
 
 Share = tuple[float, np.ndarray, np.ndarray]
 """Terms of a state in a guess: weight, displacement, and its change by the tangents."""
 
 
 def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.ndarray,
-             place: np.ndarray) -> Guess | None:
-    """Return a guess of the branch's shape with the grasp at ``place`` [3], None if nothing is
+             position: np.ndarray) -> Guess | None:
+    """Return a guess of the branch's shape with the grasp at ``position`` [3], None if nothing is
     known; an empty guess if the model needs none.
 
     An interpolation of the nearest states with their tangents (Hermite, radial); the nearest alone
@@ -39,7 +39,7 @@ def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.nda
     if not grasp_model.needs_guess:
         return Guess()
     length, states = grasp_model.reach.arc_length, []
-    for k in np.argsort(np.linalg.norm(positions - place, axis=1), kind="stable")[:2 * _STATES]:
+    for k in np.argsort(np.linalg.norm(positions - position, axis=1), kind="stable")[:2 * _STATES]:
         gaps = [np.linalg.norm(one.pose[:3] - positions[k]) for one in states]
         if known[k].has_tangents and min(gaps, default=np.inf) > _APART * length:
             states.append(known[k])
@@ -48,41 +48,41 @@ def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.nda
     if not states:
         return None
     if len(states) == _STATES:
-        shares = _interpolated(states, place)
-        off = np.linalg.norm(_displacement(shares) - states[0].foretold(place), axis=1).max()
+        shares = _interpolated(states, position)
+        off = np.linalg.norm(_displacement(shares) - states[0].extrapolated(position), axis=1).max()
         if off <= _SURE * length:
             return blended(grasp_model, shares)
-    return foretold_by(grasp_model, states[0], place)
+    return extrapolated(grasp_model, states[0], position)
 
 
-def foretold_by(grasp_model: GraspModel, state: Solved, place: np.ndarray) -> Guess | None:
-    """Return the prediction of a state's tangents at ``place`` [3], None if it has none."""
+def extrapolated(grasp_model: GraspModel, state: Solved, position: np.ndarray) -> Guess | None:
+    """Return the prediction of a state's tangents at ``position`` [3], None if it has none."""
     if not state.has_tangents:
         return None
-    return blended(grasp_model, [_share(1.0, state, place - state.pose[:3])])
+    return blended(grasp_model, [_share(1.0, state, position - state.pose[:3])])
 
 
-def half_way(grasp_model: GraspModel, first: Solved, second: Solved, place: np.ndarray,
-             ) -> Guess | None:
+def midpoint_blend(grasp_model: GraspModel, first: Solved, second: Solved, position: np.ndarray,
+                   ) -> Guess | None:
     """Return the blend of both states' values and slopes near half-way, None without slopes."""
     if not (first.has_tangents and second.has_tangents):
         return None
     straight = 0.5 * (first.pose[:3] + second.pose[:3])
     return blended(grasp_model, [
-        _share(0.5, one, 0.25 * (place - one.pose[:3] + place - straight))
+        _share(0.5, one, 0.25 * (position - one.pose[:3] + position - straight))
         for one in (first, second)])
 
 
-def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, place: np.ndarray,
+def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, position: np.ndarray,
                 ) -> Guess | None:
     """Return the extrapolation of two states on a path, displacements [node_count, 3], to the next
-    ``place`` [3]: straight on by the tangents of the second, plus the curvature of the path since
-    the first.
+    ``position`` [3]: straight on by the tangents of the second, plus the curvature of the path
+    since the first.
 
     None if the path turns, or the branch is about to snap.
     """
     here = grasp_model.pose(now)[:3]
-    back, on = grasp_model.pose(before)[:3] - here, place - here
+    back, on = grasp_model.pose(before)[:3] - here, position - here
     size = float(np.linalg.norm(back) * np.linalg.norm(on))
     if size == 0.0 or back @ on > -_STRAIGHT * size:
         return None
@@ -109,20 +109,20 @@ def blended(grasp_model: GraspModel, shares: Sequence[Share]) -> Guess:
     return Guess(_displacement(shares), strain)
 
 
-def _share(weight: float, state: Solved, way: np.ndarray) -> Share:
-    return weight, state.displacement, state.moved(way)
+def _share(weight: float, state: Solved, shift: np.ndarray) -> Share:
+    return weight, state.displacement, state.moved(shift)
 
 
 def _displacement(shares: Sequence[Share]) -> np.ndarray:
     return sum(weight * displacement + change for weight, displacement, change in shares)
 
 
-def _interpolated(states: list[Solved], place: np.ndarray) -> list[Share]:
+def _interpolated(states: list[Solved], position: np.ndarray) -> list[Share]:
     points = np.array([one.pose[:3] for one in states])
     count = len(points)
     # Contribution of each value, and each slope: the interpolation of unit data.
     unit = np.eye(4 * count)
     weights = RadialInterpolant.fit(points, unit[:count], unit[count:].reshape(count, 3, -1),
-                                    **_KERNEL).value(place[None])[0]
+                                    **_KERNEL).value(position[None])[0]
     slopes = weights[count:].reshape(count, 3)
     return [_share(weights[k], one, slopes[k]) for k, one in enumerate(states)]

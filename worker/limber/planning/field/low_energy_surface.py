@@ -19,10 +19,10 @@ from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.solved import Solved, taken
 from limber.planning.field.solver_pool import SolverPool
 
-_STEP = 1e-4  # [m] of the moves that measure the stiffness at rest
-_RIM = 1.1  # times the force that linear bending needs for the largest deflection
+_STEP = 1e-4  # [m] displacement that measures the stiffness at rest
+_RIM = 1.1  # factor on the force of linear bending at the largest deflection
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
-_WORST = 0.02  # share of the radius that the sphere may miss the states by, root mean square
+_WORST = 0.02  # rms deviation of the states from the sphere, over the radius
 _SHARE_DIRECTIONS = 3
 """Directions of one task; must not depend on the number of processes."""
 
@@ -63,8 +63,8 @@ def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, s
                      progress=progress, message="finding the low-energy surface")
     pairs = [found[k % shares][k // shares] for k in range(len(across))]
     slack = [pair[0] for pair in pairs[1:] if pair[0] is not None]
-    places = np.array([grasp_model.rest_position, *(state.pose[:3] for state in slack)])
-    return _sphere(places, reach.base, grasp_model.rest_position), [
+    positions = np.array([grasp_model.rest_position, *(state.pose[:3] for state in slack)])
+    return _sphere(positions, reach.base, grasp_model.rest_position), [
         *slack, *(pair[1] for pair in pairs if pair[1] is not None)]
 
 
@@ -100,14 +100,14 @@ def _under(grasp_model: GraspModel, force: np.ndarray, start: StaticResult) -> S
     return None if refusal(held) else held
 
 
-def _sphere(places: np.ndarray, base: np.ndarray, rest: np.ndarray) -> LowEnergySurface:
+def _sphere(positions: np.ndarray, base: np.ndarray, rest: np.ndarray) -> LowEnergySurface:
     arm = rest - base
     chord = float(np.linalg.norm(arm))
 
     def missed(unknown: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(places - unknown[:3], axis=1) - unknown[3]
+        return np.linalg.norm(positions - unknown[:3], axis=1) - unknown[3]
 
-    if len(places) >= 8:
+    if len(positions) >= 8:
         start = np.r_[base + 0.2 * arm, 0.8 * chord]
         found = scipy.optimize.least_squares(missed, start, x_scale=chord)
         pivot, radius = found.x[:3], float(found.x[3])

@@ -23,7 +23,7 @@ from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.refresh import corrected_once
 from limber.reduced.state import ReducedState, ReducedStaticSettings
 
-_SETTINGS = ReducedStaticSettings(tolerance=1e-7)  # the correction does the rest
+_SETTINGS = ReducedStaticSettings(tolerance=1e-7)  # the correction removes the rest
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class LearntGraspModel(GraspModel):
                *, snap: bool = True) -> list[StaticResult]:
         """As for the full model; only that needs ``guess``."""
         results, at = [], start
-        for place in positions:
-            pose = np.concatenate([place, np.zeros(3)])
+        for position in positions:
+            pose = np.concatenate([position, np.zeros(3)])
             result = self._corrected(self.reduced.followed(self._coordinates(at), pose,
                                                            _SETTINGS))
             if result is None:
-                result = super().follow(place[None], at, guess, snap=snap)[0]
+                result = super().follow(position[None], at, guess, snap=snap)[0]
             results.append(result)
             at, guess = result.displacement if result.converged else at, None
         return results

@@ -12,9 +12,9 @@ from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import Sampled
 from limber.planning.field.solved import Solved, samples_of, taken
 
-_ROUND = 0.15  # of the samples are added a round
+_ROUND = 0.15  # fraction of the samples added in a round
 _FEWEST = 8
-_APART = 0.5  # of the way between two samples, that no other place of a round lies nearer
+_APART = 0.5  # fraction of the distance between two samples that no other new one may be within
 _SHARE_PLACES = 20
 """Places of one task; must not depend on the number of processes."""
 
@@ -33,15 +33,17 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
         progress((count - begun) / max(most - begun, 1),
                  "adding poses where the field's error is large",
                  error=field.errors["energy_error"], samples=count)
-        places, sources = _where_off(field, min(max(_FEWEST, round(_ROUND * count)), most - count))
-        if not len(places):
+        positions, sources = _where_off(field,
+                                        min(max(_FEWEST, round(_ROUND * count)), most - count))
+        if not len(positions):
             break
-        solved = _solved(grasp_model, places, [sampled.displacements[k] for k in sources], workers)
+        solved = _solved(grasp_model, positions, [sampled.displacements[k] for k in sources],
+                         workers)
         good = [one for one in solved if not one.trouble]
         bad = np.array([one.trouble is not None for one in solved])
-        added = samples_of(good, places[bad]) if good else replace(
+        added = samples_of(good, positions[bad]) if good else replace(
             field.samples.take(np.empty(0, int)), rejected_poses=np.hstack(
-                [places[bad], np.zeros((int(bad.sum()), 3))]))
+                [positions[bad], np.zeros((int(bad.sum()), 3))]))
         field = refit(field, added)
         sampled = replace(sampled, samples=field.samples, displacements=[
             *sampled.displacements, *(one.displacement for one in good)])
@@ -56,31 +58,31 @@ def _where_off(field: EnergyField, count: int) -> tuple[np.ndarray, np.ndarray]:
     flat = chart.map(positions)
     edges = neighbours(flat)
     off = np.where(field.region.is_face(), 0.0, np.abs(field.missed[:, 0]))
-    apart = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
+    distance = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
     middles = chart.curved(flat[edges].mean(axis=1))
     chosen: list[int] = []
-    for k in np.argsort(-off[edges].sum(axis=1) * apart, kind="stable"):
+    for k in np.argsort(-off[edges].sum(axis=1) * distance, kind="stable"):
         if len(chosen) == count or not off[edges[k]].any():
             break
         if not field.region.contains(middles[k])[0]:
             continue
         gaps = np.linalg.norm(middles[chosen] - middles[k], axis=1)
-        if not len(gaps) or gaps.min() > _APART * apart[k]:
+        if not len(gaps) or gaps.min() > _APART * distance[k]:
             chosen.append(int(k))
     nearest = np.linalg.norm(middles[chosen][:, None] - positions[None], axis=2)
     return middles[chosen], nearest.argmin(axis=1) if chosen else np.empty(0, int)
 
 
-def _solved(grasp_model: GraspModel, places: np.ndarray, starts: list[np.ndarray],
+def _solved(grasp_model: GraspModel, positions: np.ndarray, starts: list[np.ndarray],
             workers: int | None) -> list[Solved]:
-    shares = np.array_split(np.arange(len(places)), max(2, -(-len(places) // _SHARE_PLACES)))
-    found = run_tasks(_solve, [(grasp_model, places[k], [starts[n] for n in k])
+    shares = np.array_split(np.arange(len(positions)), max(2, -(-len(positions) // _SHARE_PLACES)))
+    found = run_tasks(_solve, [(grasp_model, positions[k], [starts[n] for n in k])
                               for k in shares if len(k)],
                       workers=workers, message="adding poses where the field's error is large")
     return [one for share in found for one in share]
 
 
-def _solve(grasp_model: GraspModel, places: np.ndarray, starts: list[np.ndarray],
+def _solve(grasp_model: GraspModel, positions: np.ndarray, starts: list[np.ndarray],
            ) -> list[Solved]:
-    return [taken(grasp_model, grasp_model.follow(place[None], start)[0], number)
-            for number, (place, start) in enumerate(zip(places, starts, strict=True))]
+    return [taken(grasp_model, grasp_model.follow(position[None], start)[0], number)
+            for number, (position, start) in enumerate(zip(positions, starts, strict=True))]

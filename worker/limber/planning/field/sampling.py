@@ -26,16 +26,16 @@ from limber.planning.field.solved import Solved, samples_of, taken
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.settings import EnergySettings
 
-_LAYER = 0.06  # share of the shell's radius
-_SPREAD = 2 / 3  # of the samples lie evenly, the others between those that do not agree
-_WALK = 1 / 8  # directions along the shell for each sample that lies evenly
+_LAYER = 0.06  # fraction of the surface's radius
+_SPREAD = 2 / 3  # fraction of the samples that are evenly spaced; others are placed between
+_WALK = 1 / 8  # directions along the surface for each evenly spaced sample
 _FEWEST_DIRECTIONS = 8
-_USUAL = 2048  # poses that say where the field is asked how often
+_USUAL = 2048  # poses that show where the field is evaluated most
 _TAUT = 2.0  # times the median force
 _SHARE_POSES = 30
 """Poses of one tree. The number of trees must not depend on the processes, nor on their results."""
-_SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
-_SAME_PLACE = 1e-9  # of the mesh's size: last digits differ between machines
+_SECOND_TRIES = 3  # other solutions tried as start for a pose that was not reached
+_SAME_PLACE = 1e-9  # fraction of the mesh's size; last digits differ between machines
 _GRASP_INPUT = "grasp nodes"
 TWO_SHAPES = "two shapes"
 """One of the reasons for refusing poses: which of two shapes results depends on the path."""
@@ -197,20 +197,20 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
     solved: list[Solved] = []
 
     def attempt(target: int, source: int) -> Solved:
-        place, begin = targets[target], states[source]
-        guess = guess_of(grasp_model, states, np.array(positions), place)
-        result = grasp_model.follow(place[None], begin.displacement, guess)[0]
+        position, begin = targets[target], states[source]
+        guess = guess_of(grasp_model, states, np.array(positions), position)
+        result = grasp_model.follow(position[None], begin.displacement, guess)[0]
         found = taken(grasp_model, result, int(numbers[target]))
         if not found.trouble:
-            positions.append(place)
+            positions.append(position)
             states.append(found)
         return found
 
     waiting, failed = list(range(len(targets))), []
     while waiting:
         gaps = np.linalg.norm(targets[waiting][:, None] - np.array(positions)[None], axis=2)
-        place, source = np.unravel_index(np.argmin(gaps), gaps.shape)
-        target = waiting.pop(int(place))
+        flat_index, source = np.unravel_index(np.argmin(gaps), gaps.shape)
+        target = waiting.pop(int(flat_index))
         found = attempt(target, int(source))
         if found.trouble:
             failed.append((target, int(source)))
@@ -239,9 +239,9 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
     with SolverPool(grasp_model, workers) as solvers:
         good, bad = solve_branch(solvers, positions, progress=progress)
     if bad:
-        place = ", ".join(f"{x:.3f}" for x in positions[bad[0].target])
+        position = ", ".join(f"{x:.3f}" for x in positions[bad[0].target])
         raise ConvergenceError(
-            f"No acceptable solution ({bad[0].trouble}) with the grasp at ({place}) m.",
+            f"No acceptable solution ({bad[0].trouble}) with the grasp at ({position}) m.",
             "This pose is a sample of the energy field and had a solution before.",
             "Run `limber energy` again with --force.")
     return np.array([one.displacement for one in good[1:]])

@@ -50,29 +50,29 @@ class Solved:
         """Whether they are known; at a snap they are not."""
         return bool(np.isfinite(self.tangents[0, 0, 0]))
 
-    def foretold(self, place: np.ndarray) -> np.ndarray | None:
-        """Return the displacement by the tangents with the grasp at ``place`` [3], if known."""
+    def extrapolated(self, position: np.ndarray) -> np.ndarray | None:
+        """Return the displacement by the tangents with the grasp at ``position`` [3], if known."""
         if not self.has_tangents:
             return None
-        return self.displacement + self.moved(place - self.pose[:3])
+        return self.displacement + self.moved(position - self.pose[:3])
 
-    def moved(self, way: np.ndarray) -> np.ndarray:
-        """Return the tangents' displacement for a ``way`` [3] of the grasp, [node_count, 3]."""
+    def moved(self, step: np.ndarray) -> np.ndarray:
+        """Return the tangents' displacement for a ``step`` [3] of the grasp, [node_count, 3]."""
         # Not by BLAS, whose last digit may differ between processes.
-        return way[0] * self.tangents[0] + way[1] * self.tangents[1] + way[2] * self.tangents[2]
+        return step[0] * self.tangents[0] + step[1] * self.tangents[1] + step[2] * self.tangents[2]
 
 
 def taken(grasp_model: GraspModel, result: StaticResult, target: int = -1) -> Solved:
     """Return the stored state of a solution."""
     moved, at_rest = result.displacement, result is grasp_model.rest
-    strain, place, stress = grasp_model.peak_load(moved)
+    strain, position, stress = grasp_model.peak_load(moved)
     tangents = grasp_model.tangents(moved)
     force = np.zeros(3) if at_rest else result.reaction_force
     return Solved(
         target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
         force, grasp_model.tip(moved),
         float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
-        np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
+        np.zeros(3) if at_rest else result.reaction_torque, strain, position, stress,
         grasp_model.shape_slopes(moved, tangents), grasp_model.axial_force(moved, force), moved,
         tangents.astype(np.float32), isinstance(result, CorrectedResult))
 

@@ -11,7 +11,7 @@ from limber.core.processes.pool_process import Task
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.grasp_model import GraspModel
 
-_held: list[GraspModel] = []  # in a process of a crew
+_held: list[GraspModel] = []  # in a process of the pool
 
 
 class SolverPool:
@@ -24,7 +24,7 @@ class SolverPool:
 
     def __init__(self, grasp_model: GraspModel, workers: int | None = None):
         self.grasp_model = grasp_model
-        self._count = worker_count(core_budget(), wanted=workers)
+        self._count = worker_count(core_budget(), requested=workers)
         self._pool: Pool | None = None
 
     def run(self, function: Callable, tasks: Sequence[tuple], *, progress: Progress = SILENT,

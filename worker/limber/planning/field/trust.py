@@ -15,8 +15,8 @@ from limber.core.errors import WorkError
 from limber.core.numerics.compiled import compiled
 from limber.planning.field.chart import Chart, mapped
 
-_EDGE = 1e-9  # [m] a sample on the hull belongs to it in spite of rounding
-_OUTLINE = 24  # points a side of the grid that tells how far the region reaches
+_EDGE = 1e-9  # [m] a sample on the hull belongs to it despite rounding
+_OUTLINE = 24  # points per side of the grid that outlines the region
 
 
 @dataclass(frozen=True)
@@ -189,8 +189,8 @@ def _surely_refused(centres, halves, accepted, rejected):
             for axis in range(3):
                 along = 0.0
                 for k in range(3):
-                    apart = 2.0 * (rejected[refused, k] - accepted[i, k])
-                    along += apart * halves[axis, k]
+                    normal = 2.0 * (rejected[refused, k] - accepted[i, k])
+                    along += normal * halves[axis, k]
                 ahead -= np.abs(along)
                 middle = 0.5 * (rejected[refused, axis] + accepted[i, axis])
                 ahead += 2.0 * (rejected[refused, axis] - accepted[i, axis]) * (

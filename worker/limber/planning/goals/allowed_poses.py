@@ -8,11 +8,11 @@ from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed
 from limber.planning.field.limited_quantities import limited
 from limber.planning.goals.goal import Goal
 
-_MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
+_MILLIMETRES = 30.0  # times the sampled region's size; a goal is never so far away
 
-_HALVINGS = 20  # of a way into the goal
-_NEARER, _NEAREST = 3, 10  # rounds in which ways are tried about those of the last that are nearest
-_ASIDE, _DEEPER = 0.2, 1.15  # of the distance: how far aside ways go, and behind the border
+_HALVINGS = 20  # halvings of a path into the goal
+_NEARER, _NEAREST = 3, 10  # rounds in which paths near the last round's best are tried
+_ASIDE, _DEEPER = 0.2, 1.15  # of the distance: sideways offset, and depth behind the border
 
 
 class GoalOverLimitsError(NoPathError):
@@ -81,13 +81,13 @@ def _entered(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyFie
 def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
     """Describe which limits none of ``points`` [n, 3] keeps, and by how much."""
     outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
-    told = [f"the {one.words} is at least {one.with_unit(least)}, its limit is "
-            f"{one.with_unit(one.limit)}" for one in limited(field, limits)
-            if (least := float(one.size(points).min())) > one.limit]
+    exceeded = [f"the {one.words} is at least {one.with_unit(least)}, its limit is "
+                f"{one.with_unit(one.limit)}" for one in limited(field, limits)
+                if (least := float(one.size(points).min())) > one.limit]
     if outside.min() > 0.0:
-        told.append(f"the workspace is {outside.min():.3f} m away"
-                    + unit_uncertainty(outside.min(), field))
-    return " and ".join(told) or "every pose breaks at least one of them"
+        exceeded.append(f"the workspace is {outside.min():.3f} m away"
+                        + unit_uncertainty(outside.min(), field))
+    return " and ".join(exceeded) or "every pose breaks at least one of them"
 
 
 @compiled
@@ -103,13 +103,13 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     points = field.region.draw(2000, np.random.default_rng(seed))
     distance = goal.distance(field, points)
     nearest = points[np.argmin(distance)]
-    place = ", ".join(f"{value:.3f}" for value in nearest)
+    position = ", ".join(f"{value:.3f}" for value in nearest)
     return NoPathError(
         f"No sampled pose brings {goal.what} to the goal; the nearest misses it by "
-        f"{distance.min():.3f} m, with the grasp at ({place})"
+        f"{distance.min():.3f} m, with the grasp at ({position})"
         f"{unit_uncertainty(float(distance.min()), field)}.",
         f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
-        f"{_place(field.region.low)} to {_place(field.region.high)}.",
+        f"{_position_text(field.region.low)} to {_position_text(field.region.high)}.",
         "Choose a goal nearer to this region, raise --goal-tolerance, or sample farther (`limber "
         "energy --deflection`).")
 
@@ -122,5 +122,5 @@ def unit_uncertainty(off: float, field: EnergyField) -> str:
     return " (in millimetres? Lengths are in metres)" if off > _MILLIMETRES * size else ""
 
 
-def _place(point: np.ndarray) -> str:
+def _position_text(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.3f}" for value in point) + ")"

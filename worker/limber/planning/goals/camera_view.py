@@ -7,7 +7,7 @@ import numpy as np
 from limber.core.errors import NoPathError
 from limber.planning.goals.regions import Convex
 
-_OWN = 0.003  # [m] of the surface about a target that does not hide it
+_OWN = 0.003  # [m] of surface around a target that does not hide it
 
 
 @dataclass(frozen=True)
@@ -45,29 +45,29 @@ class View(Convex):
         return {"camera_m": self.frame[:3, 3].tolist(), "axis": self.frame[:3, 2].tolist(),
                 "range_m": list(self.range_m)}
 
-    def hidden_by(self, triangles: np.ndarray, place: np.ndarray, slack: float) -> bool:
-        """Return whether a surface is between the camera and ``place`` [3].
+    def hidden_by(self, triangles: np.ndarray, point: np.ndarray, slack: float) -> bool:
+        """Return whether a surface is between the camera and ``point`` [3].
 
         ``triangles`` are [f, 3, 3]; surface within ``slack`` [m] of the position belongs to it.
         Moeller and Trumbore 1997.
         """
         eye = self.frame[:3, 3]
-        way = np.asarray(place, float) - eye
+        ray = np.asarray(point, float) - eye
         first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-        across = np.cross(way, second)
+        across = np.cross(ray, second)
         volume = np.einsum("ij,ij->i", first, across)
         safe = np.where(np.abs(volume) > 1e-30, volume, np.inf)
         to_eye = eye - triangles[:, 0]
         u = np.einsum("ij,ij->i", to_eye, across) / safe
         turned = np.cross(to_eye, first)
-        v = (turned @ way) / safe
+        v = (turned @ ray) / safe
         t = np.einsum("ij,ij->i", second, turned) / safe
         hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-        return bool((hit & (t < 1.0 - slack / np.linalg.norm(way))).any())
+        return bool((hit & (t < 1.0 - slack / np.linalg.norm(ray))).any())
 
-    def require_seen(self, what: str, place: np.ndarray, triangles: np.ndarray) -> None:
+    def require_seen(self, what: str, point: np.ndarray, triangles: np.ndarray) -> None:
         """Raise NoPathError if the branch's surface hides ``what`` at a position."""
-        if self.hidden_by(triangles, place, _OWN):
+        if self.hidden_by(triangles, point, _OWN):
             raise NoPathError(
                 f"At the end of the path the branch hides {what} from the camera.",
                 "The line of sight is checked on the full model at the end of each plan.",

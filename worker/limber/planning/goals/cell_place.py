@@ -22,10 +22,10 @@ from limber.planning.goals.goal import CellPlace, GoalKind, GoalRequest
 from limber.planning.goals.target_goal import TargetGoal, target_of
 from limber.planning.path_on_full_model import SolvedPoses
 
-_DRAWN = 2000  # poses of the field among which those in the region are looked for
-_ASKED = 150  # of these at most, where the target's place alone counts
-_PAIRS, _HALVINGS = 40, 5  # of these and others, between which the border is looked for
-_SOLVED = 16  # states of the branch model at most, where its surface counts as well
+_DRAWN = 2000  # poses of the field searched for those in the region
+_ASKED = 150  # most of these, where only the target's position counts
+_PAIRS, _HALVINGS = 40, 5  # pairs between which the border is searched; halvings
+_SOLVED = 16  # most states of the branch model, where its surface counts as well
 _NOWHERE = np.empty((0, 3))
 
 
@@ -60,11 +60,11 @@ class CellGoal(TargetGoal):
         return super().uncertainty(field, points)
 
     def drawn_in(self, states: SolvedPoses) -> Self:
-        places = states.tips if self.target is None else states.targets[:, self.target]
-        return super().drawn_in(states)._asked(states.poses[:, :3], places, states.displacements)
+        positions = states.tips if self.target is None else states.targets[:, self.target]
+        return super().drawn_in(states)._asked(states.poses[:, :3], positions, states.displacements)
 
     def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
-        self.cell_place.require(self.what, self.place(states),
+        self.cell_place.require(self.what, self.target_position(states),
                                 self._surface(states.displacements[-1]))
 
     def learnt(self, field: EnergyField) -> Self:
@@ -92,12 +92,12 @@ class CellGoal(TargetGoal):
             return self
         chosen = _far_apart(self.refused, _PAIRS)
         wrong = self.refused[chosen]
-        apart = np.linalg.norm(wrong[:, None] - self.taken[None], axis=2)
-        right = self.taken[apart.argmin(axis=1)]
+        distance = np.linalg.norm(wrong[:, None] - self.taken[None], axis=2)
+        right = self.taken[distance.argmin(axis=1)]
         for _ in range(_HALVINGS):
             middle = 0.5 * (wrong + right)
-            places = field.tip(middle, self.target)
-            does = np.array([self._does(place, None) for place in places])[:, None]
+            positions = field.tip(middle, self.target)
+            does = np.array([self._does(position, None) for position in positions])[:, None]
             wrong, right = np.where(does, wrong, middle), np.where(does, middle, right)
         return replace(self, taken=np.concatenate([self.taken, right]),
                        refused=np.concatenate([self.refused, wrong]))
@@ -105,9 +105,9 @@ class CellGoal(TargetGoal):
     def _of_states(self, field: EnergyField) -> Self:
         """Test states of the branch model at samples of the field in the region, far apart."""
         samples = field.samples
-        places = samples.tips if self.target is None or samples.targets is None else (
+        positions = samples.tips if self.target is None or samples.targets is None else (
             samples.targets[:, self.target])
-        inside = np.flatnonzero(self.region.distance(places) <= 0.0)
+        inside = np.flatnonzero(self.region.distance(positions) <= 0.0)
         if not len(inside):
             return self
         chosen = inside[_far_apart(samples.positions[inside], _SOLVED)]
@@ -115,25 +115,25 @@ class CellGoal(TargetGoal):
             good, _ = solve_branch(solvers, samples.positions[chosen])
         states = good[1:]
         which = [chosen[one.target] for one in states]
-        return self._asked(samples.positions[which], places[which],
+        return self._asked(samples.positions[which], positions[which],
                            np.array([one.displacement for one in states]))
 
-    def _asked(self, grasps: np.ndarray, places: np.ndarray, moved: np.ndarray | None) -> Self:
-        """Return the goal with poses [n, 3] added that have the target at ``places`` [n, 3]; the
+    def _asked(self, grasps: np.ndarray, positions: np.ndarray, moved: np.ndarray | None) -> Self:
+        """Return the goal with poses [n, 3] added that have the target at ``positions`` [n, 3]; the
         nodes are displaced by ``moved`` [n, nodes, 3] there.
         """
-        inside = np.flatnonzero(self.region.distance(places) <= 0.0)
-        does = np.array([self._does(places[k], None if moved is None else moved[k])
+        inside = np.flatnonzero(self.region.distance(positions) <= 0.0)
+        does = np.array([self._does(positions[k], None if moved is None else moved[k])
                          for k in inside], bool)
         return replace(self, taken=np.concatenate([self.taken, grasps[inside[does]]]),
                        refused=np.concatenate([self.refused, grasps[inside[~does]]]))
 
-    def _does(self, place: np.ndarray, moved: np.ndarray | None) -> bool:
+    def _does(self, position: np.ndarray, moved: np.ndarray | None) -> bool:
         surface = None
         if self.cell_place.of_surface and moved is not None:
             surface = self._surface(moved)
         try:
-            self.cell_place.require(self.what, place, surface)
+            self.cell_place.require(self.what, position, surface)
         except NoPathError:
             return False
         return True

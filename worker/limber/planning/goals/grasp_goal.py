@@ -51,9 +51,9 @@ class GraspGoal:
         return {}
 
 
-def near(place: np.ndarray, tolerance: float) -> GraspGoal:
-    """Return the goal of a grasp within ``tolerance`` [m] of ``place`` [3]."""
-    x, y, z = map(float, place)
+def near(position: np.ndarray, tolerance: float) -> GraspGoal:
+    """Return the goal of a grasp within ``tolerance`` [m] of ``position`` [3]."""
+    x, y, z = map(float, position)
     return GraspGoal((x, y, z), tolerance)
 
 

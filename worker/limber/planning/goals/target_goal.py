@@ -13,8 +13,8 @@ from limber.planning.goals.goal import GoalKind, GoalRequest
 from limber.planning.goals.regions import Ball, BoxRegion, Region
 from limber.planning.path_on_full_model import SolvedPoses
 
-_SMALL = 0.02  # [m] of a region's depth, up to which targets are drawn in all of it
-_HALVINGS = 12  # of the way into a region
+_SMALL = 0.02  # [m] depth of a region up to which targets are drawn in all of it
+_HALVINGS = 12  # halvings of a path into a region
 
 
 @dataclass(frozen=True)
@@ -70,27 +70,27 @@ class TargetGoal:
         """Return ``points`` [n, 3] moved so that the target approaches places in the region."""
         if not len(points):
             return points
-        wanted = self._entered(field.tip(points, self.target),
-                               self.region.draw(len(points), generator))
+        is_inside = self._entered(field.tip(points, self.target),
+                                  self.region.draw(len(points), generator))
         for _ in range(8):
             outside = self.distance(field, points) > 0.5 * self.tolerance
             steps = _damped_steps(field.tip_gradient(points, self.target),
-                                  wanted - field.tip(points, self.target))
+                                  is_inside - field.tip(points, self.target))
             points = points + np.where(outside[:, None], steps, 0.0)
         return points
 
-    def _entered(self, places: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Return the points [n, 3] on the path from ``places`` to ``wanted`` places in the region
-        that are just inside: in a large region the others are far out of the branch's reach.
+    def _entered(self, positions: np.ndarray, is_inside: np.ndarray) -> np.ndarray:
+        """Return the points [n, 3] on the path from ``positions`` to ``is_inside`` places in the
+        region that are just inside: in a large region the others are far out of the branch's reach.
         """
         inside = 0.25 * self.tolerance if self.tolerance < _SMALL else 0.25 * _SMALL
-        low, high = np.zeros(len(places)), np.ones(len(places))
+        low, high = np.zeros(len(positions)), np.ones(len(positions))
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
             deep = self.region.distance(
-                places + middle[:, None] * (wanted - places)) <= -inside
+                positions + middle[:, None] * (is_inside - positions)) <= -inside
             low, high = np.where(deep, low, middle), np.where(deep, middle, high)
-        return places + high[:, None] * (wanted - places)
+        return positions + high[:, None] * (is_inside - positions)
 
     def centre(self, field: EnergyField) -> np.ndarray:
         points = self.guess(field, 50, np.random.default_rng(0))
@@ -98,14 +98,14 @@ class TargetGoal:
         points = trusted if len(trusted) else points
         return points[np.argmin(self.distance(field, points))]
 
-    def place(self, states: SolvedPoses) -> np.ndarray:
+    def target_position(self, states: SolvedPoses) -> np.ndarray:
         """Return the target's position in the last state [m], shape [3]."""
         return states.tips[-1] if self.target is None else states.targets[-1, self.target]
 
     def missed_by(self, states: SolvedPoses) -> float:
         """Return how far outside the region the target is in the last state [m]; inside: below 0.
         """
-        return float(self.region.distance(self.place(states)[None])[0])
+        return float(self.region.distance(self.target_position(states)[None])[0])
 
     def drawn_in(self, states: SolvedPoses) -> Self:
         """Return the goal moved inwards by the last state's distance from it, at most half."""
@@ -121,7 +121,7 @@ class TargetGoal:
                 "region": self.region.describe()}
 
     def describe_end(self, states: SolvedPoses) -> dict:
-        return {"target_end_m": self.place(states)}
+        return {"target_end_m": self.target_position(states)}
 
 
 def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
@@ -147,8 +147,8 @@ def target_of(asked: GoalRequest) -> tuple[int | None, str]:
     return names.index(name), name
 
 
-def _in_ball(asked: GoalRequest, place: tuple[float, float, float]) -> TargetGoal:
-    return TargetGoal(Ball(place, asked.settings.goal_tolerance), *target_of(asked))
+def _in_ball(asked: GoalRequest, centre: tuple[float, float, float]) -> TargetGoal:
+    return TargetGoal(Ball(centre, asked.settings.goal_tolerance), *target_of(asked))
 
 
 def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> TargetGoal:

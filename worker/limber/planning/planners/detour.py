@@ -26,16 +26,16 @@ from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.refine import refine
 
-_LIGHT = 1e-2  # of the weight of a metre that was given: the energy alone counts, nearly
-_HEAVY = 1e3  # likewise: the length alone counts
-_SHORTER = (0.99, 0.97)  # of the length allowed: for the slope of the energy over it
-_BINDS = 0.998  # of the length allowed: a longer path is held back by it
-_ENOUGH = 0.03  # gap of the energy below which no finer grid is worth its time
-_UNUSED = 0.004  # of the energy, that the weight of a length left over may cost the bound
-_FINEST_GAP = 1e-3  # of the weighed cost, that is asked for
+_LIGHT = 1e-2  # fraction of the given weight of a metre: energy alone counts, nearly
+_HEAVY = 1e3  # the same: length alone counts
+_SHORTER = (0.99, 0.97)  # fractions of the allowed length, for the slope of energy over length
+_BINDS = 0.998  # fraction of the allowed length above which the length binds
+_ENOUGH = 0.03  # gap of the energy below which a finer grid is not worth its time
+_UNUSED = 0.004  # fraction of the energy that the weight of an unused length may cost the bound
+_FINEST_GAP = 1e-3  # gap of the weighted cost that is asked for
 _MOST_BOUNDS = 3
 _STRIDE = 2.5
-_SPACING = 0.001  # [m] at which a path's integral is taken
+_SPACING = 0.001  # [m] spacing of a path's integral
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Search:
         self.problem, self.longest = problem, longest
         self.path, self.shortest = shortest, shortest
         self.length, self.integral = _measured(shortest, problem)
-        self.slope = 0.0  # [J] what a metre more saves
+        self.slope = 0.0  # [J] saved by one more metre
         self.curve: list[TradePoint] = []
         self.best: GentlePath | None = None
         self.best_weight, self.value = np.nan, -np.inf
@@ -162,8 +162,8 @@ class _Search:
         energy, metre = self.problem.weights.energy, weight * self._metre
         asked = replace(_weighed(self.problem, weight), longest=self.longest)
         # The requested gap is the energy's, which is a part of the weighted cost.
-        wanted = self.integral / (1.0 + _ENOUGH) + metre * self.longest
-        enough = max((self.integral + metre * self.length) / wanted - 1.0, _FINEST_GAP)
+        least_cost = self.integral / (1.0 + _ENOUGH) + metre * self.longest
+        enough = max((self.integral + metre * self.length) / least_cost - 1.0, _FINEST_GAP)
         found = plan_gentle(asked, [self.path], enough=enough, progress=progress)
         self._take(found.points)
         length, integral = _measured(found.points, self.problem)

@@ -18,12 +18,12 @@ from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.limited_quantities import limited
 from limber.planning.goals.goal import Goal
 
-_ALONG, _ACROSS = 64, 48  # points of the grid along the shell, each way, and off it
-_FINE = 0.001  # [m] between points of the way
-_HALVINGS = 24  # of the least excess
+_ALONG, _ACROSS = 64, 48  # grid points along the surface in each direction, and across it
+_FINE = 0.001  # [m] between points of the path
+_HALVINGS = 24  # halvings of the smallest excess
 _NEAR = np.ones((3, 3, 3))
-_REFUSED = 10.0  # of its limit, as which a pose near one counts that the branch model refused
-_DEARER = 30.0  # times the length counts where a pose is as much over its limit as the limit is
+_REFUSED = 10.0  # multiple of its limit that counts near a refused pose
+_DEARER = 30.0  # weight of the length at a pose twice over its limit
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,12 @@ class EasiestWay:
     worst: float
 
 
-def easiest_way(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal: Goal,
-                ) -> EasiestWay | None:
+def easiest_path(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal: Goal,
+                 ) -> EasiestWay | None:
     """Return the path from ``start`` [3]; None if none stays among the samples, limits or not."""
-    chart, places = _grid(field)
-    shape = places.shape[:3]
-    points = chart.curved(places.reshape(-1, 3))
+    chart, points_of_grid = _grid(field)
+    shape = points_of_grid.shape[:3]
+    points = chart.curved(points_of_grid.reshape(-1, 3))
     shares = _shares(field, limits, points).reshape(shape)
     known = np.isfinite(shares)
     if not known.any():
@@ -49,16 +49,16 @@ def easiest_way(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal
     away = np.full(shape, np.inf)
     away[known] = goal.distance(field, points[known.ravel()])
     ends = away <= max(goal.tolerance, float(away.min()))
-    apart = np.linalg.norm(points - start, axis=1).reshape(shape)
-    begin = np.unravel_index(int(np.where(known, apart, np.inf).argmin()), shape)
+    distance = np.linalg.norm(points - start, axis=1).reshape(shape)
+    begin = np.unravel_index(int(np.where(known, distance, np.inf).argmin()), shape)
     level = _least_level(shares, begin, ends)
     if level is None:
         return None
-    numbers = _shortest(shares, places, level, begin, ends)
+    numbers = _shortest(shares, points_of_grid, level, begin, ends)
     # Along the shell: chords are well off it.
     flat = np.concatenate([chart.map(start), chart.map(points[numbers])])
-    way = chart.curved(resample(flat, _FINE))
-    return EasiestWay(way, float(max(_shares(field, limits, way).max(), 0.0)))
+    path = chart.curved(resample(flat, _FINE))
+    return EasiestWay(path, float(max(_shares(field, limits, path).max(), 0.0)))
 
 
 def _grid(field: EnergyField) -> tuple:
@@ -106,34 +106,34 @@ def _least_level(shares: np.ndarray, begin: tuple, ends: np.ndarray) -> float | 
     return high
 
 
-def _shortest(shares: np.ndarray, places: np.ndarray, level: float, begin: tuple,
+def _shortest(shares: np.ndarray, points: np.ndarray, level: float, begin: tuple,
               ends: np.ndarray) -> np.ndarray:
     """Return the numbers of the places on the shortest path that exceeds no ``level``; the part
     over its limit counts as longer.
     """
-    open_places = np.flatnonzero(shares.ravel() <= level)
+    open_cells = np.flatnonzero(shares.ravel() <= level)
     number = np.full(shares.size, -1)
-    number[open_places] = np.arange(len(open_places))
+    number[open_cells] = np.arange(len(open_cells))
     number = number.reshape(shares.shape)
     dear = 1.0 + _DEARER * np.maximum(shares - 1.0, 0.0)
     rows, columns, lengths = [], [], []
     for step in [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)
                  if (i, j, k) > (0, 0, 0)]:
-        here = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shares.shape,
-                                                                      strict=True))
-        there = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, shares.shape,
-                                                                       strict=True))
-        both = (number[here] >= 0) & (number[there] >= 0)
-        rows.append(number[here][both])
-        columns.append(number[there][both])
-        apart = np.linalg.norm(places[here][both] - places[there][both], axis=1)
-        lengths.append(apart * np.maximum(dear[here][both], dear[there][both]))
+        unshifted = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shares.shape,
+                                                                           strict=True))
+        shifted = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, shares.shape,
+                                                                         strict=True))
+        both = (number[unshifted] >= 0) & (number[shifted] >= 0)
+        rows.append(number[unshifted][both])
+        columns.append(number[shifted][both])
+        distance = np.linalg.norm(points[unshifted][both] - points[shifted][both], axis=1)
+        lengths.append(distance * np.maximum(dear[unshifted][both], dear[shifted][both]))
     graph = coo_matrix((np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))),
-                       shape=(len(open_places),) * 2).tocsr()
+                       shape=(len(open_cells),) * 2).tocsr()
     away, before = dijkstra(graph, directed=False, indices=number[begin], return_predecessors=True)
     reached = number[ends & (number >= 0)]
     at = int(reached[np.argmin(away[reached])])
-    way = [at]
-    while before[way[-1]] >= 0:
-        way.append(int(before[way[-1]]))
-    return open_places[way[::-1]]
+    path = [at]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return open_cells[path[::-1]]

@@ -15,12 +15,12 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
-from limber.planning.path_problem import GentleProblem, NoWayError, no_way, not_found
-from limber.planning.planners.easiest import easiest_way
+from limber.planning.path_problem import GentleProblem, NoWayError, no_path_error, not_found
+from limber.planning.planners.easiest import easiest_path
 from limber.planning.planners.refine import refine
 
-_GAIN = 1e-3  # of the cost, that refining a path once more has to bring
-_SAME_WAY = 0.05  # of a path's length: another way round a ridge is farther off
+_GAIN = 1e-3  # relative gain of cost that another refinement must bring
+_SAME_WAY = 0.05  # fraction of a path's length; another path around a ridge is farther away
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
         before, along = best[1], rough is not None and best[0] is not None and _is_along(
             rough, best[0])
         if along and in_vain:
-            return before  # it leads to the same optimum again
+            return before  # leads to the same optimum
         if found_from(starts):
             if along and best[1] > (1.0 - _GAIN) * before:
                 in_vain.append(True)
@@ -70,8 +70,8 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
             raise not_found(problem, f"The question is undecided on {_grid(verdicts[0])}.")
         verdicts.append(judge(problem))
         # A path that keeps the limits is a better proof than cells that separate.
-        way = verdicts[0].way
-        known = (way is not None and found_from([way])) or found_from(_easiest(problem))
+        path = verdicts[0].path
+        known = (path is not None and found_from([path])) or found_from(_easiest(problem))
         if not known and verdicts[0].proven:
             raise separated(problem, verdicts[0])
         return best[1]
@@ -82,8 +82,9 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
 
 def separated(problem: GentleProblem, verdict: Verdict) -> NoWayError:
     """Return the error for a goal that cells separate from the start."""
-    return no_way(problem, f"This is proven on {_grid(verdict)}: forbidden cells separate the "
-                  "start from the goal.").behind(verdict.wall, verdict.nearest)
+    return no_path_error(problem,
+                         f"This is proven on {_grid(verdict)}: forbidden cells separate the "
+                         "start from the goal.").behind(verdict.wall, verdict.nearest)
 
 
 def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:
@@ -95,8 +96,8 @@ def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:
 
 
 def _easiest(problem: GentleProblem) -> list[np.ndarray]:
-    way = easiest_way(problem.energy_field, problem.limits, problem.start, problem.goal)
-    return [] if way is None else [way.points]
+    path = easiest_path(problem.energy_field, problem.limits, problem.start, problem.goal)
+    return [] if path is None else [path.points]
 
 
 def _grid(verdict: Verdict) -> str:

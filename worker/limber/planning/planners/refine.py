@@ -24,22 +24,22 @@ from limber.planning.field.trust import nearest_of
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.smoothing import smooth_cost
 
-_EDGES = 48  # of the polyline while it is moved; limits are asked half-way as well
-_FINE = 0.001  # [m] between points of what is returned: chords in space leave a valley
-_STRETCH = 4.0  # off the shell, where there is one
+_EDGES = 48  # edges of the polyline while it is optimised; limits are evaluated half-way too
+_FINE = 0.001  # [m] between returned points: chords in space leave the low-energy surface
+_STRETCH = 4.0  # off the surface, where there is one
 _ROUNDS = 12
-_ITERATIONS = 80  # a round
-_WEIGHTS = (1e3, 1.0)  # of squared excesses at first: of place and length, and of loads
-_HOPELESS = 1e5  # times heavier: limits that are not kept then will not be
-_FAR = 10.0  # relative excess that outweighs any cost: heavier weights then change nothing
-_HEAVIER = 5.0  # from a round to the next where limits are not kept much better than before
+_ITERATIONS = 80  # in a round
+_WEIGHTS = (1e3, 1.0)  # of squared excesses at first: of position and length, and of loads
+_HOPELESS = 1e5  # factor on the weights above which violated limits stay violated
+_FAR = 10.0  # relative excess above which heavier weights change nothing
+_HEAVIER = 5.0  # from round to round, where limits are not kept much better than before
 _BETTER = 0.25
 _SETTLED = 3e-4  # change of the cost in a round, relative
-_MARGINS = (2e-5, 3e-4, 2e-3)  # [m] kept from the limits; the next where the last was not enough
-_FIRST_STEP = 0.1  # of an edge: so far the minimiser goes before it knows the curvature
-_FLAT = 1e-8  # slope to those units, of a cost of about 1
-_INSIDE = 1e-3  # of the goal's tolerance, that an end lies inside
-_STEP = 1e-5  # [m] of the two differences that are not worth a formula
+_MARGINS = (2e-5, 3e-4, 2e-3)  # [m] distance kept from the limits; the next if one was not enough
+_FIRST_STEP = 0.1  # fraction of an edge: the first step, without known curvature
+_FLAT = 1e-8  # slope in those units, for a cost of about 1
+_INSIDE = 1e-3  # fraction of the goal's tolerance by which an end lies inside
+_STEP = 1e-5  # [m] of the two finite differences
 
 
 def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]:

@@ -9,7 +9,7 @@ from limber.core.progress import Progress
 from limber.planning.cost import edge_cost
 from limber.planning.planners.tree_search import PathProblem, Search, Searched, SearchTree
 
-_CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
+_CHUNK = 250  # iterations between progress reports, at which it can be cancelled
 
 
 class OwnRrtStar:
@@ -82,8 +82,8 @@ def _grow(samples, count, nodes, cost, parent, first_child, next_sibling, reach,
         new = nodes[nearest] + (samples[s] - nodes[nearest]) * step
         _distances(new, nodes, count, distance)
         # k = e (1 + 1/d) log n keeps RRT* asymptotically optimal (Karaman and Frazzoli, 2011).
-        wanted = int(np.ceil(np.e * (1.0 + 1.0 / dimension) * np.log(count + 1.0)))
-        near = _smallest(distance, count, wanted)
+        neighbour_count = int(np.ceil(np.e * (1.0 + 1.0 / dimension) * np.log(count + 1.0)))
+        near = _smallest(distance, count, neighbour_count)
         edges = np.empty(len(near))
         best, best_cost, best_slot = -1, np.inf, -1
         for i in range(len(near)):
@@ -91,7 +91,7 @@ def _grow(samples, count, nodes, cost, parent, first_child, next_sibling, reach,
             edges[i] = np.inf
             length = np.sqrt(distance[j])
             if length > reach or cost[j] + weights.length * length >= best_cost:
-                continue  # cannot be the parent: the length alone costs too much
+                continue  # cannot be the parent: its length alone costs too much
             edges[i] = edge_cost(nodes[j], new, field, weights)
             if cost[j] + edges[i] < best_cost:
                 best, best_cost, best_slot = j, cost[j] + edges[i], i
@@ -131,21 +131,21 @@ def _distances(point, nodes, count, distance):
 
 
 @compiled
-def _smallest(distance, count, wanted):
-    """Return the indices of the ``wanted`` smallest of ``distance[:count]``, in ascending order."""
-    wanted = min(wanted, count)
-    kept = np.empty(wanted, np.int64)
+def _smallest(distance, count, most):
+    """Return the indices of the ``most`` smallest of ``distance[:count]``, in ascending order."""
+    most = min(most, count)
+    kept = np.empty(most, np.int64)
     size = 0
     for i in range(count):
-        if size == wanted and distance[i] >= distance[kept[size - 1]]:
+        if size == most and distance[i] >= distance[kept[size - 1]]:
             continue
-        place = size if size < wanted else wanted - 1
-        while place > 0 and distance[kept[place - 1]] > distance[i]:
-            if place < wanted:
-                kept[place] = kept[place - 1]
-            place -= 1
-        kept[place] = i
-        size = min(size + 1, wanted)
+        slot = size if size < most else most - 1
+        while slot > 0 and distance[kept[slot - 1]] > distance[i]:
+            if slot < most:
+                kept[slot] = kept[slot - 1]
+            slot -= 1
+        kept[slot] = i
+        size = min(size + 1, most)
     return kept
 
 

@@ -10,7 +10,7 @@ import scipy
 from limber.planning.cost import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 
-_POLISH_POINTS = 40  # corners of the path while it is polished
+_POLISH_POINTS = 40  # corners of the path while it is smoothed
 _MIN_GAP = 1e-9  # [m] keeps the length's gradient finite where two corners meet
 
 

@@ -75,9 +75,9 @@ class SearchTree:
                 break
             depth[below] = depth[parents[below]] + 1
         order = np.argsort(depth, kind="stable")[int((depth < 0).sum()):]
-        place = np.full(len(nodes), -1)
-        place[order] = np.arange(len(order))
-        return cls(nodes[order], np.where(depth[order] > 0, place[parents[order]], -1))
+        index = np.full(len(nodes), -1)
+        index[order] = np.arange(len(order))
+        return cls(nodes[order], np.where(depth[order] > 0, index[parents[order]], -1))
 
     def pruned(self, most: int) -> "SearchTree":
         """Return at most ``most`` of its nodes: those with the most descendants.

@@ -25,7 +25,7 @@ BRANCH_FRAME = "branch"
 MOST_MARKERS = 60
 """Most points of a cloud that counts as tracked markers, if all clouds have the same number."""
 
-_LONGEST_GAP = 0.1  # s between wrenches, or three of their steps, over which nothing is known
+_LONGEST_GAP = 0.1  # [s] between wrenches, or three of their steps, beyond which nothing is known
 _GRIPPERS = ("grasp", "gripper", "tcp", "tool", "tool0", "flange", "ee_link", "hand")
 
 JointPoses = Callable[[tuple[str, ...], np.ndarray], np.ndarray]
@@ -91,10 +91,10 @@ def _chosen(bag: Bag, kind: str, named: str | None, option: str, why: str) -> To
         return topics[0]
     known = ", ".join(topic.name for topic in bag.of(kind)) or "none"
     if not topics:
-        there = ", ".join((*(topic.name for every in bag.kinds.values() for topic in every),
-                           *bag.others)) or "no messages"
+        present = ", ".join((*(topic.name for every in bag.kinds.values() for topic in every),
+                             *bag.others)) or "no messages"
         missing = f"no {kind}" if named is None else f"no {kind} on {named}"
-        raise InputError(f"{bag.path} has {missing}.", f"{why} Its topics: {there[:400]}.",
+        raise InputError(f"{bag.path} has {missing}.", f"{why} Its topics: {present[:400]}.",
                          f"Name a topic with {option} (known: {known}).")
     raise InputError(f"{bag.path} has {len(topics)} {kind} topics: {known}.",
                      "A pull uses one gripper and one topic of each kind.",
@@ -123,12 +123,12 @@ def _by_frames(bag: Bag, frames: Frames, name: str | None, clock: str, warnings:
                ) -> tuple[np.ndarray, np.ndarray, str] | None:
     """The gripper from the tree of frames, if it moves there."""
     moving = [topic for topic in bag.of("transform") if len(topic.stamps) > 2]
-    wanted = [frame for frame in frames.names
+    chosen = [frame for frame in frames.names
               if (frame == name if name else frame.lower() in _GRIPPERS)]
-    if not moving or not wanted:
+    if not moving or not chosen:
         return None
     # Of a chain flange, tool0, gripper, the last in our list is the gripper.
-    frame = min(wanted, key=lambda frame: name is None and _GRIPPERS.index(frame.lower()))
+    frame = min(chosen, key=lambda frame: name is None and _GRIPPERS.index(frame.lower()))
     longest = max(moving, key=lambda topic: len(topic.stamps))
     root = _root(bag, frame)
     times = np.unique(getattr(longest, clock))
@@ -300,13 +300,13 @@ def _write_clouds(topic: Topic, times: np.ndarray, where: tuple[np.ndarray, Rota
                   folder: Path, settings: ImportSettings, progress: Progress) -> None:
     counts = topic.counts
     ends = np.cumsum(counts) if counts is not None else np.empty(0, int)
-    with tempfile.TemporaryDirectory(prefix="limber-bag-") as place:
+    with tempfile.TemporaryDirectory(prefix="limber-bag-") as scratch:
         for number, time in enumerate(times):
             points = topic.values[number] if counts is None else topic.values[
                 ends[number] - counts[number]:ends[number]]
             points = where[0] + where[1].apply(points[np.isfinite(points).all(axis=1)])
-            write_frame(Path(place, f"{time:.6f}.ply"), points)
-        copy_clouds(Path(place), folder, settings.model_copy(update={"unit": "m"}), progress)
+            write_frame(Path(scratch, f"{time:.6f}.ply"), points)
+        copy_clouds(Path(scratch), folder, settings.model_copy(update={"unit": "m"}), progress)
 
 
 def _write_images(bag: Bag, topic: Topic, times: np.ndarray, base: str,
@@ -325,15 +325,15 @@ def _write_images(bag: Bag, topic: Topic, times: np.ndarray, base: str,
     position, turn = _frame_of(topic, base, placed, frames, warnings)
     camera = Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, depth_scale=1000.0,
                     pose=(*map(float, position), *map(float, turn.as_rotvec())))
-    with tempfile.TemporaryDirectory(prefix="limber-bag-") as place:
-        Path(place, "depth").mkdir()
-        write_camera(Path(place, "camera.toml"), camera)
+    with tempfile.TemporaryDirectory(prefix="limber-bag-") as scratch:
+        Path(scratch, "depth").mkdir()
+        write_camera(Path(scratch, "camera.toml"), camera)
         for image, time in zip(topic.values, times, strict=True):
             # By ROS' convention (REP 118) 16 bits are millimetres, floats metres.
             depth = image if image.dtype.kind == "u" else np.clip(
                 np.nan_to_num(image) * 1000.0, 0, 65535).round().astype(np.uint16)
-            Image.fromarray(depth).save(Path(place, "depth", f"{time:.6f}.png"))
-        warnings += copy_rgbd(Path(place), folder, settings, progress)
+            Image.fromarray(depth).save(Path(scratch, "depth", f"{time:.6f}.png"))
+        warnings += copy_rgbd(Path(scratch), folder, settings, progress)
 
 
 def _six(positions: np.ndarray, turns: Rotation) -> np.ndarray:

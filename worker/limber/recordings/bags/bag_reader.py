@@ -130,17 +130,17 @@ def bag_arrays(path: Path) -> dict[str, np.ndarray]:
     others: list[str] = []
     read = broken = 0
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        wanted = []
+        connections = []
         for connection in reader.connections:
             if connection.msgtype in _READERS:
-                wanted.append(connection)
+                connections.append(connection)
             else:
                 others.append(f"{connection.topic} ({connection.msgtype})")
-        for connection, logged, raw in reader.messages(connections=wanted):
+        for connection, logged, raw in reader.messages(connections=connections):
             try:
                 message = reader.deserialize(raw, connection.msgtype)
                 entries = _READERS[connection.msgtype](message)
-            except Exception:  # the decoder raises what it stumbles over; counted and told
+            except Exception:  # the decoder raises any error; it is counted and reported
                 broken += 1
                 continue
             read += 1

@@ -65,11 +65,11 @@ class Frames:
     def between(self, frame: str, within: str, times: np.ndarray,
                 ) -> tuple[np.ndarray, Rotation] | None:
         """Return position [n, 3] and rotation of ``frame`` in ``within``; None if unknown."""
-        way = self._way(within.lstrip("/"), frame.lstrip("/"))
-        if way is None:
+        chain = self._transform_chain(within.lstrip("/"), frame.lstrip("/"))
+        if chain is None:
             return None
         position, turn = np.zeros((len(times), 3)), Rotation.identity(len(times))
-        for motion, is_inverse in way:
+        for motion, is_inverse in chain:
             step, turned = motion.at(times)
             if is_inverse:
                 turned = turned.inv()
@@ -77,12 +77,12 @@ class Frames:
             position, turn = position + turn.apply(step), turn * turned
         return position, turn
 
-    def _way(self, start: str, end: str) -> list[tuple[Motion, bool]] | None:
+    def _transform_chain(self, start: str, end: str) -> list[tuple[Motion, bool]] | None:
         if start == end:
             return []
         reached: dict[str, list[tuple[Motion, bool]]] = {start: []}
         for _ in range(_MOST_LINKS):
-            grown = {other: [*way, link] for name, way in reached.items()
+            grown = {other: [*chain, link] for name, chain in reached.items()
                      for other, link in self._links.get(name, {}).items() if other not in reached}
             if not grown:
                 return None

@@ -29,28 +29,28 @@ def read_bag_pull(path: Path, request: ImportRequest) -> Pull:
     bag, robot, asked = read_bag(path), request.robot, request
     found = pull_of_bag(bag, request.folder, request.settings,
                         None if robot is None else robot.joint_poses, request.progress)
-    told, warnings = _told_by_limber(bag)
+    recorded, warnings = _recorded_by_limber(bag)
     poses, wrenches = found.robot.values[:, :6], found.robot.values[:, 6:]
     if request.settings.torque_sigma is None:
         request = replace(request, settings=request.settings.model_copy(update={
             "torque_sigma": _torque_noise(wrenches[:, 3:])}))
-    seen, rest = (None, None) if found.seen is None else _markers(found.seen, told, request)
+    seen, rest = (None, None) if found.seen is None else _markers(found.seen, recorded, request)
     settings = request.settings
     entry = request.entry(found.observation, rest, drive=settings.drive, mode=settings.grasp_mode,
                           grasp=request.grasp_or(lambda: poses[0]),
                           sigma=settings.position_sigma or 1e-3)
-    if told is not None:
-        entry = _as_told(entry, told, request)
+    if recorded is not None:
+        entry = _with_recorded(entry, recorded, request)
     require_on_branch(entry.grasp, request.name, request.branch.nodes)
     return of_known_robot(Pull(request.name, entry, found.robot.times, poses, wrenches, seen,
                                (*found.warnings, *warnings)), asked)
 
 
-def _markers(seen: Observations, told: PullEntry | None, request: ImportRequest,
+def _markers(seen: Observations, recorded: PullEntry | None, request: ImportRequest,
              ) -> tuple[Observations, np.ndarray]:
     """Markers with a known rest position, and those positions [m], shape [m, 3]."""
     placed = request.registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)])
-    at_rest = None if told is None or placed else told.rest_points_m
+    at_rest = None if recorded is None or placed else recorded.rest_points_m
     known = at_rest is not None and len(at_rest) == seen.point_count
     used = placed.used if placed else np.flatnonzero(seen.visible[0] | known)
     if not len(used):
@@ -65,7 +65,7 @@ def _markers(seen: Observations, told: PullEntry | None, request: ImportRequest,
     return seen, rest
 
 
-def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
+def _recorded_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
     """The description that `limber export-pull` wrote beside the messages, and its faults.
     """
     if not bag.pull_toml:
@@ -76,29 +76,30 @@ def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
         return None, (f"{error} Default values are used for grasp, noise and calibration.",)
 
 
-def _as_told(entry: PullEntry, told: PullEntry, request: ImportRequest) -> PullEntry:
+def _with_recorded(entry: PullEntry, recorded: PullEntry, request: ImportRequest) -> PullEntry:
     """The entry of a bag that Limber wrote; the import's settings take precedence."""
-    given = request.given
+    requested = request.stated
     kept: dict[str, Any] = {
-        "calibration": told.calibration, "weightless": told.weightless, "truth": told.truth,
-        "source": f"{entry.source} ({told.source})" if told.source else entry.source}
-    if "own_weight" not in given:
-        kept["gravity_m_s2"] = told.gravity_m_s2
-    kept |= {name: getattr(told, name) for name in ("drive", "motion") if name not in given}
-    grasp: dict[str, Any] = {"mode": told.grasp.mode} if "grasp_mode" not in given else {}
-    if "grasp_radius" not in given:
-        grasp["radius_m"] = told.grasp.radius_m
-    if not given & {"grasp_point", "frame_pose", "cell"}:
-        grasp["point_m"] = told.grasp.point_m
-    sensor: dict[str, float | None] = {} if "position_sigma" in given else {
-        "position_sigma_m": told.sensor.position_sigma_m}
-    if "force_sigma" not in given:
-        sensor["force_sigma_n"] = told.sensor.force_sigma_n
-    if "torque_sigma" not in given:
-        sensor["torque_sigma_nm"] = told.sensor.torque_sigma_nm
+        "calibration": recorded.calibration, "weightless": recorded.weightless,
+        "truth": recorded.truth,
+        "source": f"{entry.source} ({recorded.source})" if recorded.source else entry.source}
+    if "own_weight" not in requested:
+        kept["gravity_m_s2"] = recorded.gravity_m_s2
+    kept |= {name: getattr(recorded, name) for name in ("drive", "motion") if name not in requested}
+    grasp: dict[str, Any] = {"mode": recorded.grasp.mode} if "grasp_mode" not in requested else {}
+    if "grasp_radius" not in requested:
+        grasp["radius_m"] = recorded.grasp.radius_m
+    if not requested & {"grasp_point", "frame_pose", "cell"}:
+        grasp["point_m"] = recorded.grasp.point_m
+    sensor: dict[str, float | None] = {} if "position_sigma" in requested else {
+        "position_sigma_m": recorded.sensor.position_sigma_m}
+    if "force_sigma" not in requested:
+        sensor["force_sigma_n"] = recorded.sensor.force_sigma_n
+    if "torque_sigma" not in requested:
+        sensor["torque_sigma_nm"] = recorded.sensor.torque_sigma_nm
     return entry.model_copy(update=kept | {
         "grasp": entry.grasp.model_copy(update=grasp),
-        "sensor": told.sensor.model_copy(update={
+        "sensor": recorded.sensor.model_copy(update={
             "position_sigma_m": entry.sensor.position_sigma_m,
             "force_sigma_n": entry.sensor.force_sigma_n,
             "torque_sigma_nm": entry.sensor.torque_sigma_nm} | sensor)})

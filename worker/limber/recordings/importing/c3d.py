@@ -17,9 +17,9 @@ def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
     import ezc3d
 
     data = ezc3d.c3d(str(path))
-    told = data["parameters"]["POINT"]
-    labels = [str(label) for label in told["LABELS"]["value"]]
-    unit = (told.get("UNITS", {}).get("value") or ["mm"])[0].strip()
+    parameters = data["parameters"]["POINT"]
+    labels = [str(label) for label in parameters["LABELS"]["value"]]
+    unit = (parameters.get("UNITS", {}).get("value") or ["mm"])[0].strip()
     return {"points": np.asarray(data["data"]["points"][:3], float),
             "rate": np.array(float(data["header"]["points"]["frame_rate"])),
             "unit": np.array(unit), "labels": np.array(labels, "U64")}

@@ -74,7 +74,7 @@ class ImportRequest:
     progress: Progress = SILENT
 
     @property
-    def given(self) -> set[str]:
+    def stated(self) -> set[str]:
         """Names of the settings that differ from their defaults."""
         return {name for name, field in ImportSettings.model_fields.items()
                 if getattr(self.settings, name) != field.default}
@@ -145,9 +145,9 @@ def require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) ->
         return
     off = float(np.linalg.norm(nodes - np.array(grasp.point_m), axis=1).min())
     if off > 2 * grasp.radius_m + 5e-3:
-        place = ", ".join(f"{value:.4g}" for value in grasp.point_m)
+        point = ", ".join(f"{value:.4g}" for value in grasp.point_m)
         raise InputError(
-            f"{name}: the grasp point ({place}) m is {off * 1e3:.0f} mm away from the branch.",
+            f"{name}: the grasp point ({point}) m is {off * 1e3:.0f} mm away from the branch.",
             "The gripper would not hold the branch. The point, or the whole recording, has "
             "another frame of reference or unit.",
             "Give a --grasp-point on the branch, in the frame set by --coordinates, and check "
@@ -190,7 +190,7 @@ def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
             "[calibration] in --pull-toml.")
     sensor = pull.entry.sensor.model_copy(update={
         "force_range_n": robot.noise.force_range_n,
-        **({} if "force_sigma" in request.given else {
+        **({} if "force_sigma" in request.stated else {
             "force_sigma_n": robot.noise.force_sigma_n}),
         **({} if settings.torque_sigma is not None or pull.entry.sensor.torque_sigma_nm is None
            else {"torque_sigma_nm": robot.noise.torque_sigma_nm})})

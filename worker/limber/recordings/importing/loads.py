@@ -145,9 +145,9 @@ def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.
                                     Observations(times, found.positions)))
 
 
-def _nearest(nodes: np.ndarray, place: np.ndarray) -> np.ndarray:
+def _nearest(nodes: np.ndarray, point: np.ndarray) -> np.ndarray:
     """The node nearest to a position [m]."""
-    return nodes[np.linalg.norm(nodes - place, axis=1).argmin()]
+    return nodes[np.linalg.norm(nodes - point, axis=1).argmin()]
 
 
 def _farthest(moved: np.ndarray) -> int:

@@ -67,7 +67,7 @@ def _titled(rows: list[list[str]], at: int) -> list[str] | None:
     types = _filled(next((row for row in rows[:at] if "type" in (_letters(row[0]),
                                                                _letters(row[1]))), []), columns)
     present = {kind.lower() for kind in types.values()}
-    wanted = next((kind for kind in _TYPES if kind in present), None)
+    chosen = next((kind for kind in _TYPES if kind in present), None)
     units = rows[at + 1] if at + 1 < len(rows) else []
     titles = []
     for k, axis in enumerate(axes):
@@ -75,7 +75,7 @@ def _titled(rows: list[list[str]], at: int) -> list[str] | None:
             own = rows[at][k] or (named[k] if k < min(columns) else "")
             titles.append(own or f"column {k + 1}")
         elif kinds.get(k, "position").lower() != "position" or (
-                wanted is not None and types.get(k, "").lower() != wanted):
+                chosen is not None and types.get(k, "").lower() != chosen):
             titles.append(f"{labels.get(k, '')} {axis} of {types.get(k, '')} {kinds.get(k, '')} "
                           "rotation, not used")
         else:

@@ -28,7 +28,7 @@ _STAMP = re.compile(
     r"\s*(?P<half>[AaPp][Mm])?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?")
 _DAY = 86400.0
 _LATEST, _EARLIEST = 4e9, 1e9  # [s] since 1970: 2001 to 2096
-_FASTEST, _SLOWEST = 2e-4, 0.2  # [s] between samples that are taken for granted without a unit
+_FASTEST, _SLOWEST = 2e-4, 0.2  # [s] between samples that are assumed without a unit
 _LEAST = 5
 """Fewest stamps from which a clock can be recognised."""
 

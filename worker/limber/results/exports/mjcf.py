@@ -41,8 +41,8 @@ def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
     for link in range(tree.count):
         parent = int(tree.parent[link])
         holder = world if parent < 0 else bodies[parent]
-        place = tree.joint[link] - (tree.joint[parent] if parent >= 0 else 0.0)
-        body = ElementTree.SubElement(holder, "body", name=f"link{link}", pos=_numbers(place))
+        origin = tree.joint[link] - (tree.joint[parent] if parent >= 0 else 0.0)
+        body = ElementTree.SubElement(holder, "body", name=f"link{link}", pos=_numbers(origin))
         bodies[link] = body
         if parent >= 0:
             for axis in range(3):
@@ -53,10 +53,10 @@ def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
                     stiffness=f"{stiffness:.9g}", springref=f"{slack[link, axis]:.9g}",
                     damping=f"{damping.stiffness * stiffness:.9g}")
         _add_inertial(body, tree, link)
-        way = tree.end[link] - tree.joint[link]
-        if np.linalg.norm(way) > 1e-6:
+        vector = tree.end[link] - tree.joint[link]
+        if np.linalg.norm(vector) > 1e-6:
             ElementTree.SubElement(body, "geom", type="capsule", size=f"{tree.radius[link]:.6g}",
-                                   fromto=f"0 0 0 {_numbers(way)}")
+                                   fromto=f"0 0 0 {_numbers(vector)}")
     for label, point in sites.items():
         link = tree.link_at(point)
         ElementTree.SubElement(bodies[link], "site", name=label, size="0.004",

@@ -80,10 +80,10 @@ class RodTree:
 
     def link_at(self, point: Sequence[float]) -> int:
         """Return the link whose centre line is nearest to a point [m]."""
-        start, way = self.joint, self.end - self.joint
-        size = np.maximum((way**2).sum(axis=1), 1e-18)
-        share = np.clip(((np.asarray(point) - start) * way).sum(axis=1) / size, 0.0, 1.0)
-        return int(np.linalg.norm(start + share[:, None] * way - point, axis=1).argmin())
+        start, vectors = self.joint, self.end - self.joint
+        size = np.maximum((vectors**2).sum(axis=1), 1e-18)
+        share = np.clip(((np.asarray(point) - start) * vectors).sum(axis=1) / size, 0.0, 1.0)
+        return int(np.linalg.norm(start + share[:, None] * vectors - point, axis=1).argmin())
 
 
 def matched(tree: RodTree, model: BranchModel, tip: int) -> tuple[RodTree, float]:
@@ -92,12 +92,12 @@ def matched(tree: RodTree, model: BranchModel, tip: int) -> tuple[RodTree, float
     What links leave out (mainly the stiffening effect of forks) is a few percent. One common factor
     corrects for it and is returned as well.
     """
-    place = model.mesh.nodes[tip]
+    position = model.mesh.nodes[tip]
     compliance = np.zeros((3, 3))
-    link = tree.link_at(place)
+    link = tree.link_at(position)
     while link > 0:
-        ways = np.cross(tree.axes[link], place - tree.joint[link])
-        compliance += (ways / tree.stiffness[link][:, None]).T @ ways
+        arms = np.cross(tree.axes[link], position - tree.joint[link])
+        compliance += (arms / tree.stiffness[link][:, None]).T @ arms
         link = int(tree.parent[link])
     bare = model.with_parameters(gravity=(0.0, 0.0, 0.0))
     factor = float(np.trace(compliance)) / tip_compliance(bare, tip)
@@ -123,7 +123,7 @@ class _Segment:
     end: np.ndarray
     tangent: np.ndarray
     length: float
-    before: int  # the link that ends in its middle; the next one begins there
+    before: int  # the link at whose middle this one begins
     link: int
 
 
@@ -184,23 +184,24 @@ def _laid_out(skeleton: Skeleton, spacing: float, wood: cKDTree,
     before: list[int] = []
     link_of = {0: 0}
     for nodes in _pieces(skeleton, children):
-        place = skeleton.nodes[nodes]
-        steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+        positions = skeleton.nodes[nodes]
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         fork = nodes[0]
-        if int(fork) not in link_of or not _is_meshed(place, skeleton.radius[nodes], wood):
-            continue  # a twig that the mesh leaves out: its mass hangs on the branch
+        if int(fork) not in link_of or not _is_meshed(positions, skeleton.radius[nodes], wood):
+            continue  # a twig that the mesh omits: its mass hangs on the branch
         is_side = skeleton.branch[nodes[1]] != skeleton.branch[fork] and fork > 0
         # A side branch begins to bend where it leaves its parent axis's wood.
-        first = _leaves_at(skeleton, int(fork), place, along) if is_side else 0.0
+        first = _leaves_at(skeleton, int(fork), positions, along) if is_side else 0.0
         number = max(1, round((along[-1] - first) / spacing))
         cuts = np.linspace(first, along[-1], number + 1)
         current = link_of[int(fork)]
         for low, high in pairwise(cuts):
             line = np.linspace(low, high, 2 * (_SAMPLES_A_SEGMENT // 2) + 1)
             line = (line[1:] + line[:-1]) / 2
-            points = np.column_stack([np.interp(line, along, place[:, k]) for k in range(3)])
-            start, middle, end = (np.array([np.interp(at, along, place[:, k]) for k in range(3)])
+            points = np.column_stack([np.interp(line, along, positions[:, k]) for k in range(3)])
+            start, middle, end = (np.array([np.interp(at, along, positions[:, k]) for k
+                                            in range(3)])
                                   for at in (low, (low + high) / 2, high))
             tangent = (end - start) / np.linalg.norm(end - start)
             link = len(segments) + 1
@@ -215,19 +216,19 @@ def _laid_out(skeleton: Skeleton, spacing: float, wood: cKDTree,
     return segments, np.concatenate(samples), np.array(owner), np.array(before)
 
 
-def _leaves_at(skeleton: Skeleton, fork: int, place: np.ndarray, along: np.ndarray) -> float:
+def _leaves_at(skeleton: Skeleton, fork: int, points: np.ndarray, along: np.ndarray) -> float:
     """Distance along a side branch at which its axis leaves the parent's wood [m]."""
     run = np.flatnonzero(skeleton.branch == skeleton.branch[fork])
-    distance, nearest = cKDTree(skeleton.nodes[run]).query(place)
+    distance, nearest = cKDTree(skeleton.nodes[run]).query(points)
     outside = np.flatnonzero(distance > skeleton.radius[run][nearest])
     at = along[outside[0]] if len(outside) else along[-1]
     return float(min(at, 0.5 * along[-1]))
 
 
-def _is_meshed(place: np.ndarray, radius: np.ndarray, wood: cKDTree) -> bool:
+def _is_meshed(points: np.ndarray, radius: np.ndarray, wood: cKDTree) -> bool:
     """Whether the outer half of a piece of the axes runs inside the mesh."""
-    half = len(place) // 2
-    return bool(np.median(wood.query(place[half:])[0] / np.maximum(radius[half:], 1e-9)) < 1.0)
+    half = len(points) // 2
+    return bool(np.median(wood.query(points[half:])[0] / np.maximum(radius[half:], 1e-9)) < 1.0)
 
 
 def _pieces(skeleton: Skeleton, children: np.ndarray) -> list[list[int]]:
@@ -317,14 +318,14 @@ def _masses(points: np.ndarray, mass: np.ndarray, link: np.ndarray,
 def _with_hung(tree: RodTree, model: BranchModel) -> RodTree:
     mass, centre, inertia = tree.mass.copy(), tree.centre.copy(), tree.inertia.copy()
     for hung in model.point_masses:
-        place = np.array(hung.position)
+        position = np.array(hung.position)
         link, own = tree.link_at(hung.position), np.zeros((3, 3))
         if isinstance(hung, HungTwig):
             link, own = tree.link_at(hung.attached), np.array(hung.inertia)
         joined = mass[link] + hung.mass
-        middle = (mass[link] * centre[link] + hung.mass * place) / max(joined, 1e-300)
+        middle = (mass[link] * centre[link] + hung.mass * position) / max(joined, 1e-300)
         inertia[link] += own + _about(mass[link], centre[link] - middle) + _about(
-            hung.mass, place - middle)
+            hung.mass, position - middle)
         mass[link], centre[link] = joined, middle
     return RodTree(tree.parent, tree.joint, tree.axes, tree.stiffness, mass, centre, inertia,
                    tree.end, tree.radius, tree.gravity)

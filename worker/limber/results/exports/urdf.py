@@ -36,15 +36,15 @@ def urdf_text(tree: RodTree, damping: RayleighDamping, name: str) -> str:
             joint = ElementTree.SubElement(root, "joint", name="base", type="fixed")
             _connect(joint, "world", "link0", tree.joint[0])
             continue
-        holder, place = f"link{parent}", tree.joint[link] - tree.joint[parent]
+        holder, origin = f"link{parent}", tree.joint[link] - tree.joint[parent]
         for number, label in enumerate(_AXES):
             held = f"link{link}" if number == 2 else f"link{link}_{label}"
             if number < 2:
                 _add_inertial(ElementTree.SubElement(root, "link", name=held), 0.0, np.zeros(3),
                               np.zeros((3, 3)))
-            _add_joint(root, f"joint{link}_{label}", holder, held, place, tree.axes[link, number],
+            _add_joint(root, f"joint{link}_{label}", holder, held, origin, tree.axes[link, number],
                        float(tree.stiffness[link, number]), float(slack[link, number]), damping)
-            holder, place = held, np.zeros(3)
+            holder, origin = held, np.zeros(3)
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -53,16 +53,17 @@ def _add_link(root: ElementTree.Element, tree: RodTree, link: int) -> None:
     element = ElementTree.SubElement(root, "link", name=f"link{link}")
     _add_inertial(element, float(tree.mass[link]), tree.centre[link] - tree.joint[link],
                   tree.inertia[link])
-    way = tree.end[link] - tree.joint[link]
-    length = float(np.linalg.norm(way))
+    vector = tree.end[link] - tree.joint[link]
+    length = float(np.linalg.norm(vector))
     if length < 1e-6:
         return
     for kind in ("visual", "collision"):
         part = ElementTree.SubElement(element, kind)
         # A cylinder's axis is z through its centre.
-        roll_pitch_yaw = (0.0, float(np.arccos(np.clip(way[2] / length, -1.0, 1.0))),
-                          float(np.arctan2(way[1], way[0])))
-        ElementTree.SubElement(part, "origin", xyz=_numbers(way / 2), rpy=_numbers(roll_pitch_yaw))
+        roll_pitch_yaw = (0.0, float(np.arccos(np.clip(vector[2] / length, -1.0, 1.0))),
+                          float(np.arctan2(vector[1], vector[0])))
+        ElementTree.SubElement(part, "origin", xyz=_numbers(vector / 2),
+                               rpy=_numbers(roll_pitch_yaw))
         shape = ElementTree.SubElement(part, "geometry")
         ElementTree.SubElement(shape, "cylinder", radius=f"{tree.radius[link]:.6g}",
                                length=f"{length:.9g}")
@@ -79,10 +80,10 @@ def _add_inertial(element: ElementTree.Element, mass: float, centre: np.ndarray,
                            iyz=f"{i[1, 2]:.9g}")
 
 
-def _add_joint(root: ElementTree.Element, name: str, parent: str, child: str, place: np.ndarray,
+def _add_joint(root: ElementTree.Element, name: str, parent: str, child: str, origin: np.ndarray,
                axis: np.ndarray, stiffness: float, slack: float, damping: RayleighDamping) -> None:
     joint = ElementTree.SubElement(root, "joint", name=name, type="revolute")
-    _connect(joint, parent, child, place)
+    _connect(joint, parent, child, origin)
     ElementTree.SubElement(joint, "axis", xyz=_numbers(axis))
     ElementTree.SubElement(joint, "limit", lower=f"{-_WIDEST}", upper=f"{_WIDEST}",
                            effort="1000", velocity="1000")
@@ -95,10 +96,10 @@ def _add_joint(root: ElementTree.Element, name: str, parent: str, child: str, pl
     ElementTree.SubElement(gazebo, "springReference").text = spring["spring_reference"]
 
 
-def _connect(joint: ElementTree.Element, parent: str, child: str, place: np.ndarray) -> None:
+def _connect(joint: ElementTree.Element, parent: str, child: str, origin: np.ndarray) -> None:
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
-    ElementTree.SubElement(joint, "origin", xyz=_numbers(place), rpy="0 0 0")
+    ElementTree.SubElement(joint, "origin", xyz=_numbers(origin), rpy="0 0 0")
 
 
 def _numbers(values: np.ndarray | tuple[float, ...]) -> str:

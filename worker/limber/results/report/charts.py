@@ -24,7 +24,7 @@ def chart(width: float, height: float, across: str, up: str, *, has_grid: bool =
     return figure, axes
 
 
-_NUMBER_INCHES = 0.6  # that a number below an axis takes
+_NUMBER_INCHES = 0.6  # width of a number below an axis
 
 
 def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int]]]:

@@ -59,17 +59,17 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
     """E at the control points with intervals, and the truth if known."""
     figure, axes = chart(5.2, 3.2, "position on the main path (0 base, 1 tip)",
                          "Young's modulus [MPa]")
-    place = np.array(estimate["fractions"])
+    fractions = np.array(estimate["fractions"])
     young = np.array(estimate["young_pa"]) / 1e6
     interval = np.array(estimate["young_interval_pa"]) / 1e6
     sensor = np.array(estimate.get("young_interval_sensor_pa", estimate["young_interval_pa"]))
-    if len(place) == 1:
+    if len(fractions) == 1:
         # One modulus for the whole branch.
-        place, young = np.array([0.0, 1.0]), np.repeat(young, 2)
+        fractions, young = np.array([0.0, 1.0]), np.repeat(young, 2)
         interval, sensor = np.repeat(interval, 2, axis=0), np.repeat(sensor, 2, axis=0)
-    axes.fill_between(place, *interval.T, color=SIMULATED, alpha=0.18, lw=0,
+    axes.fill_between(fractions, *interval.T, color=SIMULATED, alpha=0.18, lw=0,
                       label="95 %, including radii and mesh")
-    axes.errorbar(place, young, np.abs(sensor.T / 1e6 - young), fmt="o-", color=SIMULATED,
+    axes.errorbar(fractions, young, np.abs(sensor.T / 1e6 - young), fmt="o-", color=SIMULATED,
                   capsize=4, label="estimated, 95 % from the sensors alone")
     truth = estimate.get("truth")
     if truth:
@@ -94,15 +94,15 @@ def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
     after = np.concatenate([after[groups], after[len(set(groups)):]])
     # Parameter names are words; stacked vertically they do not overlap.
     figure, axes = chart(6.0, 1.2 + 0.3 * len(names), "standard deviation", "")
-    place = np.arange(len(names))
+    rows = np.arange(len(names))
     least = 1e-4
-    axes.barh(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color=_BEFORE,
+    axes.barh(rows - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color=_BEFORE,
               label="before the fit")
-    axes.barh(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED,
+    axes.barh(rows + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED,
               label="after the fit")
     axes.axvline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
     axes.set_xscale("log")
-    axes.set_yticks(place, names)
+    axes.set_yticks(rows, names)
     axes.invert_yaxis()
     figure.legend(frameon=False, ncols=2, loc="outside upper right")
     return figure
@@ -147,14 +147,14 @@ def held_out_scores(estimate: dict[str, Any]) -> Any:
     """Errors of predicted pulls in percent, of points and force."""
     scores = estimate["held_out"]
     figure, axes = chart(5.2, 1.2 + 0.45 * len(scores), "error of the predicted pull [%]", "")
-    place = np.arange(len(scores))
+    rows = np.arange(len(scores))
     for shift, key, colour, label in (
             (0.2, "relative_distance", SIMULATED, "points, relative to travel"),
             (-0.2, "relative_force", FORCE, "force, relative to its peak")):
         values = 100 * np.array([_number(score.get(key)) for score in scores.values()])
-        axes.barh(place + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
-    axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
-                            for name, score in scores.items()])
+        axes.barh(rows + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
+    axes.set_yticks(rows, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
+                           for name, score in scores.items()])
     figure.legend(frameon=False, ncol=2, fontsize=8, loc="outside upper right")
     return figure
 
@@ -215,9 +215,9 @@ def force_over_time(pull: dict[str, Any]) -> Any:
 
 def _interval_caption(estimate: dict[str, Any]) -> str:
     parts = estimate.get("young_deviation") or {}
-    told = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
-            (("sensor", "sensors"), ("geometry", "shape from the scan"), ("mesh", "mesh"))
-            if parts.get(key) is not None]
+    shares = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
+              (("sensor", "sensors"), ("geometry", "shape from the scan"), ("mesh", "mesh"))
+              if parts.get(key) is not None]
     missing = ""
     if parts and parts.get("geometry") is None:
         missing = (" The radii have no stated deviation, so the interval does not include their "
@@ -225,7 +225,7 @@ def _interval_caption(estimate: dict[str, Any]) -> str:
     elif parts.get("axis_is_exact", True) and parts:
         missing = " The position of the scan's axis is assumed exact."
     return ("Young's modulus along the branch with its 95 % interval"
-            + (f"; largest standard deviations from: {', '.join(told)}" if told else "")
+            + (f"; largest standard deviations from: {', '.join(shares)}" if shares else "")
             + "." + missing)
 
 

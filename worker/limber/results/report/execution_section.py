@@ -40,7 +40,7 @@ def execution_rows(result: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def force_along_the_way(path: Path) -> "Figure":
+def force_along_path(path: Path) -> "Figure":
     """Draw the measured force (smoothed), and the predicted one with its 95 % interval.
 
     Raises:

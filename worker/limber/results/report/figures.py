@@ -37,10 +37,10 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
             axis.scatter(nodes[:, first], nodes[:, 2], s=60, facecolors="none",
                          edgecolors=MARK_COLOURS["control_points"], linewidths=1.4, zorder=5)
         for target in targets:
-            place = target["position_m"]
-            axis.plot(place[first], place[2], marker="*", markersize=13,
+            position = target["position_m"]
+            axis.plot(position[first], position[2], marker="*", markersize=13,
                       color=MARK_COLOURS["targets"], markeredgecolor="#5c4300", zorder=6)
-            axis.annotate(target["name"], (place[first], place[2]), (7, 5), fontsize=9,
+            axis.annotate(target["name"], (position[first], position[2]), (7, 5), fontsize=9,
                           textcoords="offset points", zorder=6)
     return figure
 

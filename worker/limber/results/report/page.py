@@ -103,19 +103,19 @@ def _found(branch: Branch, picture: Path | None) -> Section:
     if pull is not None:
         section.text.append(ASSUMED if pull["young_assumed"] else (
             "The branch was generated and its pull simulated, so that the true modulus is known."))
-    told = []
+    sentences = []
     if branch.has("estimate.json"):
-        told.append(modulus_sentence(
+        sentences.append(modulus_sentence(
             read_estimate(branch.path("estimate.json")),
             ASSUMED_PULL if is_assumed(pull) else ""))
     else:
-        told.append("Young's modulus has not been estimated from a pull: what follows holds for "
-                    "the modulus that the mesh has.")
+        sentences.append("Young's modulus has not been estimated from a pull: what follows holds "
+                         "for the modulus that the mesh has.")
     plans = [branch.manifest.stages[f"plan:{name}"] for name in _names(branch, "plan")]
     if plans:
         newest = max(plans, key=lambda entry: entry.finished).result
-        told += [path_sentence(newest), certificate_sentence(newest), beyond_sentence(newest)]
-    section.text.append(" ".join(filter(None, told)))
+        sentences += [path_sentence(newest), certificate_sentence(newest), beyond_sentence(newest)]
+    section.text.append(" ".join(filter(None, sentences)))
     if picture is not None:
         section.pictures.append((inline_png(read_png(picture)), "Rendered scene."))
     return section
@@ -267,9 +267,10 @@ def _provenance(branch: Branch) -> Section:
     rows = [["stage", "finished", "settings"]]
     programs: dict[str, str] = {}
     for key, entry in branch.manifest.stages.items():
-        shown = ", ".join(f"{name} {_setting(value)}" for name, value in entry.settings.items()
-                          if value not in (None, []))
-        rows.append([key, entry.finished[:16].replace("T", " "), shown])
+        settings_text = ", ".join(f"{name} {_setting(value)}" for name, value
+                                  in entry.settings.items()
+                                  if value not in (None, []))
+        rows.append([key, entry.finished[:16].replace("T", " "), settings_text])
         programs |= entry.programs
     section.tables.append(("Stages (times in UTC)", rows))
     section.tables.append(("Programs", [["program", "version"],

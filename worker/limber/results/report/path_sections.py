@@ -16,7 +16,7 @@ def energy_section(branch: Branch) -> Section:
     if not branch.has("energy.npz"):
         section.missing = "limber energy NAME.branch"
         return section
-    EnergyField.read(branch.path("energy.npz"))  # what is shown has been checked
+    EnergyField.read(branch.path("energy.npz"))  # checks what is shown
     data = read_arrays(branch.path("energy.npz"), "an energy field")
     section.draw(figures.energy_samples(data), "Strain energy of the sampled grasp poses "
                                                "against the distance from rest, and the force.")
@@ -75,7 +75,7 @@ def execution_section(branch: Branch, name: str) -> Section:
     section = Section(f"Executed by the robot: {name}", tables=[
         ("", execution.execution_rows(branch.manifest.stages[f"execute:{name}"].result))])
     try:
-        section.draw(execution.force_along_the_way(
+        section.draw(execution.force_along_path(
             branch.path(f"executions/{name}/samples.csv")),
             "Force of the gripper on the branch: measured (smoothed), and predicted at the "
             "gripper's measured position. The robot moves to the goal, waits and returns.")

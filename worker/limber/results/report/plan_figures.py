@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LABELS = {"baseline": "shortest (length alone)", "plan": "gentle (deformation-aware)"}
-_WIDTHS = {"baseline": 3.2, "plan": 1.5}  # where both run together, both are seen
-_FLAT = 1e-3  # a cost that changes by less along the search draws a line and says nothing
-_STILL = 1e-9  # [m] a path that is no longer has no length
-_GRID = 160  # points of the slice along its longer side
+_WIDTHS = {"baseline": 3.2, "plan": 1.5}  # both remain visible where they coincide
+_FLAT = 1e-3  # a cost that changes less along the search shows only a line
+_STILL = 1e-9  # [m] a path that is not longer has no length
+_GRID = 160  # points of the slice on its longer side
 
 
 def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
@@ -34,7 +34,7 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
     if plan.summary["plan"]["length_m"] <= _STILL:
         return []
     field = EnergyField.read(branch.path("energy.npz"))
-    shown = [
+    figures = [
         (along_paths(plan), "Energy above the rest shape (strain and weight), gripper force and "
                             "largest strain along both paths, on the full model. Dashed: energy "
                             "of the field that the planner used."),
@@ -44,20 +44,23 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
          "projected onto that plane."),
     ]
     if moved := searched(plan.summary["convergence"]):
-        shown.append((convergence(moved), "Cost of the best path so far over the planner's "
+        figures.append((convergence(moved), "Cost of the best path so far over the planner's "
                                              "iterations, relative to the final cost."))
     if (plan.summary.get("certificate") or {}).get("levels"):
         if branch.has(f"plans/{name}-bound.npz"):
             bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
             if (drawn := paths_over_bound(field, bound, plan)) is not None:
-                shown.append((drawn, "Both paths over the lower bound on the cost of any path from "
-                              "there to the goal, in the same plane. The gentlest path follows "
-                              "its steepest descent."))
-        shown.append((certificate(plan), "Cost of the gentle path, and lower bound on the cost of "
-                      "every path on the energy field, as the grid of the certificate is refined."))
+                figures.append((drawn,
+                                "Both paths over the lower bound on the cost of any path from "
+                                "there to the goal, in the same plane. The gentlest path follows "
+                                "its steepest descent."))
+        figures.append((certificate(plan),
+                        "Cost of the gentle path, and lower bound on the cost of "
+                        "every path on the energy field, as the grid of the certificate is "
+                        "refined."))
     if branch.has(f"plans/{name}-damage.csv"):
         damage = DamageAlong.read(branch.path(f"plans/{name}-damage.csv"))
-        shown.append((damage_along_branch(damage), (
+        figures.append((damage_along_branch(damage), (
             "Where the gentle path would damage the branch: the probability that the largest "
             "strain at a place, in any state of the motion, breaks it there. "
             if damage.probabilities is not None else
@@ -66,9 +69,9 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
             + "The circle marks the largest strain."))
     if any(point["lower_bound_jm"] is not None
            for point in (plan.summary.get("detour") or {}).get("curve", ())):
-        shown.append((trade_off(plan), "Energy against length of the gentlest paths for several "
-                      "weights of distance. No path is below the dashed line."))
-    return shown
+        figures.append((trade_off(plan), "Energy against length of the gentlest paths for several "
+                        "weights of distance. No path is below the dashed line."))
+    return figures
 
 
 def along_paths(plan: PlanFile) -> "Figure":
@@ -77,7 +80,7 @@ def along_paths(plan: PlanFile) -> "Figure":
 
     figure = Figure(figsize=(11, 3.8), layout="constrained")
     axes = figure.subplots(1, 3)
-    for key, path in _ways(plan).items():
+    for key, path in _paths_of(plan).items():
         along = 1e3 * arc_lengths(path.poses[:, :3])
         style = {"color": PATH_COLOURS[key], "label": _LABELS[key], "lw": _WIDTHS[key]}
         axes[0].plot(along, 1e3 * path.energies, **style)
@@ -104,7 +107,7 @@ def paths_over_slice(field: EnergyField, plan: PlanFile,
     energy[~field.region.contains(view.points)] = np.nan
     figure, axis = view.figure()
     # Nearly all of the paths' energy range, without the few stiff corners of the slice.
-    top = max(1.5 * max(way.energies.max() for way in _ways(plan).values()), 1e-9)
+    top = max(1.5 * max(path.energies.max() for path in _paths_of(plan).values()), 1e-9)
     view.fill(figure, axis, 1e3 * energy, 1e3 * top, "energy above rest [mJ]", "viridis")
     if tree is not None:
         nodes, parents = 1e3 * view.flat(tree[0]), tree[1]
@@ -145,13 +148,13 @@ class _View:
 
     @classmethod
     def of(cls, field: EnergyField, plan: PlanFile) -> "_View":
-        paths = {key: way.poses[:, :3] for key, way in _ways(plan).items()}
+        paths = {key: path.poses[:, :3] for key, path in _paths_of(plan).items()}
         origin, across, up = _plane(np.concatenate(list(paths.values())))
         axes = np.stack([across, up])
         flat = {key: (path - origin) @ axes.T for key, path in paths.items()}
         rest = (field.rest - origin) @ axes.T
-        shown = np.concatenate([*flat.values(), rest[None]])
-        low, high = shown.min(axis=0), shown.max(axis=0)
+        points = np.concatenate([*flat.values(), rest[None]])
+        low, high = points.min(axis=0), points.max(axis=0)
         margin = 0.25 * (high - low).max()
         x, y = (np.linspace(low[k] - margin, high[k] + margin, _GRID) for k in range(2))
         return cls(origin, axes, x, y, flat, rest)
@@ -280,7 +283,7 @@ def trade_off(plan: PlanFile) -> "Figure":
     return figure
 
 
-def _ways(plan: PlanFile) -> dict[str, Way]:
+def _paths_of(plan: PlanFile) -> dict[str, Way]:
     return {"baseline": plan.baseline, "plan": plan.plan}
 
 

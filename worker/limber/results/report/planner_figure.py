@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = (BASELINE, "D-RRT*, not smoothed", "eikonal")
-_SHELL = 600  # poses of the field that are drawn behind the paths
+_SHELL = 600  # poses of the field drawn behind the paths
 
 
 def planner_figure(field: EnergyField, trials: Sequence[ComparedTrial]) -> "Figure":

@@ -18,8 +18,8 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
     """
     truth = (pull or {}).get("young_true_pa")
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
-    told = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
-    rows = [[*header, *told, "in the interval"] if truth else header]
+    titles = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
+    rows = [[*header, *titles, "in the interval"] if truth else header]
     for number, young in enumerate(estimate["young_pa"]):
         row = [str(number + 1), _mpa(young), _interval(estimate, number)]
         if truth:
@@ -48,7 +48,7 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
     which limits of arm or wood are exceeded, if any.
     """
     rows = [["measure", "shortest", "gentle", "change"]]
-    remarks, told = remarks_on(plan), []
+    remarks, notes = remarks_on(plan), []
     for label, key, unit in [
             ("path length", "length_m", "m"),
             ("energy along the path", "energy_integral_jm", "J m"),
@@ -60,13 +60,13 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
             continue
         change = f"{100 * (after / before - 1):+.1f} %" if before else "-"
         rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
-        told.append(remarks.get(key, ""))
+        notes.append(remarks.get(key, ""))
     below = _below(plan)
-    if not any(told):
+    if not any(notes):
         return rows + below
-    told += [""] * len(below)
+    notes += [""] * len(below)
     return [[*row, remark] for row, remark in zip(
-        rows + below, ["beyond reach", *told], strict=True)]
+        rows + below, ["beyond reach", *notes], strict=True)]
 
 
 def leg_rows(legs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -116,11 +116,11 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     if not any(parts.get(name) for name in known):
         return []
     rows = [["control point", "position (0 base, 1 tip)", *known.values()]]
-    for number, place in enumerate(estimate["fractions"]):
+    for number, fraction in enumerate(estimate["fractions"]):
         shares = ["not examined" if not parts.get(name) else "not known"
                   if parts[name][number] is None else f"{100 * parts[name][number]:.1f} %"
                   for name in known]
-        rows.append([str(number + 1), f"{place:.2f}", *shares])
+        rows.append([str(number + 1), f"{fraction:.2f}", *shares])
     return rows
 
 
@@ -244,18 +244,19 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         doubtful: Uncertain parts, each with ``kind``, ``branch``, ``at`` [3], ``length_m``,
             ``radius_m`` and ``value`` (see :class:`limber.geometry.skeleton.doubtful_parts.Doubt`).
     """
-    told = {"unlikely branch": "probability {:.2f}",
-            "unresolved radius": "sigma {:.0%} of the radius",
-            "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
+    value_formats = {"unlikely branch": "probability {:.2f}",
+                     "unresolved radius": "sigma {:.0%} of the radius",
+                     "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
     rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty"]]
     for part in doubtful:
         value = part["value"]
         if part["kind"] in ("kink", "starts backwards"):
             value = math.degrees(value)
         rows.append([part["kind"], str(part["branch"]),
-                     " ".join(f"{place:.8g}" for place in part["at"]),
+                     " ".join(f"{value:.8g}" for value in part["at"]),
                      f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
-                     told[part["kind"]].format(value) if part["kind"] in told else "no points"])
+                     value_formats[part["kind"]].format(value) if part["kind"] in value_formats
+                     else "no points"])
     return rows
 
 

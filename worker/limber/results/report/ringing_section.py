@@ -26,17 +26,17 @@ def vibration_rows(path: Path) -> tuple[list[list[str]], list[list[str]]]:
     Raises:
         InputError: the file cannot be read, or has other content.
     """
-    told = read_json_as(path, VibrationFile, "the result of a vibration")
-    low, high = told.young_interval_pa
-    intervals: list[tuple[float, float] | None] = [*told.damping_ratio_intervals]
+    result = read_json_as(path, VibrationFile, "the result of a vibration")
+    low, high = result.young_interval_pa
+    intervals: list[tuple[float, float] | None] = [*result.damping_ratio_intervals]
     modulus = [["quantity", "value", "95 % interval"],
-               ["Young's modulus, mean of the branch [MPa]", f"{told.young_pa / 1e6:.4g}",
+               ["Young's modulus, mean of the branch [MPa]", f"{result.young_pa / 1e6:.4g}",
                 f"{low / 1e6:.4g} to {high / 1e6:.4g}"],
-               ["unexplained part of the recording", f"{100 * told.left_over:.0f} %", ""]]
+               ["unexplained part of the recording", f"{100 * result.left_over:.0f} %", ""]]
     vibrations = [["frequency [Hz]", "+-", "damping", "95 % interval"]]
     vibrations += [[f"{frequency:.4g}", f"{spread:.2g}", f"{100 * ratio:.2f} %",
                     f"{100 * interval[0]:.2f} to {100 * interval[1]:.2f} %" if interval else ""]
                    for frequency, spread, ratio, interval in zip(
-                       told.frequencies_hz, told.frequency_deviations_hz, told.damping_ratios,
-                       intervals or [None] * len(told.damping_ratios), strict=False)]
+                       result.frequencies_hz, result.frequency_deviations_hz, result.damping_ratios,
+                       intervals or [None] * len(result.damping_ratios), strict=False)]
     return modulus, vibrations

@@ -46,7 +46,7 @@ def read_swing(path: Path) -> SwingFile:
     counts = {len(markers) for track in (swing.seen_m, swing.simulated_m) for markers in track}
     if len(swing.seen_m) != len(swing.times_s) or len(swing.simulated_m) != len(swing.times_s) or (
             len(counts) != 1 or not counts.pop()) or any(
-            None in place for markers in swing.simulated_m for place in markers):
+            None in value for markers in swing.simulated_m for value in markers):
         raise InputError(f"{path}: the observed and simulated tracks do not have the same markers "
                          "and times.",
                          "The result of a swing was expected.",
@@ -74,14 +74,14 @@ def swing_rows(swing: SwingFile) -> list[list[str]]:
              "-"]]
 
 
-def along_its_way(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
+def along_path(swing: SwingFile) -> tuple[np.ndarray, np.ndarray]:
     """Return the displacement [m] along its path of the marker with the largest swing: observed
     (NaN if not observed) and simulated, shape [f] each.
     """
     seen, simulated = np.array(swing.seen_m, float), np.array(swing.simulated_m, float)
     most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
-    way = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
-    return seen[:, most] @ way, simulated[:, most] @ way
+    direction = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
+    return seen[:, most] @ direction, simulated[:, most] @ direction
 
 
 def swing_over_time(swing: SwingFile) -> "Figure":
@@ -89,7 +89,7 @@ def swing_over_time(swing: SwingFile) -> "Figure":
     from limber.results.report.estimate_figures import OBSERVED, SIMULATED
 
     figure, axes = chart(5.2, 3.0, "time [s]", "displacement [mm]")
-    seen, simulated = along_its_way(swing)
+    seen, simulated = along_path(swing)
     axes.plot(swing.times_s, 1e3 * seen, ".", ms=4, color=OBSERVED, label="observed")
     axes.plot(swing.times_s, 1e3 * simulated, color=SIMULATED, label="simulated")
     axes.legend(frameon=False)

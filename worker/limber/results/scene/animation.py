@@ -122,10 +122,10 @@ def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
     stress, young = data.arrays.get("frame_scalar:stress"), data.arrays.get("scalar:young")
     if stress is None or young is None:
         return
-    told = (f"{100 * STRENGTH_OVER_YOUNG:g} % of E, assumed" if strength is None
-            else f"{strength / 1e6:.3g} MPa")
+    source_text = (f"{100 * STRENGTH_OVER_YOUNG:g} % of E, assumed" if strength is None
+                   else f"{strength / 1e6:.3g} MPa")
     add_frame_scalar(data, "stress_over_strength", stress / strength_of(young, strength),
-                      f"stress over strength ({told})", "", "inferno", is_from_zero=True)
+                      f"stress over strength ({source_text})", "", "inferno", is_from_zero=True)
 
 
 def add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
@@ -171,5 +171,5 @@ def _along(points: np.ndarray, count: int) -> np.ndarray:
         return points
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     length = np.concatenate([[0.0], np.cumsum(steps)])
-    places = np.linspace(0.0, length[-1], count)
-    return np.column_stack([np.interp(places, length, points[:, axis]) for axis in range(3)])
+    distances = np.linspace(0.0, length[-1], count)
+    return np.column_stack([np.interp(distances, length, points[:, axis]) for axis in range(3)])

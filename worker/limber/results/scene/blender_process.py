@@ -61,10 +61,11 @@ def _is_older_than_bpy(blender: str | None) -> bool:
     if not blender:
         return False
     try:
-        told = subprocess.run([blender, "--version"], capture_output=True, text=True, check=False,
-                              timeout=_ANSWER_SECONDS).stdout
+        version_text = subprocess.run([blender, "--version"], capture_output=True, text=True,
+                                      check=False,
+                                      timeout=_ANSWER_SECONDS).stdout
         versions = [re.match(r"(?:Blender )?(\d+)\.(\d+)", text)
-                    for text in (told, importlib.metadata.version("bpy"))]
+                    for text in (version_text, importlib.metadata.version("bpy"))]
     except (OSError, subprocess.TimeoutExpired, importlib.metadata.PackageNotFoundError):
         # A Blender that does not respond cannot write.
         return False
@@ -79,10 +80,10 @@ def scene_script() -> Path:
         MissingDependencyError: it is in neither.
     """
     here = Path(__file__).parent
-    places = [here / "addon" / "make_scene.py", here.parents[3] / "addon" / "make_scene.py"]
-    for place in places:
-        if place.is_file():
-            return place
+    candidates = [here / "addon" / "make_scene.py", here.parents[3] / "addon" / "make_scene.py"]
+    for path in candidates:
+        if path.is_file():
+            return path
     raise MissingDependencyError(
-        f"The add-on's {places[0].name} is not installed.", "`limber scene` needs it.",
+        f"The add-on's {candidates[0].name} is not installed.", "`limber scene` needs it.",
         "Install Limber from its wheel, or run it from a checkout of the project.")

@@ -11,7 +11,7 @@ _COLOUR_MAPS = {
     "inferno": ("#1b0c41", "#4a0c6b", "#781c6d", "#a52c60", "#cf4446", "#ed6925", "#fb9b06",
                 "#f7d13d", "#fcffa4"),
 }
-_MOST_DECADES = 1e3  # a logarithmic scale spans at most this; what is below has its first colour
+_MOST_DECADES = 1e3  # range of a logarithmic scale; lower values have its first colour
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 
 
@@ -38,10 +38,10 @@ def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dic
 
 def colours_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
     """Return linear colours of values by a scale, shape [n, 4]."""
-    place = _places(values, scale)
+    position = _scale_positions(values, scale)
     stops = np.array(scale["stops"])
-    channels = [np.interp(place, stops[:, 0], stops[:, channel]) for channel in (1, 2, 3)]
-    return np.column_stack([*channels, np.ones_like(place)])
+    channels = [np.interp(position, stops[:, 0], stops[:, channel]) for channel in (1, 2, 3)]
+    return np.column_stack([*channels, np.ones_like(position)])
 
 
 def css_colours(values: np.ndarray, scale: dict[str, Any]) -> list[str]:
@@ -65,10 +65,10 @@ def palette(name: str) -> np.ndarray:
 
 def levels_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
     """Return the nearest of 256 evenly spaced colours of a scale for each value, as bytes."""
-    return np.round(255 * _places(values, scale)).astype(np.uint8)
+    return np.round(255 * _scale_positions(values, scale)).astype(np.uint8)
 
 
-def _places(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
+def _scale_positions(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
     """Return the positions of values on a scale, 0 to 1."""
     low, high = scale["low"], scale["high"]
     if scale["log"]:

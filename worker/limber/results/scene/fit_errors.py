@@ -14,14 +14,14 @@ from limber.results.scene.still_objects import add_scalar
 from limber.store import Branch
 
 
-def add_fit(data: SceneData, branch: Branch, shown: str | None) -> None:
+def add_fit(data: SceneData, branch: Branch, name: str | None) -> None:
     """Add Young's modulus along the branch as a graph, and the fit of the simulation to a pull.
 
     Args:
         data: Gets ``rods:fit`` (lines along simulated points, balls at measured ones, coloured by
             the distance between them), scalar ``residual`` and graphs.
         branch: The branch whose ``estimate.json`` is read, if present.
-        shown: The pull whose measurement is shown; the first of the estimate if it is not one of
+        name: The pull whose measurement is shown; the first of the estimate if it is not one of
         them.
 
     Raises:
@@ -34,7 +34,7 @@ def add_fit(data: SceneData, branch: Branch, shown: str | None) -> None:
     pulls = {pull["name"]: pull for pull in estimate["pulls"]}
     if not pulls:
         return
-    pull = pulls.get(shown) or next(iter(pulls.values()))
+    pull = pulls.get(name) or next(iter(pulls.values()))
     if (force := force_graph(pull["name"], pull["all_times_s"], pull["measured_force_n"],
                              pull["simulated_force_n"],
                              times_of_frames(data, pull["name"]))) is not None:

@@ -42,15 +42,15 @@ class Axis:
     def over(cls, title: str, unit: str, values: Sequence[np.ndarray], *,
              log: bool = False) -> "Axis":
         """Return an axis over all values; it starts at zero unless there are negative values."""
-        given = np.concatenate([np.ravel(part) for part in values]).astype(float)
-        given = given[np.isfinite(given)]
-        low, high = (float(given.min()), float(given.max())) if len(given) else (0.0, 1.0)
+        numbers = np.concatenate([np.ravel(part) for part in values]).astype(float)
+        numbers = numbers[np.isfinite(numbers)]
+        low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 1.0)
         if log and low > 0 and high > _LOG_FROM * low:
             return cls(title, unit, low / 1.15, high * 1.15, log=True)
         low = min(low, 0.0)
         return cls(title, unit, low, low + 1.06 * (high - low) if high > low else low + 1.0)
 
-    def place(self, values: float | np.ndarray) -> np.ndarray:
+    def axis_fraction(self, values: float | np.ndarray) -> np.ndarray:
         """Return the positions of values, as fractions of the axis."""
         values = np.asarray(values, float)
         if self.log:
@@ -63,7 +63,7 @@ class Axis:
         values = _decades(self.low, self.high) if self.log else _steps(self.low, self.high)
         largest = max((abs(value) for value in values), default=1.0)
         # On a logarithmic axis each tick has its own prefix.
-        return [[float(self.place(value)),
+        return [[float(self.axis_fraction(value)),
                  with_unit(value, self.unit, abs(value) if self.log else largest)]
                 for value in values]
 
@@ -88,21 +88,23 @@ class Graph:
         if len(chosen) > _MOST_POINTS:
             chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_POINTS).astype(int)]
         if len(chosen):
-            points = np.column_stack([self.x.place(x[chosen]), self.y.place(y[chosen])])
+            points = np.column_stack([self.x.axis_fraction(x[chosen]),
+                                      self.y.axis_fraction(y[chosen])])
             self.lines.append({"label": label, "color": color, "is_dotted": is_dotted,
                                "points": np.clip(points, 0.0, 1.0).round(4).tolist()})
 
     def band(self, label: str, color: tuple[float, float, float], x: np.ndarray, low: np.ndarray,
              high: np.ndarray) -> None:
         """Add a band between two lines."""
-        rows = np.column_stack([self.x.place(x), self.y.place(low), self.y.place(high)])
+        rows = np.column_stack([self.x.axis_fraction(x), self.y.axis_fraction(low),
+                                self.y.axis_fraction(high)])
         self.bands.append({"label": label, "color": color,
                            "rows": np.clip(rows, 0.0, 1.0).round(4).tolist()})
 
-    def told(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Return the graph as the scene's file stores it."""
         return {"title": self.title, "lines": self.lines, "bands": self.bands,
-                "cursor": self.x.place(self.cursor).round(4).tolist(),
+                "cursor": self.x.axis_fraction(self.cursor).round(4).tolist(),
                 **{name: {"title": axis.title, "ticks": axis.ticks()}
                    for name, axis in (("x", self.x), ("y", self.y))}}
 
@@ -130,12 +132,12 @@ def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
     Args:
         estimate: Content of ``estimate.json``.
     """
-    place = np.array(estimate["fractions"], float)
+    fractions = np.array(estimate["fractions"], float)
     young = np.array(estimate["young_pa"], float)
     interval = np.array(estimate["young_interval_pa"], float)
-    if len(place) == 1:
+    if len(fractions) == 1:
         # One modulus for the whole branch.
-        place, young, interval = np.array([0.0, 1.0]), np.repeat(young, 2), np.repeat(
+        fractions, young, interval = np.array([0.0, 1.0]), np.repeat(young, 2), np.repeat(
             interval, 2, axis=0)
     # A modulus that is not determined has no interval; its line stays.
     is_known = np.isfinite(interval).all(axis=1)
@@ -145,13 +147,13 @@ def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
     graph = Graph("Young's modulus along the branch",
                   Axis("position on the main path (0 base, 1 tip)", "", 0.0, 1.0), axis)
     if is_known.sum() > 1:
-        graph.band("95 %", SIMULATED, place[is_known], *interval[is_known].T)
-    graph.line("estimated", SIMULATED, place, young)
-    graph.line("", SIMULATED, place, young, is_dotted=True)
+        graph.band("95 %", SIMULATED, fractions[is_known], *interval[is_known].T)
+    graph.line("estimated", SIMULATED, fractions, young)
+    graph.line("", SIMULATED, fractions, young, is_dotted=True)
     if len(true) and len(true) == len(truth.get("fractions") or []):
         graph.line("assumed" if truth.get("assumed") else "true", TRUE, truth["fractions"], true,
                    is_dotted=True)
-    return graph.told()
+    return graph.as_dict()
 
 
 def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[str, Any]:
@@ -167,7 +169,7 @@ def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[s
                   along.get("plan", np.empty(0)))
     for key, (title, _, energy) in paths.items():
         graph.line(title, FIRST if key == "plan" else SECOND, along[key], energy)
-    return graph.told()
+    return graph.as_dict()
 
 
 def force_graph(name: str, times: np.ndarray, measured: np.ndarray,
@@ -193,4 +195,4 @@ def force_graph(name: str, times: np.ndarray, measured: np.ndarray,
     graph.line("measured", MEASURED, times, forces["measured"], is_dotted=True)
     if "simulated" in forces:
         graph.line("simulated", SIMULATED, times, forces["simulated"])
-    return graph.told()
+    return graph.as_dict()

@@ -29,8 +29,8 @@ def add_observation(data: SceneData, branch: Branch) -> None:
     pulls = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
     data.info["pulls"] = pulls
     frames = data.info.get("frames") or {}
-    shown = frames.get("name")
-    name = shown if shown in pulls else (pulls[-1] if pulls else None)
+    pull_name = frames.get("name")
+    name = pull_name if pull_name in pulls else (pulls[-1] if pulls else None)
     if name is None:
         return
     try:
@@ -38,7 +38,7 @@ def add_observation(data: SceneData, branch: Branch) -> None:
     except InputError as error:
         data.info["notes"].append(f"pull {name} cannot be shown: {error}")
         return
-    is_shown = name == shown and frames["is_timed"]
+    is_shown = name == pull_name and frames["is_timed"]
     data.info["observation"] = {"pull": name, "is_shown": is_shown}
     data.arrays["observation_grasp"] = pull.poses[:, :3]
     data.arrays["observation_grasp_times"] = pull.times
@@ -69,14 +69,14 @@ def _add_frames(data: SceneData, branch: Branch, pull: Pull, count: int) -> None
     """Add the position of each point in each frame, and its distance to the simulation."""
     if "observation" not in data.arrays:
         return
-    places, seen = _in_frames(data, times_of_frames(data, pull.name))
-    data.arrays |= {"observation_motion": places, "observation_seen": seen}
+    seen_at, seen = _in_frames(data, times_of_frames(data, pull.name))
+    data.arrays |= {"observation_motion": seen_at, "observation_seen": seen}
     rest = _rest_points(data, pull.entry, count)
     if rest is None or not seen.any():
         return
     vertices = data.arrays["vertices"]
     positions, _, _ = read_pc2(branch.path(data.info["frames"]["file"]))
-    distance = np.linalg.norm(places - carried(rest, vertices, positions), axis=2)
+    distance = np.linalg.norm(seen_at - carried(rest, vertices, positions), axis=2)
     add_frame_scalar(data, "residual", _around(rest, distance, seen, vertices),
                      f"{RESIDUAL}, pull {pull.name}", "m", "inferno", is_from_zero=True)
 
@@ -99,13 +99,13 @@ def _in_frames(data: SceneData, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
     nearest = np.abs(times[:, None] - at).argmin(axis=1)
     step = np.diff(at).max(initial=0.0)
     is_inside = (times >= at[0] - step) & (times <= at[-1] + step)
-    places = np.empty((len(times), *found.shape[1:]))
+    positions = np.empty((len(times), *found.shape[1:]))
     for point in range(found.shape[1]):
         known = visible[:, point]
         for axis in range(3):
-            places[:, point, axis] = (np.interp(times, at[known], found[known, point, axis])
-                                      if known.any() else 0.0)
-    return places, visible[nearest] & is_inside[:, None]
+            positions[:, point, axis] = (np.interp(times, at[known], found[known, point, axis])
+                                         if known.any() else 0.0)
+    return positions, visible[nearest] & is_inside[:, None]
 
 
 def _around(points: np.ndarray, distance: np.ndarray, seen: np.ndarray, vertices: np.ndarray,

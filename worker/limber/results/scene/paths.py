@@ -15,7 +15,7 @@ from limber.results.scene.rods import add_rods
 from limber.store import Branch
 
 _POSITION = ("x_m", "y_m", "z_m")
-_TREES = {"D-RRT*": "plan", "RRT*": "baseline"}  # what a tree's path is called
+_TREES = {"D-RRT*": "plan", "RRT*": "baseline"}  # name of the path of each tree
 _ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 
 

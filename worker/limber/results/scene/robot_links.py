@@ -14,9 +14,9 @@ from limber.store import Branch
 
 _FARTHEST_M = 0.02
 """Distance to the dry run above which a frame's grasp belongs to another motion."""
-_GRIPPER = 0.9  # radius of its body in those of the thinnest link
-_PALM = 0.65  # how far from the flange to the grasp its body reaches
-_FINGER = 0.3  # radius of a finger in those of the body
+_GRIPPER = 0.9  # radius of its body over that of the thinnest link
+_PALM = 0.65  # extent of its body from the flange to the grasp
+_FINGER = 0.3  # radius of a finger over that of the body
 _POSE = ("x_m", "y_m", "z_m")
 
 
@@ -41,15 +41,15 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
         return
     names = tuple(f"q{number + 1}_rad" for number in range(len(arm.joint_names)))
     table = read_columns(branch.path(name), (*_POSE, *names), "the table of a dry run")
-    places, joints = (np.column_stack([table[column] for column in columns])
-                      for columns in (_POSE, names))
-    rows = _rows(places, grasps)
+    positions, joints = (np.column_stack([table[column] for column in columns])
+                         for columns in (_POSE, names))
+    rows = _rows(positions, grasps)
     if rows is None:
         return
     base = matrices(np.asarray(entry.result["base_pose"], float))
     starts, ends, radii = _arm_rods(arm, base, joints[rows])
     flange = (base @ arm.link_frames(joints[rows]))[:, -1]
-    held = _gripper_rods(flange, places[rows], _GRIPPER * float(radii.min()))
+    held = _gripper_rods(flange, positions[rows], _GRIPPER * float(radii.min()))
     data.arrays["robot_starts"], data.arrays["robot_ends"], data.arrays["robot_radii"] = (
         np.concatenate(parts, axis=axis) for parts, axis in zip(
             zip((starts, ends, radii), held, strict=True), (1, 1, 0), strict=True))
@@ -80,28 +80,28 @@ def _gripper_rods(flange: np.ndarray, grasps: np.ndarray, radius: float,
         grasps: Middle between the fingers [m], shape [n, 3].
         radius: Radius of the body [m].
     """
-    place = flange[:, :3, 3]
-    way = grasps - place
-    length = np.linalg.norm(way, axis=1, keepdims=True)
-    axis = way / np.maximum(length, 1e-9)
+    position = flange[:, :3, 3]
+    vector = grasps - position
+    length = np.linalg.norm(vector, axis=1, keepdims=True)
+    axis = vector / np.maximum(length, 1e-9)
     side = flange[:, :3, 0] - (flange[:, :3, 0] * axis).sum(axis=1, keepdims=True) * axis
     side *= 0.8 * radius / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    palm, tip = place + _PALM * way, grasps + 0.5 * radius * axis
-    return (np.stack([place, palm - side, palm + side], axis=1),
+    palm, tip = position + _PALM * vector, grasps + 0.5 * radius * axis
+    return (np.stack([position, palm - side, palm + side], axis=1),
             np.stack([palm, tip - side, tip + side], axis=1),
             radius * np.array([1.0, _FINGER, _FINGER]))
 
 
-def _rows(places: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:
+def _rows(positions: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:
     """Return the row of the dry run nearest to each frame, in ascending order; or None.
 
     Args:
-        places: Positions of the grasp in the dry run [m], shape [rows, 3].
+        positions: Positions of the grasp in the dry run [m], shape [rows, 3].
         grasps: Positions of the grasp in the frames [m], shape [frames, 3].
     """
     first, rows = 0, []
     for grasp in grasps:
-        distances = np.linalg.norm(places[first:] - grasp, axis=1)
+        distances = np.linalg.norm(positions[first:] - grasp, axis=1)
         first += int(distances.argmin())
         if distances.min() > _FARTHEST_M:
             return None

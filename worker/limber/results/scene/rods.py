@@ -67,14 +67,14 @@ def rods(points: np.ndarray, lines: np.ndarray, radius: float | np.ndarray,
     """
     points = np.asarray(points, float)
     size = np.broadcast_to(np.asarray(radius, float), len(points))
-    way = points[lines[:, 1]] - points[lines[:, 0]]
-    length = np.linalg.norm(way, axis=1)
-    lines, way = lines[length > 0], way[length > 0] / length[length > 0, None]
+    vector = points[lines[:, 1]] - points[lines[:, 0]]
+    length = np.linalg.norm(vector, axis=1)
+    lines, vector = lines[length > 0], vector[length > 0] / length[length > 0, None]
     # Perpendicular to a line: built from the axis least along it.
-    least = np.eye(3)[np.abs(way).argmin(axis=1)]
-    first = np.cross(way, least)
+    least = np.eye(3)[np.abs(vector).argmin(axis=1)]
+    first = np.cross(vector, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(way, first)
+    second = np.cross(vector, first)
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     ring = (first[:, None] * np.cos(angle)[:, None] + second[:, None] * np.sin(angle)[:, None])
     ends = points[lines][:, :, None] + size[lines][:, :, None, None] * ring[:, None]

@@ -133,10 +133,10 @@ def add_radii(data: SceneData, name: str, share: float) -> None:
 
 def alignment(branch: Branch) -> np.ndarray:
     """Return the 4x4 matrix that takes points of the scan's file to the branch's frame [m]."""
-    place = branch.manifest.alignment
+    transform = branch.manifest.alignment
     matrix = np.eye(4)
-    matrix[:3, 3] = place.apply(np.zeros((1, 3)))[0]
-    matrix[:3, :3] = (place.apply(np.eye(3)) - matrix[:3, 3]).T
+    matrix[:3, 3] = transform.apply(np.zeros((1, 3)))[0]
+    matrix[:3, :3] = (transform.apply(np.eye(3)) - matrix[:3, 3]).T
     return matrix
 
 

@@ -95,7 +95,7 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
             "branch.")
 
 
-def touched_place(cell: Cell, sample: Sample) -> np.ndarray:
+def touched_point(cell: Cell, sample: Sample) -> np.ndarray:
     """Return the position of the gripper's middle by :func:`gripper_pose` [m], shape [3]."""
     return gripper_pose(cell, sample)[:3]
 

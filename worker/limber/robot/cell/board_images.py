@@ -79,10 +79,10 @@ def find_board(path: Path, board: Board, camera: CameraEntry) -> View | None:
     corners, pixels = _corners(cv2, picture, board)
     if len(corners) < _FEWEST_CORNERS:
         return None
-    found, turn, place = cv2.solvePnP(corners, pixels, _matrix(camera), np.zeros(5))
+    found, turn, translation = cv2.solvePnP(corners, pixels, _matrix(camera), np.zeros(5))
     if not found:
         return None
-    return View(path.name, corners, pixels, np.r_[place.ravel(), turn.ravel()])
+    return View(path.name, corners, pixels, np.r_[translation.ravel(), turn.ravel()])
 
 
 def _corners(cv2: Any, picture: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
@@ -157,6 +157,6 @@ def _pixels_off(values: np.ndarray, moves: np.ndarray, views: list[View], lens: 
     seen = inverted(matrices(values[:6])) @ moves @ matrices(values[6:])
     parts = []
     for frame, view in zip(seen, views, strict=True):
-        places = (view.corners @ frame[:3, :3].T + frame[:3, 3]) @ lens.T
-        parts.append(places[:, :2] / np.maximum(places[:, 2:], 1e-6) - view.pixels)
+        projected = (view.corners @ frame[:3, :3].T + frame[:3, 3]) @ lens.T
+        parts.append(projected[:, :2] / np.maximum(projected[:, 2:], 1e-6) - view.pixels)
     return np.concatenate(parts).ravel()

@@ -277,8 +277,8 @@ class Cell(_Entry):
 
     @model_validator(mode="after")
     def _makes_sense(self) -> "Cell":
-        if told := list(slips(self)):
-            raise ValueError("; ".join(told))
+        if found_slips := list(slips(self)):
+            raise ValueError("; ".join(found_slips))
         return self
 
     @property
@@ -330,8 +330,8 @@ def read_cell(path: str | Path) -> Cell:
     try:
         return validated(Cell, content)
     except ValidationError as error:
-        told = "; ".join(_told(path, item) for item in error.errors())
-        raise InputError(told, "The robot's position or reach would be wrong.",
+        problems = "; ".join(_problem_text(path, item) for item in error.errors())
+        raise InputError(problems, "The robot's position or reach would be wrong.",
                          "Correct the entries; lengths are in metres, angles in radians.",
                          ) from error
 
@@ -346,14 +346,14 @@ def write_cell(path: str | Path, cell: Cell) -> None:
     write_atomically(Path(path), tomlkit.dumps(content))
 
 
-def _told(path: Path, item: dict) -> str:
-    place = ".".join(str(part) for part in item["loc"])
+def _problem_text(path: Path, item: dict) -> str:
+    key = ".".join(str(part) for part in item["loc"])
     message = item["msg"].removeprefix("Value error, ")
     # An error that several entries cause together begins with the name of one of them.
     named = tuple(re.match(r"[\w.]+", message)[0].split(".")) if not item["loc"] else item["loc"]
     line = _line_of(path, named)
     where = f"{path}, line {line}" if line else f"{path}"
-    return f"{where}: {place}: {message}" if place else f"{where}: {message}"
+    return f"{where}: {key}: {message}" if key else f"{where}: {message}"
 
 
 def _line_of(path: Path, location: tuple) -> int | None:

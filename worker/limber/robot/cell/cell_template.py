@@ -69,8 +69,8 @@ def _lines(kind: type[BaseModel], stated: dict[str, Any], examples: dict[str, An
 def _obstacle(entry: dict[str, Any], is_example: bool) -> str:
     mark = "# " if is_example else ""
     lines = [f"{mark}{name} = {_written(value)}" for name, value in entry.items()]
-    told = "A box in the way." if entry["kind"] == "box" else "A closed surface in the way."
-    return "\n".join([f"# {told}", f"{mark}[[obstacles]]", *lines]) + "\n"
+    comment = "A box in the way." if entry["kind"] == "box" else "A closed surface in the way."
+    return "\n".join([f"# {comment}", f"{mark}[[obstacles]]", *lines]) + "\n"
 
 
 def _written(value: Any) -> str:

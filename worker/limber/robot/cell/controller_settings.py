@@ -37,8 +37,8 @@ class Difference:
     is_set: bool
 
     def __str__(self) -> str:
-        told = f"{self.what}: {self.seen} in the controller, {self.wanted} in the cell file"
-        return f"{told} (set for a motion, and put back)" if self.is_set else told
+        message = f"{self.what}: {self.seen} in the controller, {self.wanted} in the cell file"
+        return f"{message} (set for a motion, and put back)" if self.is_set else message
 
 
 def tool_in_controller(cell: Cell, sample: Sample,
@@ -59,9 +59,9 @@ def is_tool(cell: Cell, sample: Sample, tool: np.ndarray,
             calibration: FactoryCalibration | None = None) -> bool:
     """Whether ``tool`` [6] is set in the controller, as far as that is known."""
     seen = tool_in_controller(cell, sample, calibration)
-    told = sample.tool is not None or calibration is not None
-    return bool(length(seen[:3] - tool[:3]) <= (_TOLD_M if told else NOMINAL_M)
-                and length(turn_between(tool, seen)) <= (_TOLD_RAD if told else NOMINAL_RAD))
+    is_reported = sample.tool is not None or calibration is not None
+    return bool(length(seen[:3] - tool[:3]) <= (_TOLD_M if is_reported else NOMINAL_M)
+                and length(turn_between(tool, seen)) <= (_TOLD_RAD if is_reported else NOMINAL_RAD))
 
 
 def require_tool(cell: Cell, sample: Sample) -> None:
@@ -100,8 +100,8 @@ def differences(cell: Cell, sample: Sample, calibration: FactoryCalibration | No
     centre = np.array(cell.tool.centre_of_mass_m)
     if sample.payload_centre is not None and mass and not (
             length(sample.payload_centre - centre) <= _SAME_CENTRE_M):
-        found.append(Difference("centre of the payload", _place(sample.payload_centre),
-                                _place(centre), True))
+        found.append(Difference("centre of the payload", _position_text(sample.payload_centre),
+                                _position_text(centre), True))
     if sample.slider < 1.0:
         found.append(Difference("speed slider", f"{100 * sample.slider:.0f} %",
                                 "100 % assumed", False))
@@ -149,8 +149,8 @@ def in_millimetres(pose: np.ndarray) -> str:
     """Return a pose [m, rad, 6] as text."""
     # Adding 0 makes a zero of a rounded -0.
     turn = ", ".join(f"{value:.1f}" for value in np.degrees(pose[3:]).round(1) + 0.0)
-    return f"{_place(pose[:3])}, turned by ({turn}) degrees"
+    return f"{_position_text(pose[:3])}, turned by ({turn}) degrees"
 
 
-def _place(place: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.0f}" for value in (1000 * place).round() + 0.0) + ") mm"
+def _position_text(position: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.0f}" for value in (1000 * position).round() + 0.0) + ") mm"

@@ -21,10 +21,10 @@ from limber.robot.cell.base_calibration import least_depth
 
 CameraOn = Literal["stand", "gripper"]
 
-_LEVER_M = 0.1  # a turn of the board counts as much as this times it
-_FEWEST = {6: 3, 3: 5}  # views, of a board and of a marker
+_LEVER_M = 0.1  # m; converts a turn of the board to a length
+_FEWEST = {6: 3, 3: 5}  # fewest views of a board and of a marker
 _LEAST_TURN = 0.15  # rad, rms about the second axis
-_STARTS, _REFINED = 400, 4  # turns of the camera to begin from
+_STARTS, _REFINED = 400, 4  # rotations of the camera from which the fit begins
 _STEP = 1e-6
 
 
@@ -64,9 +64,9 @@ class CameraFit:
         for k in range(len(known)):
             moved = known.copy()
             moved[k] += _STEP
-            there = frame(*_frames(moved))
-            slopes[:3, k] = (there - middle)[:3] @ np.r_[point, 1.0] / _STEP
-            slopes[3:, k] = rotation_vector(there[:3, :3] @ middle[:3, :3].T) / _STEP
+            moved_frame = frame(*_frames(moved))
+            slopes[:3, k] = (moved_frame - middle)[:3] @ np.r_[point, 1.0] / _STEP
+            slopes[3:, k] = rotation_vector(moved_frame[:3, :3] @ middle[:3, :3].T) / _STEP
         spread = slopes @ self.covariance @ slopes.T
         return (float(np.sqrt(np.linalg.eigvalsh(spread[:3, :3])[-1])),
                 float(np.sqrt(np.linalg.eigvalsh(spread[3:, 3:])[-1])))
@@ -128,9 +128,9 @@ def _require_turns(moves: np.ndarray, what: str) -> None:
             "Tilt the gripper about two axes, by at least 20 degrees in each direction.")
 
 
-def _require_depth(places: np.ndarray, largest_residual: float) -> None:
+def _require_depth(positions: np.ndarray, largest_residual: float) -> None:
     """Refuse positions [n, 3] in a plane: they fit equally well with mirrored camera axes."""
-    spread = spreads(places)[2]
+    spread = spreads(positions)[2]
     needed = least_depth(largest_residual)
     if spread < needed:
         raise InputError(
@@ -149,8 +149,8 @@ def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[flo
     count = len(moves)
     left = np.hstack([np.tile(-np.eye(3), (count, 1)), moves[:, :3, :3].reshape(-1, 3)])
     right = (seen[:, :3] @ turn.T - moves[:, :3, 3]).ravel()
-    places = np.linalg.lstsq(left, right, rcond=None)[0]
-    start = np.r_[places[:3], rotation_vector(turn), places[3:]]
+    translations = np.linalg.lstsq(left, right, rcond=None)[0]
+    start = np.r_[translations[:3], rotation_vector(turn), translations[3:]]
     if seen.shape[1] == 6:
         boards = moves[:, :3, :3].transpose(0, 2, 1) @ turn @ matrices(seen)[:, :3, :3]
         start = np.r_[start, Rotation.from_matrix(boards).mean().as_rotvec()]
@@ -160,10 +160,10 @@ def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[flo
 def _off(values: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Distances and rotations [m] between boards as seen and as expected, flat."""
     camera, board = _frames(values)
-    there, should = camera @ matrices(_whole(seen)), moves @ board
-    off = there[:, :3, 3] - should[:, :3, 3]
+    predicted, expected = camera @ matrices(_whole(seen)), moves @ board
+    off = predicted[:, :3, 3] - expected[:, :3, 3]
     if seen.shape[1] == 6:
-        turns = rotation_vector(should[:, :3, :3].transpose(0, 2, 1) @ there[:, :3, :3])
+        turns = rotation_vector(expected[:, :3, :3].transpose(0, 2, 1) @ predicted[:, :3, :3])
         off = np.hstack([off, _LEVER_M * turns])
     return off.ravel()
 

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 FAR = 20.0
 """Greatest distance from the branch [m] of any object that an arm works with."""
-_FAR_FROM_ARM = 10.0  # m that the branch's origin may be beyond the arm's reach
-_AT_FLANGE = 1.0  # m; what an arm carries is nearer to its flange
+_FAR_FROM_ARM = 10.0  # m; distance of the branch's origin beyond the arm's reach
+_AT_FLANGE = 1.0  # m; a tool is nearer to the flange
 _WHOLE_TURN = 2 * math.pi + 1e-6
-_DEGREES = 4 * math.pi  # no joint's limit is beyond; in degrees nearly all are
+_DEGREES = 4 * math.pi  # no joint limit is beyond; in degrees nearly all are
 _LARGEST_RANGE = {"force": 1e4, "torque": 1e3}  # [N], [N m]
 
 
@@ -34,7 +34,7 @@ def slips(cell: "Cell") -> Iterator[str]:
     if cell.sensor.kind != "none":
         yield from _sensor_slips(cell.sensor, cell.limits.hard_force_n, cell.limits.hard_torque_nm)
     yield from _camera_slips(cell)
-    yield from _place_slips(cell)
+    yield from _position_slips(cell)
 
 
 def _joint_slips(cell: "Cell") -> Iterator[str]:
@@ -78,8 +78,8 @@ def _pose_slips(cell: "Cell") -> Iterator[str]:
             yield from _far(f"tool.parts.{number}.{end}", getattr(part, end), _AT_FLANGE)
 
 
-def _far(name: str, place: Any, most: float) -> Iterator[str]:
-    distance = math.hypot(*place)
+def _far(name: str, position: Any, most: float) -> Iterator[str]:
+    distance = math.hypot(*position)
     if distance > most:
         yield (f"{name} is {distance:g} m away, farther than the {most:g} m that are possible; "
                f"{distance / 1000:g} m? Was it given in millimetres?")
@@ -133,7 +133,7 @@ def _camera_slips(cell: "Cell") -> Iterator[str]:
                f"{camera.height} pixels")
 
 
-def _place_slips(cell: "Cell") -> Iterator[str]:
+def _position_slips(cell: "Cell") -> Iterator[str]:
     """Distances that the arm is to reach, compared with its reach from the base."""
     if cell.workspace is None:
         return

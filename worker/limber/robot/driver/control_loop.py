@@ -27,7 +27,7 @@ from limber.robot.driver.messages import Words
 from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory
 
@@ -35,7 +35,7 @@ PARENT_SECONDS = 1.0
 """Longest time between messages of the parent before the robot stops."""
 
 _PROGRAM_SECONDS = 1.5
-_GONE_SECONDS = 1.0  # of silence; from the first of them on the arm is being stopped
+_GONE_SECONDS = 1.0  # of silence; at its start the arm is already being stopped
 _LOOP_PRIORITY = 22
 
 Orders = queue.SimpleQueue[dict[str, Any] | None]
@@ -137,7 +137,7 @@ class Driver:
                 self._under_way.judge(
                     self.guard.event("the program that drives the robot has ended"))
                 self._put_back()
-                self._senses.way_file.close()
+                self._senses.followed_file.close()
                 self.ended = True
                 return
             self._heard = time.monotonic()
@@ -172,7 +172,7 @@ class Driver:
         elif name == "gripper":
             close = bool(order["close"])
             self._control.grip(close)
-            self._senses.way_file.gripped(close)
+            self._senses.followed_file.gripped(close)
             self.tell(event="gripper", closed=close)
         else:
             raise InputError(f"Order {name!r} is unknown.")
@@ -192,11 +192,11 @@ class Driver:
 
     def _retreat(self) -> None:
         sample = self._require_sample()
-        way = self._senses.way_back.from_here(sample, self.cell.limits.acceleration_m_s2)
+        trajectory = self._senses.retreat_path.from_here(sample, self.cell.limits.acceleration_m_s2)
         self._require_program(sample)
         self._senses.recall_tare()
         self.guard.begin_retreat(self._senses.smooth)
-        self._set_off(way)
+        self._set_off(trajectory)
 
     def _set_off(self, trajectory: Trajectory) -> None:
         self._under_way.begin(trajectory)
@@ -215,10 +215,10 @@ class Driver:
         """Start the control program once more, and check that it runs."""
         started = self._control.start_program()
         self._deadline.renew()
-        given_up = time.monotonic() + _PROGRAM_SECONDS
+        deadline = time.monotonic() + _PROGRAM_SECONDS
         while not (self._control.program_runs()
                    and self._require_sample().runtime_state == PLAYING):
-            if not started or time.monotonic() > given_up:
+            if not started or time.monotonic() > deadline:
                 raise WorkError("The control program is not running.", "", "See the pendant.")
             self._deadline.renew()
             for sample in self._control.read(1.0 / self._control.rate):
@@ -322,12 +322,12 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None
         guard.state = State.MOVING
         guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
         pose_of(base @ frame_of(sample.pose))
-    _walk_back(samples[0], WayBack(cell.arm.joint_names))
+    _walk_back(samples[0], RetreatPath(cell.arm.joint_names))
 
 
-def _walk_back(sample: Sample, way: WayBack) -> None:
+def _walk_back(sample: Sample, retreat: RetreatPath) -> None:
     """Simulate a millimetre and the return, so that everything needed for it is loaded."""
-    there = replace(sample, pose=sample.pose + np.r_[0.002, np.zeros(5)])
-    way.begin(sample, Trajectory(np.array([0.0, 1.0]), np.array([sample.pose, there.pose])))
-    way.note(there)
-    way.from_here(there, 0.1)
+    shifted = replace(sample, pose=sample.pose + np.r_[0.002, np.zeros(5)])
+    retreat.begin(sample, Trajectory(np.array([0.0, 1.0]), np.array([sample.pose, shifted.pose])))
+    retreat.note(shifted)
+    retreat.from_here(shifted, 0.1)

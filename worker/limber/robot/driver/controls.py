@@ -9,7 +9,7 @@ from limber.robot.interface import ArmControl
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.samples import Dashboard
 
-_JOINTS = 6  # of which samples and recordings have columns
+_JOINTS = 6  # joints for which samples and recordings have columns
 
 
 def _virtual(cell: Cell) -> ArmControl:

@@ -20,7 +20,7 @@ from limber.robot.driver.control_loop import Driver, Orders
 from limber.robot.driver.deadline import clear_deadline
 from limber.robot.driver.messages import Words
 
-_LAST_SECONDS = 10.0  # from when nobody gives orders any more; a stop takes one at most
+_LAST_SECONDS = 10.0  # after the last order; a stop takes at most one second
 
 
 def _read_orders(orders: Orders) -> None:

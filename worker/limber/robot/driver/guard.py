@@ -23,10 +23,10 @@ from limber.robot.ratings import within_ratings
 
 _RUNNING, _NORMAL, PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
-_DEVIATIONS = 2.0  # of a prediction that are allowed for
-_MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a difference lies
-_MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides pulls askew
-_PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, on a retreat
+_DEVIATIONS = 2.0  # standard deviations of a prediction that are allowed
+_MOSTLY = 0.8  # cosine of the angle to the predicted force that a difference opposes
+_MOSTLY_AT_ONCE = 0.5  # the same for a sudden change: a sliding piece pulls sideways
+_PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, during a retreat
 _CERTAIN = np.zeros((6, 6))
 _RISES = "the {} rises during the return"
 _UNLIKE = "the force differs from the predicted one [N]"
@@ -87,7 +87,7 @@ class GuardSettings:
         loss_time: Time in which such a loss counts as sudden [s].
         least_force: Force below which a loss cannot be distinguished from noise [N].
         largest_torque_error: Largest difference between the torque and the predicted one [N m].
-        relief_way: Path of a retreat over which a force above the soft limit falls by at least
+        relief_distance: Path of a retreat over which a force above the soft limit falls by at least
             ``least_force`` [m].
         relief_time: The same for a slow retreat [s].
     """
@@ -103,7 +103,7 @@ class GuardSettings:
     loss_time: float = 0.5
     least_force: float = 1.0
     largest_torque_error: float = 1.0
-    relief_way: float = 0.02
+    relief_distance: float = 0.02
     relief_time: float = 10.0
 
 
@@ -136,7 +136,7 @@ class _Memory:
     peak: float = 0.0
     usual_off: np.ndarray | None = None
     grasp: np.ndarray | None = None
-    way: np.ndarray | None = None
+    travel: np.ndarray | None = None
     relief: _Relief | None = None
     by_joints: bool = False
 
@@ -263,10 +263,10 @@ class Guard:
             sent: Target of the tool at this time, base frame [m], shape [3], or None.
         """
         last, self._memory.grasp = self._memory.grasp, grasp
-        self._memory.way = None if last is None or grasp is None else grasp - last
+        self._memory.travel = None if last is None or grasp is None else grasp - last
         for check in (self._check_clock(sample), self._check_modes(sample),
                       self._check_wrench(sample, wrench, raw), self._check_settings(sample),
-                      self._check_place(sample, grasp, sent),
+                      self._check_position(sample, grasp, sent),
                       self._check_expected(wrench, expected, uncertainty)):
             if check.verdict == Verdict.STOP:
                 return check
@@ -294,9 +294,9 @@ class Guard:
             self._stop("an invalid target pose")
             raise SafetyStop("An invalid target pose was given.", f"{target}", "")
         limits = self._settings.limits
-        way = length(target[:3] - current[:3])
+        distance = length(target[:3] - current[:3])
         turn = length(turn_between(current, target))
-        part = min(1.0, limits.speed_m_s * seconds / way if way > 0 else 1.0,
+        part = min(1.0, limits.speed_m_s * seconds / distance if distance > 0 else 1.0,
                    limits.turn_speed_rad_s * seconds / turn if turn > 0 else 1.0)
         return target if part >= 1.0 else pose_between(current, target, part)
 
@@ -355,15 +355,15 @@ class Guard:
             return self._stop("the force sensor is at the end of its range")
         force, torque = length(wrench[:3]), length(wrench[3:])
         most_force, most_torque = limits.hard_force_n, limits.hard_torque_nm
-        told = "hard {} limit"
+        limit_text = "hard {} limit"
         if (relief := self._memory.relief) is not None:
-            told = _RISES
+            limit_text = _RISES
             most_force = max(most_force, self._relieved_force(relief))
             most_torque = max(most_torque, self._relieved_torque(relief))
         if force > most_force:
-            return self._stop(told.format("force") + " [N]", force, most_force)
+            return self._stop(limit_text.format("force") + " [N]", force, most_force)
         if torque > most_torque:
-            return self._stop(told.format("torque") + " [N m]", torque, most_torque)
+            return self._stop(limit_text.format("torque") + " [N m]", torque, most_torque)
         return _GO
 
     def _relieved_force(self, relief: _Relief) -> float:
@@ -388,7 +388,7 @@ class Guard:
             return self._stop(_RISES.format("torque") + " [N m]", torque, most)
         mark = relief.marked_grasp
         has_gone = (mark is not None and grasp is not None
-                    and length(grasp - mark) > settings.relief_way)
+                    and length(grasp - mark) > settings.relief_distance)
         if mark is None or has_gone or sample.clock - relief.marked_clock > settings.relief_time:
             if force > limits.soft_force_n and force > relief.marked_force - settings.least_force:
                 return self._stop("the force does not fall during the return [N]", force,
@@ -414,8 +414,8 @@ class Guard:
         self._memory.filtered = kept * before + (1 - kept) * wrench
         return self._memory.filtered
 
-    def _check_place(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
-                     ) -> Decision:
+    def _check_position(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
+                        ) -> Decision:
         limits, settings = self._settings.limits, self._settings
         speed = length(sample.speed[:3])
         if speed > 1.5 * limits.speed_m_s + 0.005:
@@ -456,7 +456,7 @@ class Guard:
             # There is no prediction while E is being measured. A sudden loss still indicates a
             # slip, but not while the branch is released and pulls in the gripper's direction of
             # motion.
-            if memory.way is not None and float(memory.way @ filtered[:3]) < 0:
+            if memory.travel is not None and float(memory.travel @ filtered[:3]) < 0:
                 memory.peak = force
             memory.peak = max(memory.peak * np.exp(-self._step / settings.loss_time), force)
             lost = memory.peak - force
@@ -465,14 +465,14 @@ class Guard:
                                   max(settings.lost_share * memory.peak, settings.least_force))
             return _GO
         uncertainty = _CERTAIN if uncertainty is None else uncertainty
-        wanted = length(expected[:3])
-        if wanted > settings.least_force:
-            along = float(filtered[:3] @ expected[:3]) / wanted
+        expected_size = length(expected[:3])
+        if expected_size > settings.least_force:
+            along = float(filtered[:3] @ expected[:3]) / expected_size
             unsure = _DEVIATIONS * float(np.sqrt(max(
-                expected[:3] @ uncertainty[:3, :3] @ expected[:3], 0.0))) / wanted
-            if along < (1 - settings.lost_share) * wanted - settings.least_force - unsure:
+                expected[:3] @ uncertainty[:3, :3] @ expected[:3], 0.0))) / expected_size
+            if along < (1 - settings.lost_share) * expected_size - settings.least_force - unsure:
                 return self._stop("the branch slipped, broke or was never held: force in the "
-                                  "predicted direction [N]", along, wanted)
+                                  "predicted direction [N]", along, expected_size)
         limits = settings.limits
         off = filtered - expected
         before = self._usual_off(off[:3])
@@ -503,14 +503,14 @@ class Guard:
             off: The difference, shape [3].
             before: The usual difference so far, shape [3].
         """
-        wanted, missing = length(expected), -float(off @ expected)
-        if wanted <= self._settings.least_force:
+        expected_size, missing = length(expected), -float(off @ expected)
+        if expected_size <= self._settings.least_force:
             return _UNLIKE
         size = length(off)
         at_once = length(off - before) > 0.5 * size
-        if at_once and missing > _MOSTLY_AT_ONCE * wanted * size:
+        if at_once and missing > _MOSTLY_AT_ONCE * expected_size * size:
             return _FELL
-        return _SHORT if missing > _MOSTLY * wanted * size else _UNLIKE
+        return _SHORT if missing > _MOSTLY * expected_size * size else _UNLIKE
 
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
         decision = Decision(Verdict.STOP, reason, value, limit)

@@ -13,9 +13,9 @@ from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain
 from limber.robot.driver.guard import Guard, Verdict
 from limber.robot.interface import ArmControl, Sample
-from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.motion.way_file import WayFile, read_way
+from limber.robot.motion.way_file import FollowedPathFile, read_followed_path
 
 _BATCH_SECONDS = 0.02
 _OLDEST_READING_SECONDS = 0.05
@@ -28,7 +28,7 @@ class Senses:
 
     Attributes:
         smooth: Latest smoothed wrench, branch frame [N, N m], shape [6].
-        way_back: The arm's path so far.
+        retreat_path: The arm's path so far.
     """
 
     def __init__(self, cell: Cell, control: ArmControl, sensor: ForceTorqueSensor, guard: Guard,
@@ -38,8 +38,8 @@ class Senses:
         self._sensor, self._guard = sensor, guard
         self._chain = WrenchChain(cell, count=5 if control.rate > 200 else 3)
         self._under_way, self._hold_ups, self._tell = under_way, hold_ups, tell
-        self.way_file, followed = WayFile(cell), read_way(cell)
-        self.way_back = WayBack(cell.arm.joint_names, followed, self.way_file)
+        self.followed_file, followed = FollowedPathFile(cell), read_followed_path(cell)
+        self.retreat_path = RetreatPath(cell.arm.joint_names, followed, self.followed_file)
         self._is_tared = False
         self._recalls_tare = followed is not None and followed.bias is not None
         if followed is not None and followed.bias is not None:
@@ -59,7 +59,7 @@ class Senses:
 
     def begin(self, sample: Sample, trajectory: Trajectory) -> None:
         """A trajectory is followed from ``sample`` on."""
-        self.way_back.begin(sample, trajectory)
+        self.retreat_path.begin(sample, trajectory)
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
         if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
             # Here the gripper closed on the resting branch: displacements are measured from here.
@@ -78,7 +78,7 @@ class Senses:
         following = self._under_way.following
         expected = uncertainty = sent = None
         if following is not None:
-            self.way_back.note(sample)
+            self.retreat_path.note(sample)
             # The arm is at the target of one look-ahead ago.
             behind = max(following.time - self._lookahead * following.rate, 0.0)
             planned = following.trajectory.pose(behind)
@@ -157,7 +157,7 @@ class Senses:
             return
         self._guard.tared()
         self._is_tared = True
-        self.way_file.tared(self._chain.bias)
+        self.followed_file.tared(self._chain.bias)
         self._tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
                    delay_s=self._chain.delay(self._rate))
 
@@ -172,5 +172,5 @@ class Senses:
 
     def close(self) -> None:
         """Release the sensor, and make sure that the path is on disk."""
-        self.way_file.close()
+        self.followed_file.close()
         self._sensor.close()

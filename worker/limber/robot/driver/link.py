@@ -22,7 +22,7 @@ _CONNECT_SECONDS = 25.0
 _BEAT_SECONDS = 0.2
 _STANDS_SECONDS = 0.3
 _DASHBOARD_SECONDS = 0.5
-_LAST_WORDS_SECONDS = 1.0  # that are in the pipe still when the process has ended
+_LAST_WORDS_SECONDS = 1.0  # messages still in the pipe when the process has ended
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop}
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",

@@ -72,8 +72,9 @@ class LiveForce:
     def _write(self) -> None:
         """Without waiting for the disk: samples arrive meanwhile, and the file is short-lived."""
         content = {"format": FORMAT, "title": self._title, "step": self._step,
-                   "force_n": _told(self._force), "expected_n": _told(self._expected),
-                   "peak_n": _told(self._peak), "limit_n": self._limit, "at": time.time(),
+                   "force_n": _finite_or_none(self._force),
+                   "expected_n": _finite_or_none(self._expected),
+                   "peak_n": _finite_or_none(self._peak), "limit_n": self._limit, "at": time.time(),
                    "recent": list(self._recent)}
         temporary = self._path.with_name(owned_name(self._path.name))
         try:
@@ -85,5 +86,5 @@ class LiveForce:
             temporary.unlink(missing_ok=True)
 
 
-def _told(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return round(value, 4) if np.isfinite(value) else None

@@ -11,7 +11,7 @@ VIRTUAL_ROBOT_PRIORITY = 25
 """Before the driver that controls it: a real controller has a computer of its own."""
 
 _WAKING = Path("/dev/cpu_dma_latency")
-_ALL_PRESENT = 1  # MCL_CURRENT: not what comes later, which could then be refused
+_ALL_PRESENT = 1  # MCL_CURRENT: not future memory, which could then be refused
 
 
 def claim_real_time(priority: int = 20) -> bool:

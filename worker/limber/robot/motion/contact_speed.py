@@ -37,9 +37,9 @@ def contact_speed(cell: Cell, stiffness: float) -> float:
         InputError: not even a millimetre a second is slow enough.
     """
     limits = cell.limits
-    way = (OVER_HARD * limits.hard_force_n - limits.soft_force_n) / stiffness
+    distance = (OVER_HARD * limits.hard_force_n - limits.soft_force_n) / stiffness
     lost = _BRAKING_M_S2 * reaction_seconds(cell)
-    speed = float(np.sqrt(lost**2 + 2 * _BRAKING_M_S2 * way) - lost)
+    speed = float(np.sqrt(lost**2 + 2 * _BRAKING_M_S2 * distance) - lost)
     if speed < _SLOWEST_M_S:
         raise InputError(
             f"A contact of {stiffness:g} N/m adds more than the force between limits.soft_force_n "

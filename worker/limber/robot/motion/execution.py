@@ -9,13 +9,13 @@ from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotated, rotation_vector
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import speed_within
-from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, at_places
+from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, interpolated
 from limber.robot.motion.joint_path import JointPath, follow, no_branch
 from limber.robot.motion.trajectory import Trajectory, along, densely
 
-_WITHIN = 7.815  # squared deviations that hold 95 % of a vector's draws
-_TURNS = 12  # directions about the branch from which the gripper may come
-_MOST_TRIED = 24  # ways of taking the path that are held against obstacles
+_WITHIN = 7.815  # chi-squared: 95 % of a vector's draws
+_TURNS = 12  # directions around the branch from which the gripper may come
+_MOST_TRIED = 24  # variants of the path checked against obstacles
 
 Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
 """Obstacles to flange frames [n, 4, 4] at joint angles [n, joints]; None if there are none."""
@@ -40,7 +40,7 @@ class RobotMotion:
     rotation: np.ndarray
 
     @property
-    def way_back(self) -> Trajectory:
+    def return_path(self) -> Trajectory:
         """The path reversed, with the expected wrench along it."""
         return self.path.backwards()
 
@@ -51,7 +51,7 @@ class RobotMotion:
 
 
 @dataclass(frozen=True)
-class _Way:
+class _PathSegment:
     """One option for the path: approach and steps of the gripper's middle, base frame."""
 
     rotation: np.ndarray
@@ -88,21 +88,21 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
                          "not match.",
                          "Reduce --speed, or raise limits.speed_m_s in the cell file.")
     speed = speed_within(cell, speed)
-    wanted = across(axis) if rotation is None else [np.asarray(rotation, float)]
-    ways: list[_Way] = []
+    rotations = across(axis) if rotation is None else [np.asarray(rotation, float)]
+    segments: list[_PathSegment] = []
     refusal: NoPathError | None = None
-    for turn in wanted:
-        found = _ways(cell, predicted.poses, turn)
+    for turn in rotations:
+        found = _path_segments(cell, predicted.poses, turn)
         if isinstance(found, NoPathError):
             refusal = refusal or found
         else:
-            ways += found
-    ways.sort(key=lambda way: -way.joints.singularity)
-    for way in ways[:_MOST_TRIED]:
-        met = None if blocked is None else blocked(way.flange, way.joints.joints)
+            segments += found
+    segments.sort(key=lambda segment: -segment.joints.singularity)
+    for segment in segments[:_MOST_TRIED]:
+        met = None if blocked is None else blocked(segment.flange, segment.joints.joints)
         if met is None:
-            return _timed(cell, predicted, way, speed)
-        refusal = met if way is ways[0] else refusal
+            return _timed(cell, predicted, segment, speed)
+        refusal = met if segment is segments[0] else refusal
     assert refusal is not None
     raise refusal
 
@@ -126,13 +126,14 @@ def across(axis: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _ways(cell: Cell, poses: np.ndarray, rotation: np.ndarray) -> list[_Way] | NoPathError:
+def _path_segments(cell: Cell, poses: np.ndarray,
+                   rotation: np.ndarray) -> list[_PathSegment] | NoPathError:
     """Return the options for the grasp along ``poses`` [n, 6], or why there is none."""
     grip = inverted(matrices(poses[0])) @ matrices(np.r_[poses[0, :3], rotation])
     held = matrices(poses) @ grip
     back = held[0].copy()
-    way = held[0, :3, :3] @ np.array(cell.approach.direction)
-    back[:3, 3] -= cell.approach.distance_m * way
+    direction = held[0, :3, :3] @ np.array(cell.approach.direction)
+    back[:3, 3] -= cell.approach.distance_m * direction
     base = inverted(matrices(np.array(cell.base.pose)))
     approach = densely(pose_vectors(base @ np.array([back, held[0]])))
     steps = pose_vectors(base @ held)
@@ -144,24 +145,25 @@ def _ways(cell: Cell, poses: np.ndarray, rotation: np.ndarray) -> list[_Way] | N
                              joint_margin=cell.limits.joint_margin_rad)
     if not found:
         return no_branch(refusals, flange)
-    return [_Way(rotation, approach, steps, path, flange, joints) for joints in found]
+    return [_PathSegment(rotation, approach, steps, path, flange, joints) for joints in found]
 
 
-def _timed(cell: Cell, predicted: Predicted, way: _Way, speed: float) -> RobotMotion:
+def _timed(cell: Cell, predicted: Predicted, segment: _PathSegment, speed: float) -> RobotMotion:
     """Return the motion on a path, with the expected wrench along it."""
-    limits, steps, path = cell.limits, way.steps, way.path
+    limits, steps, path = cell.limits, segment.steps, segment.path
     times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
     # Predictions are at the plan's poses; they are interpolated to the dense poses along the path.
-    ways = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
+    arc = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
     dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
-    expected = at_places(predicted, ways, dense).felt(cell, path[0])
-    coming = along(way.approach, speed, limits.acceleration_m_s2)
-    first = len(way.approach)
+    expected = interpolated(predicted, arc, dense).felt(cell, path[0])
+    coming = along(segment.approach, speed, limits.acceleration_m_s2)
+    first = len(segment.approach)
     # The last pose of the approach is the first of the path.
-    coming_joints, joints = way.joints.joints[:first], way.joints.joints[first - 1:]
-    return RobotMotion(Trajectory(coming, way.approach, ExpectedWrench.nothing(way.approach),
+    coming_joints, joints = segment.joints.joints[:first], segment.joints.joints[first - 1:]
+    return RobotMotion(Trajectory(coming, segment.approach,
+                                  ExpectedWrench.nothing(segment.approach),
                                   coming_joints),
-                       Trajectory(times, path, expected, joints), way.joints, way.rotation)
+                       Trajectory(times, path, expected, joints), segment.joints, segment.rotation)
 
 
 @dataclass(frozen=True)
@@ -194,10 +196,10 @@ def followed(samples: np.ndarray, path: np.ndarray, force_sigma: float = 0.0) ->
     """
     force = samples[:, 13:16]
     # Distance from segments, not from points.
-    start, way = path[:-1], np.diff(path, axis=0)
-    length = np.maximum((way**2).sum(axis=1), 1e-18)
+    start, vectors = path[:-1], np.diff(path, axis=0)
+    length = np.maximum((vectors**2).sum(axis=1), 1e-18)
     nearest = np.full(len(samples), np.inf)
-    for a, step, square in zip(start, way, length, strict=True):
+    for a, step, square in zip(start, vectors, length, strict=True):
         part = np.clip((samples[:, 1:4] - a) @ step / square, 0, 1)
         nearest = np.minimum(nearest, np.linalg.norm(
             samples[:, 1:4] - a - part[:, None] * step, axis=1))

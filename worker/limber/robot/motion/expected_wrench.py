@@ -96,36 +96,36 @@ class Predicted:
         yielding[:, :, :3] += cell.tool.compliance_m_per_n * self.stiffness[:, :, :3]
         slopes = np.linalg.solve(yielding, self.stiffness)
         wrenches = np.linalg.solve(yielding, self.wrenches[..., None])[..., 0]
-        covariance = slopes @ self._way_covariance(cell) @ slopes.transpose(0, 2, 1)
+        covariance = slopes @ self._path_covariance(cell) @ slopes.transpose(0, 2, 1)
         young = np.zeros((count, 6, 6))
         young[:, :3, :3] = self.young_covariance
         inverse = np.linalg.inv(yielding)
         covariance += inverse @ young @ inverse.transpose(0, 2, 1)
         return ExpectedWrench(wrenches, slopes, covariance, rest_pose)
 
-    def _way_covariance(self, cell: Cell) -> np.ndarray:
+    def _path_covariance(self, cell: Cell) -> np.ndarray:
         """Covariance of the gripper's displacement since it closed, shape [n, 6, 6] in m and rad.
         """
-        ways = self.poses[:, :3] - self.poses[0, :3]
+        offsets = self.poses[:, :3] - self.poses[0, :3]
         turns = turn_between(self.poses[0, 3:], self.poses[:, 3:])
-        by_base = np.concatenate([_crossing(ways), _crossing(turns)], axis=1)
+        by_base = np.concatenate([_crossing(offsets), _crossing(turns)], axis=1)
         covariance = cell.base.rotation_sigma_rad**2 * by_base @ by_base.transpose(0, 2, 1)
         own = np.r_[np.full(3, cell.robot.pose_sigma_m), np.full(3, cell.robot.pose_sigma_rad)]
         return covariance + np.diag(own**2)
 
 
-def at_places(predicted: Predicted, places: np.ndarray, wanted: np.ndarray) -> Predicted:
-    """Return a prediction interpolated from ``places`` [n] along its path to others [m]."""
+def interpolated(predicted: Predicted, positions: np.ndarray, query: np.ndarray) -> Predicted:
+    """Return a prediction interpolated from ``positions`` [n] along its path to others [m]."""
     def carried(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
-        return np.column_stack([np.interp(wanted, places, column) for column in flat.T]
-                               ).reshape(len(wanted), *values.shape[1:])
+        return np.column_stack([np.interp(query, positions, column) for column in flat.T]
+                               ).reshape(len(query), *values.shape[1:])
 
     poses = carried(predicted.poses)
-    kept = np.r_[True, np.diff(places) > 0]
+    kept = np.r_[True, np.diff(positions) > 0]
     if kept.sum() > 1:
-        poses[:, 3:] = rotations_at(places[kept], predicted.poses[kept, 3:],
-                                    np.clip(wanted, places[0], places[-1]))
+        poses[:, 3:] = rotations_at(positions[kept], predicted.poses[kept, 3:],
+                                    np.clip(query, positions[0], positions[-1]))
     return Predicted(poses, carried(predicted.wrenches), carried(predicted.stiffness),
                      carried(predicted.young_covariance))
 

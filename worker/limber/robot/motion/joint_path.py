@@ -126,8 +126,8 @@ def _whole_turns(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """
     middle = 0.5 * (joints.max(axis=0) + joints.min(axis=0))
     bounded = np.isfinite(limits).all(axis=1)
-    wanted = np.where(bounded, 0.5 * np.where(bounded[:, None], limits, 0.0).sum(axis=1), 0.0)
-    return 2 * np.pi * np.round((wanted - middle) / (2 * np.pi))
+    target = np.where(bounded, 0.5 * np.where(bounded[:, None], limits, 0.0).sum(axis=1), 0.0)
+    return 2 * np.pi * np.round((target - middle) / (2 * np.pi))
 
 
 def _turned_near(path: JointPath, start: np.ndarray, limits: np.ndarray) -> JointPath:
@@ -150,12 +150,12 @@ def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
     """Return the error that states how far the best rejected configuration followed ``frames``
     [n, 4, 4]."""
     farthest = max(refusals, key=lambda refusal: refusal.index)
-    place = ", ".join(f"{value:.3f}" for value in frames[farthest.index, :3, 3])
+    position = ", ".join(f"{value:.3f}" for value in frames[farthest.index, :3, 3])
     reasons = sorted({refusal.reason for refusal in refusals if refusal.index == farthest.index})
     return NoPathError(
         "No configuration of the arm can follow the path. The best one ends at pose "
-        f"{farthest.index + 1} of {len(frames)}, flange at ({place}) m in the robot's base frame: "
-        f"{'; '.join(reasons)}.",
+        f"{farthest.index + 1} of {len(frames)}, flange at ({position}) m in the robot's base "
+        f"frame: {'; '.join(reasons)}.",
         "The arm does not reach it." if reasons == [_OUT_OF_REACH] else
         ("The arm would have to change its configuration on the path, which would swing the "
          "branch."),

@@ -12,9 +12,9 @@ import numpy as np
 
 from limber.core.errors import NoPathError
 
-STEP_RAD = 0.05  # of the joint that turns most, between angles that are looked at
+STEP_RAD = 0.05  # of the joint that turns most, between checked configurations
 _GROWN_RAD = 0.4
-_MOST = 1500  # branches of the two trees
+_MOST = 1500  # nodes of the two trees
 _SHORTCUTS = 80
 
 Free = Callable[[np.ndarray], np.ndarray]
@@ -26,20 +26,20 @@ class _Tree:
     angles: list[np.ndarray]
     parents: list[int] = field(default_factory=lambda: [-1])
 
-    def nearest(self, wanted: np.ndarray) -> int:
-        return int(np.abs(np.array(self.angles) - wanted).max(axis=1).argmin())
+    def nearest(self, target: np.ndarray) -> int:
+        return int(np.abs(np.array(self.angles) - target).max(axis=1).argmin())
 
-    def way_to(self, index: int) -> list[np.ndarray]:
+    def path_to(self, index: int) -> list[np.ndarray]:
         """From the root to an entry."""
-        way = []
+        path = []
         while index >= 0:
-            way.append(self.angles[index])
+            path.append(self.angles[index])
             index = self.parents[index]
-        return way[::-1]
+        return path[::-1]
 
 
-def joint_way(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free, *,
-              seed: int = 0) -> np.ndarray:
+def joint_space_path(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free, *,
+                     seed: int = 0) -> np.ndarray:
     """Return joint angles from ``start`` [n] to ``goal`` [n] on a free path, shape [k, n].
 
     Neighbours are at most :data:`STEP_RAD` apart.
@@ -65,7 +65,7 @@ def joint_way(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Fre
     for _ in range(_MOST):
         reached = _grown(trees[0], rng.uniform(low, high), free)
         if reached is not None and (met := _connected(trees[1], trees[0].angles[reached], free)):
-            first, second = trees[0].way_to(reached), trees[1].way_to(met)
+            first, second = trees[0].path_to(reached), trees[1].path_to(met)
             corners = first + second[::-1][1:]
             if not np.array_equal(corners[0], start):
                 corners.reverse()
@@ -88,12 +88,12 @@ def densely_turned(corners: list[np.ndarray]) -> np.ndarray:
     return np.vstack([corners[:1], *parts])
 
 
-def _grown(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
-    """Grow a tree one step towards ``wanted``; returns the new entry, None if blocked."""
-    near = tree.nearest(wanted)
-    way = wanted - tree.angles[near]
-    size = float(np.abs(way).max())
-    target = tree.angles[near] + way * min(1.0, _GROWN_RAD / max(size, 1e-12))
+def _grown(tree: _Tree, sample: np.ndarray, free: Free) -> int | None:
+    """Grow a tree one step towards ``sample``; returns the new entry, None if blocked."""
+    near = tree.nearest(sample)
+    step = sample - tree.angles[near]
+    size = float(np.abs(step).max())
+    target = tree.angles[near] + step * min(1.0, _GROWN_RAD / max(size, 1e-12))
     if size < 1e-9 or not free(straight(tree.angles[near], target)[1:]).all():
         return None
     tree.angles.append(target)
@@ -101,11 +101,11 @@ def _grown(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
     return len(tree.angles) - 1
 
 
-def _connected(tree: _Tree, wanted: np.ndarray, free: Free) -> int | None:
-    """Grow a tree until it reaches ``wanted``; returns the entry there, None if blocked."""
-    while (last := _grown(tree, wanted, free)) is not None:
-        if np.array_equal(tree.angles[last], wanted) or (
-                np.abs(tree.angles[last] - wanted).max() < 1e-9):
+def _connected(tree: _Tree, target: np.ndarray, free: Free) -> int | None:
+    """Grow a tree until it reaches ``target``; returns the entry there, None if blocked."""
+    while (last := _grown(tree, target, free)) is not None:
+        if np.array_equal(tree.angles[last], target) or (
+                np.abs(tree.angles[last] - target).max() < 1e-9):
             return last
     return None
 

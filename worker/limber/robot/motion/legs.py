@@ -32,7 +32,7 @@ class Leg:
 def legs_of(cell: Cell, motion: RobotMotion, hold: float) -> list[Leg]:
     """Return the legs of a motion that waits ``hold`` [s] at the path's end."""
     grip = cell.tool.grip_seconds
-    moves = {"approach": motion.approach, "path": motion.path, "return": motion.way_back,
+    moves = {"approach": motion.approach, "path": motion.path, "return": motion.return_path,
              "leaving": motion.leaving}
     stands = {"grasp": grip, "hold": hold, "release": grip}
     names = ("approach", "grasp", "path", "hold", "return", "release", "leaving")

@@ -9,16 +9,16 @@ from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.interface import Sample
 from limber.robot.motion.start_check import POSITION_M, ROTATION_RAD, different_joints
 from limber.robot.motion.trajectory import Trajectory, along
-from limber.robot.motion.way_file import FollowedWay, WayFile
+from limber.robot.motion.way_file import FollowedPath, FollowedPathFile
 
-_APART_M, _APART_RAD = 1e-3, 0.005  # between the places that are kept
-_SAME = 0.3  # of what is bridged at a start: so near, two places of the way are one
-_STANDS = 1e-5  # m and rad, of an arm that has not moved
+_APART_M, _APART_RAD = 1e-3, 0.005  # between the stored poses
+_SAME = 0.3  # fraction of the distance bridged at a start below which two poses are the same
+_STANDS = 1e-5  # m and rad, of an arm that does not move
 _SLOWER = 0.5
 _LEAST_SPEEDS = np.array([1e-3, 1e-2])  # m/s, rad/s
 
 
-class WayBack:
+class RetreatPath:
     """Positions of an arm since the gripper closed, or since the motion began.
 
     Args:
@@ -27,8 +27,8 @@ class WayBack:
         kept: Called with each position that is kept, and with the data at the start of a path.
     """
 
-    def __init__(self, names: Sequence[str], followed: FollowedWay | None = None,
-                 kept: WayFile | None = None) -> None:
+    def __init__(self, names: Sequence[str], followed: FollowedPath | None = None,
+                 kept: FollowedPathFile | None = None) -> None:
         self._names, self._kept = names, kept
         self._poses: list[np.ndarray] = [] if followed is None else list(followed.poses)
         self._joints: list[np.ndarray] = [] if followed is None else list(followed.joints)
@@ -99,10 +99,10 @@ class WayBack:
             raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees away from "
                              "its path.", "Something has moved it.",
                              "Free the branch by hand.")
-        if told := different_joints(sample.joints, self._joints[nearest],
+        if difference := different_joints(sample.joints, self._joints[nearest],
                                          self._names):
             raise SafetyStop("The arm is not in the configuration in which it arrived: "
-                             f"{'; '.join(told)}.",
+                             f"{'; '.join(difference)}.",
                              "Something has moved it.", "Free the branch by hand.")
         if length(sample.pose - poses[0]) < _STANDS:
             raise SafetyStop("There is no path to return "

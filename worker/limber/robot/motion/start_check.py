@@ -39,34 +39,35 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
         raise SafetyStop(f"The path starts {1000 * away:.1f} mm away from the robot.",
                          f"At most {1000 * POSITION_M:.0f} mm are allowed.",
                          "Move the robot to the start, or plan from its current pose.")
-    told = []
+    problems = []
     turn = length(turn_between(start, pose))
     if turn > ROTATION_RAD:
-        told.append(f"the gripper is turned by {np.degrees(turn):.1f} degrees against the path's "
-                    f"start: its rotation vector is {in_degrees(pose[3:])} degrees instead of "
-                    f"{in_degrees(start[3:])}")
-    told += [] if start_joints is None else different_joints(joints, start_joints, names)
-    if told:
+        problems.append(f"the gripper is turned by {np.degrees(turn):.1f} degrees against the "
+                        "path's "
+                        f"start: its rotation vector is {in_degrees(pose[3:])} degrees instead of "
+                        f"{in_degrees(start[3:])}")
+    problems += [] if start_joints is None else different_joints(joints, start_joints, names)
+    if problems:
         raise SafetyStop(
             "The arm is not in the configuration that the path was checked for: "
-            f"{'; '.join(told)}.",
+            f"{'; '.join(problems)}.",
             "Its links, joints and cables would move where nothing was checked.",
             "Rotate the gripper to the path's start." if start_joints is None else
             f"Move the joints to {in_degrees(start_joints)} degrees. A dry run of `limber "
             "execute` states them as start_joints_rad.")
 
 
-def different_joints(joints: np.ndarray, wanted: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Return which joints [rad, n] differ from ``wanted``, with both angles in degrees."""
-    told = []
-    for number in np.flatnonzero(~(np.abs(joints - wanted) <= JOINT_RAD)):
-        turns = (joints[number] - wanted[number]) / (2 * np.pi)
+def different_joints(joints: np.ndarray, expected: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Return which joints [rad, n] differ from ``expected``, with both angles in degrees."""
+    differences = []
+    for number in np.flatnonzero(~(np.abs(joints - expected) <= JOINT_RAD)):
+        turns = (joints[number] - expected[number]) / (2 * np.pi)
         whole = round(turns) != 0 and abs(turns - round(turns)) * 2 * np.pi <= JOINT_RAD
-        told.append(f"joint {number + 1} ({names[number]}) is at "
-                    f"{np.degrees(joints[number]):.1f} degrees instead of "
-                    f"{np.degrees(wanted[number]):.1f}"
-                    + (" (whole turns apart)" if whole else ""))
-    return told
+        differences.append(f"joint {number + 1} ({names[number]}) is at "
+                           f"{np.degrees(joints[number]):.1f} degrees instead of "
+                           f"{np.degrees(expected[number]):.1f}"
+                           + (" (whole turns apart)" if whole else ""))
+    return differences
 
 
 def in_degrees(angles: np.ndarray) -> str:

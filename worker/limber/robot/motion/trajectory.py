@@ -62,25 +62,25 @@ class Trajectory:
     def greatest_speeds(self) -> np.ndarray:
         """Greatest speeds of the tool's centre [m/s] and of its rotation [rad/s], shape [2]."""
         steps = np.diff(self.times)
-        ways = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
+        lengths = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
         turns = np.array([length(turn_between(first, second))
                           for first, second in pairwise(self.poses)])
-        return np.array([(ways / steps).max(), (turns / steps).max()])
+        return np.array([(lengths / steps).max(), (turns / steps).max()])
 
     def pose(self, time: float) -> np.ndarray:
         """Return the pose at a time [s]; the last one afterwards, shape [6]."""
-        k, part = self._place(time)
+        k, part = self._segment_at(time)
         return pose_between(self.poses[k], self.poses[k + 1], part)
 
     def angles(self, time: float) -> np.ndarray:
         """Return the joint angles at a time [s]; the last ones afterwards, shape [joints]."""
         assert self.joints is not None
-        k, part = self._place(time)
+        k, part = self._segment_at(time)
         return (1.0 - part) * self.joints[k] + part * self.joints[k + 1]
 
     def felt(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return expected wrench [6], its slopes [6, 6] and covariance [6, 6] at a time [s]."""
-        return None if self.expected is None else self.expected.at(*self._place(time))
+        return None if self.expected is None else self.expected.at(*self._segment_at(time))
 
     def backwards(self) -> "Trajectory":
         """Return it from its end to its start, at the same speed, with its expected wrench."""
@@ -88,7 +88,7 @@ class Trajectory:
                           None if self.expected is None else self.expected.reversed(),
                           None if self.joints is None else self.joints[::-1], self.by_joints)
 
-    def _place(self, time: float) -> tuple[int, float]:
+    def _segment_at(self, time: float) -> tuple[int, float]:
         time = min(max(time, 0.0), self.duration)
         k = min(int(np.searchsorted(self.times, time, side="right")) - 1, len(self.times) - 2)
         return k, (time - self.times[k]) / (self.times[k + 1] - self.times[k])
@@ -108,8 +108,8 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
     steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
                        angles * speed / turn_speed)
     steps = np.maximum(steps, 1e-9)
-    way = np.r_[0.0, np.cumsum(steps)]
-    bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(way, way[-1] - way)))
+    arc = np.r_[0.0, np.cumsum(steps)]
+    bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(arc, arc[-1] - arc)))
     if len(steps) == 1:
         # It begins and ends at rest, so it must not be passed at zero speed.
         durations = np.maximum(2 * np.sqrt(steps / acceleration), 2 * steps / speed)
@@ -142,8 +142,8 @@ def densely(poses: np.ndarray, spacing: float = 0.002, angle: float = 0.02) -> n
     """Return poses close together along straight lines and turns between ``poses`` [n, 6]."""
     result = [poses[0]]
     for first, second in pairwise(poses):
-        way = float(np.linalg.norm(second[:3] - first[:3]))
+        distance = float(np.linalg.norm(second[:3] - first[:3]))
         turn = float(angle_between(first[3:], second[3:]))
-        count = max(int(np.ceil(max(way / spacing, turn / angle))), 1)
+        count = max(int(np.ceil(max(distance / spacing, turn / angle))), 1)
         result += [pose_between(first, second, part) for part in np.linspace(0, 1, count + 1)[1:]]
     return np.array(result)

@@ -27,7 +27,7 @@ _FORMAT = 1
 
 
 @dataclass(frozen=True)
-class FollowedWay:
+class FollowedPath:
     """A path read from disk.
 
     Attributes:
@@ -47,7 +47,7 @@ class FollowedWay:
     at: float
 
 
-def way_path(cell: Cell) -> Path:
+def followed_path_file(cell: Cell) -> Path:
     """Return the file of the path of a cell's robot."""
     key = hashlib.sha256(cell.robot.address.encode()).hexdigest()[:16]
     return _state_folder() / "robot-ways" / f"{key}.jsonl"
@@ -58,39 +58,41 @@ def log_path() -> Path:
     return _state_folder() / "robot-moves.jsonl"
 
 
-def read_way(cell: Cell) -> FollowedWay | None:
+def read_followed_path(cell: Cell) -> FollowedPath | None:
     """Return the path that the cell's robot followed last; None if none is known.
 
     A line that is half written is ignored; a path of another arm or tool does not count.
     """
     try:
-        with open(way_path(cell), encoding="utf-8") as stream:
+        with open(followed_path_file(cell), encoding="utf-8") as stream:
             lines = list(json_objects(stream))
     except FileNotFoundError:
         return None
     if not lines or lines[0].get("head") != plain(_head(cell)):
         return None
     try:
-        places = [line for line in lines if "pose" in line]
+        pose_lines = [line for line in lines if "pose" in line]
         last = {name: line[name] for line in lines[1:] for name in line}
-        way = FollowedWay(
-            _rows([line["pose"] for line in places], 6),
-            _rows([line["joints"] for line in places], len(cell.arm.joint_names)),
+        followed = FollowedPath(
+            _rows([line["pose"] for line in pose_lines], 6),
+            _rows([line["joints"] for line in pose_lines], len(cell.arm.joint_names)),
             np.array(last.get("speeds", (0.0, 0.0)), float),
             None if last.get("bias") is None else np.array(last["bias"], float).reshape(6),
             last.get("gripper_closed"), float(lines[0]["at"]))
     except (KeyError, TypeError, ValueError):
         return None
-    whole = all(np.isfinite(part).all() for part in (way.poses, way.joints, way.speeds))
-    return way if whole and (way.bias is None or np.isfinite(way.bias).all()) else None
+    whole = all(np.isfinite(part).all() for part
+                in (followed.poses, followed.joints, followed.speeds))
+    return followed if whole and (followed.bias is None
+                                  or np.isfinite(followed.bias).all()) else None
 
 
-class WayFile:
+class FollowedPathFile:
     """Writes a path while it is followed, in its own thread: the loop waits for no disk."""
 
     def __init__(self, cell: Cell):
         self._lasting: dict[str, Any] = {}
-        self._path, self._head = way_path(cell), _head(cell)
+        self._path, self._head = followed_path_file(cell), _head(cell)
         self._lines: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="way", daemon=True)
         self._thread.start()

@@ -20,10 +20,10 @@ from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
 from limber.robot.driver.guard import Decision, Guard, GuardSettings, Verdict
 from limber.robot.interface import Sample
-from limber.robot.motion.retreat import WayBack
+from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.motion.way_file import WayFile, read_way
+from limber.robot.motion.way_file import FollowedPathFile, read_followed_path
 from limber.robot.ros.bridge import SECONDS, Bridge
 from limber.robot.ros.messages import (
     FOLLOW,
@@ -41,7 +41,7 @@ _OLDEST_READING_SECONDS = 0.05
 _STANDS_RAD_S = 1e-3
 _SETTLE_SECONDS = 0.3
 _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
-_OFF_PATH_M = 0.02  # a controller in ROS is behind its trajectory by a time that it does not tell
+_OFF_PATH_M = 0.02  # a ROS controller lags its trajectory by an unknown time
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class RosRobot:
         self.smooth = np.full(6, np.nan)
         self._goals = 0
         self.warnings: list[str] = []
-        self._kept = WayFile(cell)
-        self._way = WayBack(cell.arm.joint_names, read_way(cell), self._kept)
+        self._kept = FollowedPathFile(cell)
+        self._way = RetreatPath(cell.arm.joint_names, read_followed_path(cell), self._kept)
         self._hold_ups = HoldUps(_LISTEN_SECONDS,
                                  lambda **told: self.warnings.append(told["text"]))
         for topic, kind in ((topics.joint_states, JOINT_STATE), (topics.wrench, WRENCH),
@@ -142,7 +142,7 @@ class RosRobot:
         Raises:
             SafetyStop: none is known.
         """
-        followed = read_way(self._cell)
+        followed = read_followed_path(self._cell)
         if followed is None or followed.bias is None:
             raise SafetyStop("No tare is known from the approach.",
                              "With the branch in the gripper the sensor cannot be tared.",
@@ -279,8 +279,8 @@ class RosRobot:
             if message.get("result") and message.get("status", _SUCCEEDED) == _SUCCEEDED:
                 self.guard.end()
                 return {"event": "reached"}
-            told = (message.get("values") or {})
-            why = told.get("error_string") if isinstance(told, dict) else str(told)
+            values = (message.get("values") or {})
+            why = values.get("error_string") if isinstance(values, dict) else str(values)
             return self._stop(goal, self.guard.event(
                 f"the controller in ROS ended the motion ({why or 'no reason was given'})"))
         if message.get("op") == "publish" and message.get("topic") == self._topics.stop and (
@@ -288,7 +288,7 @@ class RosRobot:
             return self._stop(goal, self.guard.event("a stop was published"))
         return None
 
-    def _judge(self, trajectory: Trajectory, sample: Sample, place: int) -> Decision:
+    def _judge(self, trajectory: Trajectory, sample: Sample, index: int) -> Decision:
         assert self._reading is not None
         reading = Reading(self._reading.wrench, sample.arrived - self._reading_at,
                           self._reading.raw)
@@ -298,38 +298,38 @@ class RosRobot:
             self._on_sample(sample.clock, sample.pose, self.smooth)
         if reading.age > _OLDEST_READING_SECONDS:
             return self.guard.event(f"the wrench has been silent for {reading.age:.3f} s")
-        expected, uncertainty = self._expected(trajectory, sample, place)
+        expected, uncertainty = self._expected(trajectory, sample, index)
         return self.guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
-            uncertainty=uncertainty, grasp=grasp[:3, 3], sent=trajectory.poses[place, :3])
+            uncertainty=uncertainty, grasp=grasp[:3, 3], sent=trajectory.poses[index, :3])
 
-    def _expected(self, trajectory: Trajectory, sample: Sample, place: int,
+    def _expected(self, trajectory: Trajectory, sample: Sample, index: int,
                   ) -> tuple[np.ndarray | None, np.ndarray | None]:
         if trajectory.expected is None:
             return None, None
-        wrench, slopes, covariance = trajectory.expected.at(min(place, len(trajectory.times) - 2),
+        wrench, slopes, covariance = trajectory.expected.at(min(index, len(trajectory.times) - 2),
                                                             0.0)
-        planned = trajectory.poses[min(place, len(trajectory.times) - 2)]
+        planned = trajectory.poses[min(index, len(trajectory.times) - 2)]
         off = np.concatenate((sample.pose[:3] - planned[:3], turn_between(planned, sample.pose)))
         turn = self._base[:3, :3]
         return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
 
     @staticmethod
-    def _nearest(trajectory: Trajectory, joints: np.ndarray, place: int) -> int:
+    def _nearest(trajectory: Trajectory, joints: np.ndarray, index: int) -> int:
         """The position on the path nearest to ``joints``, searched from the last one on."""
         assert trajectory.joints is not None
-        ahead = trajectory.joints[place:place + 50]
-        return place + int(np.abs(ahead - joints).max(axis=1).argmin())
+        ahead = trajectory.joints[index:index + 50]
+        return index + int(np.abs(ahead - joints).max(axis=1).argmin())
 
     def _stop(self, goal: str, decision: Decision) -> dict[str, Any]:
         """Stop on both channels, and check that the arm is at rest."""
         self.guard.event(str(decision))
         self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": True})
         self._bridge.send(op="cancel_action_goal", id=goal, action=self._topics.trajectory)
-        told = {"event": "stopped", "reason": str(decision)}
+        event = {"event": "stopped", "reason": str(decision)}
         end = time.monotonic() + 1.0
         while time.monotonic() < end:
             sample = self._take(self._bridge.receive(_LISTEN_SECONDS))
             if sample is not None and np.abs(sample.joint_speeds).max() < _STANDS_RAD_S:
-                return told | {"stands": True}
-        return told | {"stands": False}
+                return event | {"stands": True}
+        return event | {"stands": False}

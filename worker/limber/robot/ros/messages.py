@@ -44,10 +44,10 @@ class JointStates:
         self._arm = cell.arm
         self._tool = matrices(np.array(cell.tool.grasp_pose))
         self._chosen, self.ordered = [], []
-        for wanted in cell.arm.ros_joints:
-            found = [k for k, name in enumerate(names) if wanted in name]
+        for joint in cell.arm.ros_joints:
+            found = [k for k, name in enumerate(names) if joint in name]
             if len(found) != 1:
-                raise InputError(f"{len(found)} joints of ROS are named like {wanted}: "
+                raise InputError(f"{len(found)} joints of ROS are named like {joint}: "
                                  f"{', '.join(names)}.", f"A {cell.arm.name} has one.",
                                  "Check robot.model in the cell file and the topic of the joint "
                                  "states.")
@@ -80,8 +80,8 @@ class JointStates:
 
 def wrench_of(message: dict[str, Any]) -> np.ndarray:
     """Return force and torque of a stamped wrench [N, N m], shape [6]."""
-    told = message["wrench"]
-    values = [told[kind].get(axis) for kind in ("force", "torque") for axis in "xyz"]
+    fields = message["wrench"]
+    values = [fields[kind].get(axis) for kind in ("force", "torque") for axis in "xyz"]
     return np.array([np.nan if value is None else value for value in values], float)
 
 

@@ -27,8 +27,8 @@ _TWIST = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 _QUICK, _SLOW, _WRIST = math.pi, 2 * math.pi / 3, 2 * math.pi
 # Housings of the joints: three sizes of arm.
 _SMALL, _MIDDLE, _LARGE = (0.055, 0.045, 0.035), (0.06, 0.06, 0.045), (0.075, 0.06, 0.055)
-_UPPER_TUBE, _FORE_TUBE = 0.9, 0.75  # radii of the two long tubes in those of their housings
-_DRAWN = 0.05  # radius of the drawn links in lengths of the two tubes
+_UPPER_TUBE, _FORE_TUBE = 0.9, 0.75  # radii of the two long tubes over those of their housings
+_DRAWN = 0.05  # radius of the drawn links over the length of the two tubes
 
 
 @dataclass(frozen=True)
@@ -160,23 +160,23 @@ class UrArm:
         shoulder and elbow. The base's foot is omitted: it touches its mount.
         """
         frames = self.link_frames(joints)
-        places, axis = frames[:, :, :3, 3], frames[:, 0, :3, 2]
+        positions, axis = frames[:, :, :3, 3], frames[:, 0, :3, 2]
         at_shoulder, at_forearm = self.lateral
-        shoulder = places[:, 0] + at_shoulder * axis
-        elbow = places[:, 1] + at_shoulder * axis
-        inner = places[:, 1] + at_forearm * axis
-        wrist = places[:, 2] + at_forearm * axis
+        shoulder = positions[:, 0] + at_shoulder * axis
+        elbow = positions[:, 1] + at_shoulder * axis
+        inner = positions[:, 1] + at_forearm * axis
+        wrist = positions[:, 2] + at_forearm * axis
         thick, middle, thin = self.housing
         # The last rod's round end stops at the flange.
-        last = places[:, 5] - min(thin, self.d[5]) * frames[:, 5, :3, 2]
+        last = positions[:, 5] - min(thin, self.d[5]) * frames[:, 5, :3, 2]
         links = (
-            ("shoulder", places[:, 0], shoulder, thick),
+            ("shoulder", positions[:, 0], shoulder, thick),
             ("upper arm", shoulder, elbow, _UPPER_TUBE * thick),
             ("elbow", elbow, inner, middle),
             ("forearm", inner, wrist, _FORE_TUBE * middle),
-            ("wrist 1", wrist, places[:, 3], thin),
-            ("wrist 2", places[:, 3], places[:, 4], thin),
-            ("wrist 3", places[:, 4], last, thin))
+            ("wrist 1", wrist, positions[:, 3], thin),
+            ("wrist 2", positions[:, 3], positions[:, 4], thin),
+            ("wrist 3", positions[:, 4], last, thin))
         names, starts, ends, radii = zip(*links, strict=True)
         return Rods(names, np.stack(starts, axis=1), np.stack(ends, axis=1), np.array(radii))
 

@@ -99,14 +99,14 @@ class Recipe:
         A shorter body gives the complete values: ur-rtde sends some commands through a recipe that
         has more fields than the command has arguments.
         """
-        values, place = {}, 0
+        values, offset = {}, 0
         for name, kind in zip(self.names, self.types, strict=True):
             part = struct.Struct(">" + _FORMATS[kind])
-            if place + part.size > len(body):
+            if offset + part.size > len(body):
                 break
-            numbers = part.unpack_from(body, place)
+            numbers = part.unpack_from(body, offset)
             values[name] = numbers if kind in _COUNTS else numbers[0]
-            place += part.size
+            offset += part.size
         return values
 
 

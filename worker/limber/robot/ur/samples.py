@@ -22,7 +22,7 @@ _MOST_AT_ONCE = 8
 _NAMES = ("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_speed",
           "actual_TCP_force", "robot_mode", "safety_mode", "runtime_state",
           "target_speed_fraction", "actual_digital_output_bits")
-_NEWER = ("tcp_offset", "payload", "payload_cog")  # that not every version knows
+_NEWER = ("tcp_offset", "payload", "payload_cog")  # not known to every version
 
 
 class SampleStream:

@@ -16,10 +16,10 @@ from limber.robot.urdf.urdf_file import Chain, read_chain
 
 ENDING = ".urdf"
 _STARTS = 96
-_MOST = 8  # configurations that are kept
+_MOST = 8  # stored configurations
 _APART = 0.2  # rad between two configurations
-_THICK = 0.07  # radius of a link without a simple shape in what the arm reaches, rounded up
-_DRAWN = 0.05  # the same of drawn links
+_THICK = 0.07  # radius of a link without a simple shape over the arm's reach, rounded up
+_DRAWN = 0.05  # the same for drawn links
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +69,9 @@ class UrdfArm:
     @cached_property
     def reach(self) -> float:
         """Upper bound: the distance of the last joint from the shoulder with all links in line."""
-        places = self.link_frames(np.zeros(len(self.chain.joints)))[1:-1, :3, 3]
-        return float(np.linalg.norm(places[0] - self.shoulder)
-                     + np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        positions = self.link_frames(np.zeros(len(self.chain.joints)))[1:-1, :3, 3]
+        return float(np.linalg.norm(positions[0] - self.shoulder)
+                     + np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
     @property
     def link_radius(self) -> float:
@@ -142,15 +142,15 @@ class UrdfArm:
         starts, ends, radii = [], [], []
         for number, name in enumerate(self.joint_names):
             own = [rod for rod in self.chain.rods if rod.joint == number]
-            turn, place = frames[:, number, :3, :3], frames[:, number, :3, 3]
+            turn, position = frames[:, number, :3, :3], frames[:, number, :3, 3]
             for rod in own:
                 names.append(rod.name)
-                starts.append(turn @ rod.start + place)
-                ends.append(turn @ rod.end + place)
+                starts.append(turn @ rod.start + position)
+                ends.append(turn @ rod.end + position)
                 radii.append(rod.radius)
             if not own and number > 0:
                 names.append(f"link behind {name}")
-                starts.append(place)
+                starts.append(position)
                 ends.append(frames[:, number + 1, :3, 3])
                 radii.append(_THICK * self.reach)
         return Rods(tuple(names), np.stack(starts, axis=1), np.stack(ends, axis=1),

@@ -104,16 +104,16 @@ def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np
     slopes, off, off_tried = np.empty((6, count)), np.empty(6), np.empty(6)
     for number in range(len(frames)):
         is_later = is_path and number > 0
-        there = found[number - 1].copy() if is_later else starts[number].copy()
-        if np.isnan(there[0]):
+        guess = found[number - 1].copy() if is_later else starts[number].copy()
+        if np.isnan(guess[0]):
             continue
-        joints, damping, least = there, 1e-3, np.inf
+        joints, damping, least = guess, 1e-3, np.inf
         for _ in range(_MOST_STEPS):
-            _chained(origins, axes, there, tried)
+            _chained(origins, axes, guess, tried)
             _off(frames[number], tried[count], off_tried)
             square = (off_tried * off_tried).sum()
             if square < least:
-                joints, least = there, square
+                joints, least = guess, square
                 chain[:], off[:] = tried, off_tried
                 damping = max(0.1 * damping, _LEAST_DAMPING)
                 _slopes(axes, chain, slopes)
@@ -125,5 +125,5 @@ def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np
             if not damping < _MOST_DAMPING:
                 break
             step = slopes.T @ np.linalg.solve(slopes @ slopes.T + damping * np.eye(6), off)
-            there = joints + step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-12))
+            guess = joints + step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-12))
     return found

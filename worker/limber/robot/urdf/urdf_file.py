@@ -171,8 +171,8 @@ def _joint(element: Element, origin: np.ndarray) -> Joint:
         limits = float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
         if not limits[0] < limits[1]:
             raise ValueError(f"the lower limit of its joint {name!r} is not below the upper limit")
-    given = element.find("axis")
-    axis = _vector((1.0, 0.0, 0.0) if given is None else _said(given, "xyz").split())
+    element_axis = element.find("axis")
+    axis = _vector((1.0, 0.0, 0.0) if element_axis is None else _said(element_axis, "xyz").split())
     if not np.linalg.norm(axis) > 0.0:
         raise ValueError(f"the axis of its joint {name!r} is zero")
     return Joint(name, origin, axis / np.linalg.norm(axis), limits, float(speed))
@@ -185,9 +185,9 @@ def _rods(link: Element, name: str, frame: np.ndarray, joint: int) -> list[Rod]:
         shape = _part(_part(collision, "geometry"), "*")
         along, radius = _axis_and_radius(shape)
         if radius > 0.0:
-            place = frame @ _origin(collision)
-            half = place[:3, :3] @ (0.5 * along)
-            found.append(Rod(joint, name, place[:3, 3] - half, place[:3, 3] + half, radius))
+            transform = frame @ _origin(collision)
+            half = transform[:3, :3] @ (0.5 * along)
+            found.append(Rod(joint, name, transform[:3, 3] - half, transform[:3, 3] + half, radius))
     return found
 
 

@@ -70,13 +70,13 @@ class TimedPath:
     def __init__(self, arm: Arm, joints: np.ndarray, lengths: np.ndarray, speeds: np.ndarray,
                  accelerations: np.ndarray, passed: np.ndarray):
         keep = np.r_[True, np.diff(lengths) > 1e-12]
-        self._joints, way = joints[keep], lengths[keep]
+        self._joints, waypoints = joints[keep], lengths[keep]
         self._passed = passed[keep]
-        self.finished = len(way) < 2
+        self.finished = len(waypoints) < 2
         self._time = 0.0
         if self.finished:
             return
-        steps = np.diff(way)
+        steps = np.diff(waypoints)
         slope = np.abs(np.diff(self._joints, axis=0)) / steps[:, None]
         joint_bound = (np.asarray(arm.joint_speed) / np.maximum(slope, 1e-12)).min(axis=1)
         bound = np.minimum(speeds[keep], np.minimum(np.r_[joint_bound, np.inf],
@@ -85,7 +85,7 @@ class TimedPath:
         self._speeds = fastest
         durations = 2 * steps / (fastest[1:] + fastest[:-1])
         self._times = np.r_[0.0, np.cumsum(durations)]
-        self._way = way
+        self._waypoints = waypoints
 
     @property
     def waypoint(self) -> int:
@@ -105,11 +105,11 @@ class TimedPath:
         return after, (after - before) / seconds
 
     def _at(self, time: float) -> np.ndarray:
-        k = min(int(np.searchsorted(self._times, time, side="right")) - 1, len(self._way) - 2)
+        k = min(int(np.searchsorted(self._times, time, side="right")) - 1, len(self._waypoints) - 2)
         elapsed, span = time - self._times[k], self._times[k + 1] - self._times[k]
         slow, fast = self._speeds[k], self._speeds[k + 1]
-        way = slow * elapsed + 0.5 * (fast - slow) / span * elapsed * elapsed
-        part = min(way / (self._way[k + 1] - self._way[k]), 1.0)
+        distance = slow * elapsed + 0.5 * (fast - slow) / span * elapsed * elapsed
+        part = min(distance / (self._waypoints[k + 1] - self._waypoints[k]), 1.0)
         return (1 - part) * self._joints[k] + part * self._joints[k + 1]
 
 
@@ -158,7 +158,7 @@ class Servo:
         self.target = np.zeros(6)
         self.gain, self.lookahead = 300.0, 0.1
         self._last: np.ndarray | None = None
-        self._led, self._since, self._pace = np.zeros(6), 0.0, 0.0
+        self._commanded, self._since, self._pace = np.zeros(6), 0.0, 0.0
 
     def step(self, joints: np.ndarray, speeds: np.ndarray, seconds: float, scale: float,
              ) -> tuple[np.ndarray, np.ndarray]:
@@ -168,7 +168,7 @@ class Servo:
     def _goal(self, joints: np.ndarray, seconds: float, scale: float) -> np.ndarray:
         """Joint angles to which the arm is driven now [rad], with the slider at ``scale``."""
         if self._last is None:
-            self._last = self._led = joints.copy()
+            self._last = self._commanded = joints.copy()
         self._since += seconds
         moved = float(np.abs(self.target - self._last).max())
         if moved > 0.0:
@@ -176,13 +176,15 @@ class Servo:
             self._pace, self._since = moved / self._since, 0.0
             self._last = self.target.copy()
         if scale >= 1.0:
-            self._led = self.target.copy()
-            return self._led
-        way = self.target - self._led
-        farthest = float(np.abs(way).max())
+            self._commanded = self.target.copy()
+            return self._commanded
+        offset = self.target - self._commanded
+        farthest = float(np.abs(offset).max())
         if farthest > 0.0:
-            self._led = self._led + way * min(1.0, scale * self._pace * seconds / farthest)
-        return self._led
+            self._commanded = self._commanded + offset * min(1.0,
+                                                             scale * self._pace * seconds
+                                                             / farthest)
+        return self._commanded
 
 
 class SpeedMotion:
@@ -196,13 +198,13 @@ class SpeedMotion:
 
     def step(self, joints: np.ndarray, speeds: np.ndarray, seconds: float, scale: float,
              ) -> tuple[np.ndarray, np.ndarray]:
-        wanted = self.target * scale
+        scaled = self.target * scale
         if self.of_tool:
             slopes = _tool_jacobian(self._arm, joints, self._tool)
             now = slopes @ speeds if self._now is None else self._now
         else:
             now = speeds
-        change = wanted - now
+        change = scaled - now
         largest = max(float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])))
         allowed = self.acceleration * seconds
         now = now + change * min(1.0, allowed / largest if largest > 0 else 1.0)
@@ -261,7 +263,7 @@ def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarra
     return solutions[np.abs(solutions - near).sum(axis=1).argmin()]
 
 
-def _timed(arm: Arm, joints: np.ndarray, curve: "_Curve", places: np.ndarray,
+def _timed(arm: Arm, joints: np.ndarray, curve: "_Curve", positions: np.ndarray,
            waypoints: list[Waypoint]) -> TimedPath:
     speeds = np.array([waypoints[k].speed for k in curve.passed])
     accelerations = np.array([waypoints[k].acceleration for k in curve.passed])
@@ -270,9 +272,9 @@ def _timed(arm: Arm, joints: np.ndarray, curve: "_Curve", places: np.ndarray,
     speeds = np.minimum(speeds, np.r_[speeds[1:], speeds[-1]])
     speeds[curve.stops] = 0.0
     # In a curve the lateral acceleration counts as well.
-    ways = np.diff(places, axis=0)
-    steps = np.maximum(np.linalg.norm(ways, axis=1), 1e-15)
-    turned = np.linalg.norm(np.diff(ways / steps[:, None], axis=0), axis=1)
+    offsets = np.diff(positions, axis=0)
+    steps = np.maximum(np.linalg.norm(offsets, axis=1), 1e-15)
+    turned = np.linalg.norm(np.diff(offsets / steps[:, None], axis=0), axis=1)
     across = accelerations[1:-1] * 0.5 * (steps[1:] + steps[:-1]) / np.maximum(turned, 1e-12)
     speeds[1:-1] = np.minimum(speeds[1:-1], np.sqrt(across))
     return TimedPath(arm, joints, curve.lengths, speeds, accelerations, curve.passed)
@@ -346,8 +348,8 @@ def _between_joints(first: np.ndarray, second: np.ndarray, parts: np.ndarray) ->
 
 def _pose_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Path length of the tool [m]; its angle [rad] if it only rotates, as in the controller."""
-    way = np.linalg.norm(second[:, :3] - first[:, :3], axis=1)
-    return np.where(way > 1e-9, way, angle_between(first[:, 3:], second[:, 3:]))
+    distance = np.linalg.norm(second[:, :3] - first[:, :3], axis=1)
+    return np.where(distance > 1e-9, distance, angle_between(first[:, 3:], second[:, 3:]))
 
 
 def _tool_jacobian(arm: Arm, joints: np.ndarray, tool: np.ndarray) -> np.ndarray:

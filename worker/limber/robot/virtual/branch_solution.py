@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.numerics.rigid_kernels import inverse_of, rotation_vector
-from limber.robot.virtual.step_kernels import led_on
+from limber.robot.virtual.step_kernels import steer
 
 _LEAST_WAY = 2e-3  # m between two solutions whose tangents are compared
 
@@ -52,7 +52,7 @@ class Solution:
 
         The patch stays behind by ``compliance`` [m/N] times the force; valid near its own frame.
         """
-        return led_on(self.frame, self.wrench, self.stiffness, *self.bends, patch, compliance)
+        return steer(self.frame, self.wrench, self.stiffness, *self.bends, patch, compliance)
 
     def change_to(self, patch: np.ndarray) -> np.ndarray:
         """Return the translation [m] and rotation [rad] to another frame of the patch, shape [6].
@@ -62,12 +62,12 @@ class Solution:
 
     def bend_from(self, before: "Solution") -> Bends:
         """Return the change of stiffness from another solution; none if it is unknown."""
-        way = self.frame[:3, 3] - before.frame[:3, 3]
-        if not (self.converged and before.converged and np.linalg.norm(way) > _LEAST_WAY):
+        offset = self.frame[:3, 3] - before.frame[:3, 3]
+        if not (self.converged and before.converged and np.linalg.norm(offset) > _LEAST_WAY):
             return NO_BENDS
-        return way[None], (self.stiffness - before.stiffness)[None]
+        return offset[None], (self.stiffness - before.stiffness)[None]
 
-    def led_by(self, past: Sequence["Solution"], tried: Bends) -> None:
+    def add_predictions(self, past: Sequence["Solution"], tried: Bends) -> None:
         """Set the bends from ``past`` solutions, the latest first; else copy the latest's."""
         for before in past:
             newest = self.bend_from(before)

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from limber.mechanics.grasp import Grasp
 
 _SOLVER_PRIORITY = 10
-_REST = 0.25  # of what a solution took: a process that never rests is held up by the system
-SAME_PLACE = 1e-6  # m, rad; over that the tangent leads on exactly
-_TOLERANCE = 1e-5  # of the residual, relative to the forces: far below what a sensor tells
-_MOST_WAYS = 2.0  # so many times the way between two solutions a change is led on
-_TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
+_REST = 0.25  # fraction of a solution's time: a process that never rests is throttled by the system
+SAME_PLACE = 1e-6  # m, rad; the tangent extrapolates exactly over it
+_TOLERANCE = 1e-5  # of the residual relative to the forces: far below a sensor's resolution
+_MOST_WAYS = 2.0  # distance between two solutions, over which a change is extrapolated
+_TRIED_WAY = 3e-3  # m across the branch when the gripper has closed
 
 
 @dataclass(frozen=True)
@@ -163,10 +163,10 @@ class BranchSolver:
         stiffness = solution.stiffness
         axes = np.linalg.eigh(stiffness[:3, :3] + stiffness[:3, :3].T)[1]
         bends = NO_BENDS
-        for way in _TRIED_WAY * axes.T[:2]:
-            turn = -np.linalg.solve(stiffness[3:, 3:], stiffness[3:, :3] @ way)
-            there = self.solve(frame_of(np.r_[solution.frame[:3, 3] + way, turn]))
-            bends = joined(bends, there.bend_from(solution))
+        for offset in _TRIED_WAY * axes.T[:2]:
+            turn = -np.linalg.solve(stiffness[3:, 3:], stiffness[3:, :3] @ offset)
+            moved = self.solve(frame_of(np.r_[solution.frame[:3, 3] + offset, turn]))
+            bends = joined(bends, moved.bend_from(solution))
         self._state, self._last, self._follows, self._turning = state, solution, follows, None
         return bends
 
@@ -189,9 +189,9 @@ class BranchSolver:
         slopes = grasp_slopes(self._held, self._grasp, self._state)
         self._turning = None
         if self._last is not None and self._follows is not None:
-            way = patch[:3, 3] - self._last.frame[:3, 3]
-            if np.linalg.norm(way) > SAME_PLACE:
-                self._turning = way, slopes.displacement - self._follows
+            offset = patch[:3, 3] - self._last.frame[:3, 3]
+            if np.linalg.norm(offset) > SAME_PLACE:
+                self._turning = offset, slopes.displacement - self._follows
         self._follows = slopes.displacement
         points = (np.zeros((0, 6)) if self._operator is None
                   else self._operator @ slopes.displacement.reshape(-1, 6))
@@ -210,8 +210,8 @@ class BranchSolver:
             return None
         change, follows = self._last.change_to(patch), self._follows
         if self._turning is not None:
-            way, turning = self._turning
-            part = float(np.clip(change[:3] @ way / (way @ way), -_MOST_WAYS, _MOST_WAYS))
+            axis, turning = self._turning
+            part = float(np.clip(change[:3] @ axis / (axis @ axis), -_MOST_WAYS, _MOST_WAYS))
             follows = follows + 0.5 * part * turning
         return self._state + follows @ change
 

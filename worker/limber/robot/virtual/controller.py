@@ -256,10 +256,10 @@ class Controller:
 
     def stand(self, joints: Sequence[float] | None = None) -> None:
         """Set the joints [rad] at once, without a path, by default to the arm's home."""
-        wanted = _six(self.arm.home if joints is None else joints)
+        target = _six(self.arm.home if joints is None else joints)
         self.stop_program("set to a pose")
         self.load.release()
-        self.joints, self.speeds, self.motion = wanted, np.zeros(6), None
+        self.joints, self.speeds, self.motion = target, np.zeros(6), None
         self._update_tool()
 
     def set_remote(self, remote: bool) -> None:
@@ -341,9 +341,9 @@ class Controller:
 
     def _write_digital(self, values: dict[str, Any], name: str, first: int) -> None:
         mask = int(values.get(f"{name}_mask", 0)) << first
-        wanted = int(values.get(name, 0)) << first
+        bits = int(values.get(name, 0)) << first
         before, self.digital_outputs = (
-            self.digital_outputs, self.digital_outputs & ~mask | wanted & mask)
+            self.digital_outputs, self.digital_outputs & ~mask | bits & mask)
         changed = before ^ self.digital_outputs
         if changed >> self.gripper_output & 1:
             self._drive_gripper(bool(self.digital_outputs >> self.gripper_output & 1))

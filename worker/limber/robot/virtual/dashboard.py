@@ -56,14 +56,14 @@ def _play(controller: Controller) -> str:
     return "Starting program"
 
 
-def _power(mode: RobotMode, said: str):
+def _power(mode: RobotMode, reply: str):
     def change(controller: Controller) -> str:
         if controller.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
             return _REFUSED
         if mode == RobotMode.POWER_OFF:
             controller.stop_program("power off")
         controller.robot_mode = mode
-        return said
+        return reply
     return change
 
 

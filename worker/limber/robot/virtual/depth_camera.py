@@ -48,13 +48,13 @@ class VirtualCamera:
         """
         try:
             self._socket.sendall(camera.model_dump_json().encode() + b"\n")
-            told = json.loads(self._stream.readline() or b"{}")
-            packed = self._stream.read(told.get("bytes", 0))
+            header = json.loads(self._stream.readline() or b"{}")
+            packed = self._stream.read(header.get("bytes", 0))
         except (OSError, ValueError) as error:
             raise WorkError(f"The connection to the virtual camera was lost ({error}).") from error
-        if "error" in told or not packed:
+        if "error" in header or not packed:
             raise WorkError("The virtual camera returned no image: "
-                            f"{told.get('error', 'it has ended')}.")
+                            f"{header.get('error', 'it has ended')}.")
         steps = np.frombuffer(zlib.decompress(packed), "<u2")
         return steps.reshape(camera.height, camera.width) / camera.depth_scale
 
@@ -70,8 +70,9 @@ def views_around(middle: np.ndarray, distance: float, count: int,
     found = []
     for number in range(count):
         turn, tilt = 2 * np.pi * number / count, 0.35 * (-1) ** number
-        way = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-        found.append(camera.looking(eye=middle + distance * way, target=middle))
+        direction = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt),
+                              np.sin(tilt)])
+        found.append(camera.looking(eye=middle + distance * direction, target=middle))
     return found
 
 

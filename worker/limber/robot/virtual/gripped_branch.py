@@ -19,12 +19,12 @@ from limber.core.errors import InputError
 from limber.core.numerics.rigid_kernels import crossed, frame_of, inverse_of, rotation_vector
 from limber.robot.virtual.branch_solution import NO_BENDS, Solution
 from limber.robot.virtual.branch_solver import SAME_PLACE, BranchSetting, solve_for_ever
-from limber.robot.virtual.step_kernels import led_on
+from limber.robot.virtual.step_kernels import steer
 
 _BLEND_SECONDS = 0.05
-_LEAD = 1.5  # times what a solution takes: the middle of when it is used
+_LEAD = 1.5  # times a solution's duration: the middle of the time in which it is used
 _LONGEST_LEAD = 0.5  # s
-_PAST = 5  # solutions that are known still: the robot may go slowly
+_PAST = 5  # past solutions kept: the robot may move slowly
 
 
 class HeldBranch:
@@ -33,7 +33,7 @@ class HeldBranch:
     def __init__(self, setting: BranchSetting):
         self.setting = setting
         # Compiled before the robot's clock runs.
-        led_on(np.eye(4), np.zeros(6), np.eye(6), *NO_BENDS, np.eye(4), 0.0)
+        steer(np.eye(4), np.zeros(6), np.eye(6), *NO_BENDS, np.eye(4), 0.0)
         self._base = frame_of(np.array(setting.base_pose, float))
         self._tool = frame_of(np.array(setting.grasp_pose, float))
         context = get_context("spawn")
@@ -191,13 +191,13 @@ class HeldBranch:
     def report(self) -> dict[str, Any]:
         """Return its state as plain data."""
         solution = self._solution
-        told: dict[str, Any] = {"branch": self.state, "solution_age_s": self._age,
-                                "points": self.points.tolist(),
-                                "extrapolation_error_n": self._largest_jump}
+        state: dict[str, Any] = {"branch": self.state, "solution_age_s": self._age,
+                                 "points": self.points.tolist(),
+                                 "extrapolation_error_n": self._largest_jump}
         if solution is not None:
-            told |= {"solve_s": solution.seconds, "peak_strain": solution.peak_strain,
-                     "converged": solution.converged, "true_wrench": solution.wrench.tolist()}
-        return told
+            state |= {"solve_s": solution.seconds, "peak_strain": solution.peak_strain,
+                      "converged": solution.converged, "true_wrench": solution.wrench.tolist()}
+        return state
 
     def _follow_twist(self, patch: np.ndarray, seconds: float) -> None:
         """Velocity and angular velocity of the patch, over the last hundredths of a second."""
@@ -214,11 +214,11 @@ class HeldBranch:
             if kind == "tried":
                 self._tried = found
                 if self._solution is not None:
-                    self._solution.led_by(list(self._past)[1:], found)
+                    self._solution.add_predictions(list(self._past)[1:], found)
                 return
             before, self._age = self._solution, 0.0
             self._taken = self._asked_age
-            found.led_by(self._past, self._tried)
+            found.add_predictions(self._past, self._tried)
             self._past.appendleft(found)
             if before is not None:
                 # The wrench blends to the new solution: a branch's force does not jump.
@@ -242,9 +242,9 @@ class HeldBranch:
 
     def _ahead(self, patch: np.ndarray) -> np.ndarray:
         """Pose of the patch in the middle of the time in which a solution is used."""
-        way = min(_LEAD * self._taken, _LONGEST_LEAD) * self._twist
-        ahead = frame_of(np.concatenate((np.zeros(3), way[3:]))) @ patch
-        ahead[:3, 3] = patch[:3, 3] + way[:3]
+        step = min(_LEAD * self._taken, _LONGEST_LEAD) * self._twist
+        ahead = frame_of(np.concatenate((np.zeros(3), step[3:]))) @ patch
+        ahead[:3, 3] = patch[:3, 3] + step[:3]
         return ahead
 
     def _receive(self, kind: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from limber.robot.virtual.arm_motions import Servo, SpeedMotion, Waypoint, line_
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.server import Server, new_loop
 
-_START_SECONDS = 240.0  # its first start on a machine compiles what moves the branch
+_START_SECONDS = 240.0  # the first start on a machine compiles the kernels of the branch
 
 
 class VirtualRobot:

@@ -238,8 +238,8 @@ class ControlProgram:
         except Unreachable:
             controller.outputs_int[self._first + 1] = 0
 
-    def _forward(self, controller: "Controller", given: bool) -> None:
-        if not given:
+    def _forward(self, controller: "Controller", is_forwarded: bool) -> None:
+        if not is_forwarded:
             self._answer(controller, controller.pose)
             return
         tool = matrices(self._vector(controller, 6))

@@ -37,7 +37,7 @@ _MARKER_SIGMA_M = 0.5e-3
 # Longest delay that is caught up; beyond it the controller's clock stands still. A real controller
 # is never delayed: its watchdog must not count time that only this process lost.
 _MOST_CATCH_UP = 0.01
-_SENDS_BEHIND = 1 << 20  # bytes a client may leave unread before it is cut off
+_SENDS_BEHIND = 1 << 20  # bytes that a client may leave unread before it is disconnected
 
 
 class Server:
@@ -237,8 +237,8 @@ class Server:
                 while self.controller.load.picture is None:
                     await asyncio.sleep(0.01)
                 picture = self.controller.load.picture
-            told = {"t_s": self.controller.clock, "bytes": len(picture)}
-            self.send(writer, json.dumps(told).encode() + b"\n" + picture)
+            header = {"t_s": self.controller.clock, "bytes": len(picture)}
+            self.send(writer, json.dumps(header).encode() + b"\n" + picture)
 
 
 class _Client(asyncio.Protocol):
@@ -336,8 +336,8 @@ class _RtdeClient(_Client):
     def _reply(self, command: int, body: bytes) -> bytes | None:
         controller = self._server.controller
         if command == rtde.VERSION_REQUEST:
-            wanted = struct.unpack(">H", body[:2])[0] if len(body) >= 2 else 0
-            return bytes([wanted == 2])
+            version = struct.unpack(">H", body[:2])[0] if len(body) >= 2 else 0
+            return bytes([version == 2])
         if command == rtde.CONTROL_VERSION:
             return struct.pack(">4I", *controller.version)
         if command == rtde.OUTPUT_SETUP:
@@ -387,9 +387,9 @@ def new_loop() -> asyncio.AbstractEventLoop:
 
 
 def _end_of_script(text: str) -> int | None:
-    place = 0
+    index = 0
     for line in text.splitlines(keepends=True):
-        place += len(line)
+        index += len(line)
         if line.rstrip("\r\n") == "end" and line.endswith("\n"):
-            return place
+            return index
     return None

@@ -6,7 +6,7 @@ import numpy as np
 from limber.core.numerics.compiled import compiled
 from limber.core.numerics.rigid_kernels import inverse_of, rotation_vector
 
-_FARTHEST = 0.03  # m over which a change of the tangent is led on
+_FARTHEST = 0.03  # m over which a change of the tangent is extrapolated
 
 
 @compiled
@@ -49,23 +49,23 @@ def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain:
     # Implicit in the speed, so that any gain is stable at 125 Hz as well.
     damping = 1.0 + step * gain * lookahead + step * step * gain
     for k in range(len(joints)):
-        wanted = (speeds[k] + step * gain * (target[k] - joints[k])) / damping
-        change = min(max(wanted - speeds[k], -largest * step), largest * step)
+        acceleration = (speeds[k] + step * gain * (target[k] - joints[k])) / damping
+        change = min(max(acceleration - speeds[k], -largest * step), largest * step)
         new_speeds[k] = speeds[k] + change
         new_joints[k] = joints[k] + step * new_speeds[k]
     return new_joints, new_speeds
 
 
 @compiled
-def led_on(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, ways: np.ndarray,
-           bends: np.ndarray, patch: np.ndarray, compliance: float) -> np.ndarray:
+def steer(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, directions: np.ndarray,
+          bends: np.ndarray, patch: np.ndarray, compliance: float) -> np.ndarray:
     """Return the wrench [6] of a held branch near where it was solved.
 
     Args:
         frame, wrench, stiffness: Frame of the solution [4, 4], the wrench there [6] and its
             derivative to position and rotation [6, 6].
-        ways, bends: Displacements [m], shape [n, 3], and the change of stiffness over each, shape
-            [n, 6, 6]; earlier ones take precedence.
+        directions, bends: Displacements [m], shape [n, 3], and the change of stiffness over each,
+            shape [n, 6, 6]; earlier ones take precedence.
         patch: Frame of the held patch with zero compliance, shape [4, 4].
         compliance: Distance of the patch behind the gripper per force [m/N].
     """
@@ -74,14 +74,14 @@ def led_on(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, ways: n
     change[3:] = rotation_vector(patch @ inverse_of(frame))
     at, felt = change.copy(), np.zeros(6)
     # The stiffness is that of the patch's displacement, which depends on the force.
-    for _ in range(2 if compliance > 0.0 and len(ways) > 0 else 1):
+    for _ in range(2 if compliance > 0.0 and len(directions) > 0 else 1):
         secant, left = stiffness.copy(), at[:3].copy()
-        for way, bend in zip(ways, bends):  # noqa: B905 (no strict in a kernel)
-            square = (way * way).sum()
+        for direction, bend in zip(directions, bends):  # noqa: B905 (no strict in a kernel)
+            square = (direction * direction).sum()
             most = _FARTHEST / np.sqrt(square)
-            part = min(max((left * way).sum() / square, -most), most)
+            part = min(max((left * direction).sum() / square, -most), most)
             secant += 0.5 * part * bend
-            left -= part * way
+            left -= part * direction
         yielding = np.eye(6)
         yielding[:, :3] += compliance * secant[:, :3]
         felt = np.linalg.solve(yielding, wrench + secant @ change)

@@ -79,23 +79,23 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
         return stage.result
 
 
-def _pull(branch: Branch, wanted: str | None) -> Pull:
+def _pull(branch: Branch, name: str | None) -> Pull:
     from limber.recordings.recording import read_entry, read_pull
     from limber.store.loading import known_pulls
 
     swings = [name for name in known_pulls(branch)
               if read_entry(branch.path(f"pulls/{name}/pull.toml")).motion == "swing"]
-    if wanted is None and len(swings) == 1:
-        wanted = swings[0]
-    if wanted not in swings:
+    if name is None and len(swings) == 1:
+        name = swings[0]
+    if name not in swings:
         raise InputError(
-            f"{branch.folder} has no swing {wanted or ''}.",
+            f"{branch.folder} has no swing {name or ''}.",
             f"It has {', '.join(swings)}." if swings else "It has none.",
             "Name one with --pull, or import one with `limber import-pull --motion swing "
             "--weight`.")
-    pull = read_pull(branch.path(f"pulls/{wanted}"))
+    pull = read_pull(branch.path(f"pulls/{name}"))
     if pull.entry.swing is None or pull.observations is None or pull.entry.rest_points_m is None:
-        raise InputError(f"{wanted}: pull.toml lacks [swing] or rest_points_m, or no markers.",
+        raise InputError(f"{name}: pull.toml lacks [swing] or rest_points_m, or no markers.",
                          "The release and the markers' rest positions must be known.",
                          "Import it with `limber import-pull --motion swing`.")
     return pull

@@ -104,9 +104,9 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
                              "Name the unit in the title of the times: t_s, t_ms or t_us.")
         progress(0.3, "modulus of that frequency")
         model = load_branch(branch, progress=progress).model
-        told = young_of(_with_sensor(model, settings), seen, settings)
-        young = told["young_factor"] * model.young
-        result = _summary(seen, told, float(young.mean()))
+        fitted = young_of(_with_sensor(model, settings), seen, settings)
+        young = fitted["young_factor"] * model.young
+        result = _summary(seen, fitted, float(young.mean()))
         with branch.stage("vibration", settings, digests=digests) as stage:
             stage.path("vibration.json").write_text(
                 json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -127,27 +127,27 @@ def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> 
     """
     from limber.mechanics.dynamics.modes import lowest_modes
 
-    wanted, factor, last = float(seen.frequencies[0]), 1.0, None
+    target, factor, last = float(seen.frequencies[0]), 1.0, None
     for _ in range(_ROUNDS):
         found = lowest_modes(model.with_young(factor * model.young), 3).frequencies
-        way = np.log(wanted / found[0])
-        if abs(way) < 1e-5:
+        log_ratio = np.log(target / found[0])
+        if abs(log_ratio) < 1e-5:
             break
         # Weight also stiffens or softens a branch: the slope is not exactly one half.
         slope = 0.5 if last is None else np.clip(
             (np.log(found[0]) - last[1]) / (np.log(factor) - last[0]), 0.1, 2.0)
         last = np.log(factor), np.log(found[0])
-        factor *= float(np.exp(way / slope))
+        factor *= float(np.exp(log_ratio / slope))
     else:
-        raise WorkError(f"No modulus gives the branch a first frequency of {wanted:.3g} Hz.",
+        raise WorkError(f"No modulus gives the branch a first frequency of {target:.3g} Hz.",
                         "The branch's mass, or what hangs on it, does not match the record.",
                         "Check density, --sensor and the record's unit of time.")
     slope = 0.5 if last is None else slope
     near = found[found < _CLOSE * found[0]]
     # The observed plane of bending is unknown if the record does not separate the two.
-    is_parted = len(seen.frequencies) > 1 and seen.frequencies[1] < _CLOSE * wanted
+    is_parted = len(seen.frequencies) > 1 and seen.frequencies[1] < _CLOSE * target
     planes = 0.0 if is_parted else float(np.log(near[-1] / near[0])) / np.sqrt(3.0)
-    deviation = np.sqrt((seen.frequency_deviations[0] / wanted / slope) ** 2
+    deviation = np.sqrt((seen.frequency_deviations[0] / target / slope) ** 2
                         + (planes / slope) ** 2 + settings.density_sigma**2
                         + (2 * settings.radius_sigma) ** 2 + _MESH_DEVIATION**2)
     return {"young_factor": factor, "deviation": float(deviation), "model_frequencies_hz": found}
@@ -167,18 +167,18 @@ def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel
     return model.with_point_masses([*model.point_masses, PointMass((x, y, z), mass)])
 
 
-def _summary(seen: Ringing, told: dict[str, Any], level: float) -> dict[str, Any]:
+def _summary(seen: Ringing, fitted: dict[str, Any], level: float) -> dict[str, Any]:
     from limber.core.json_values import plain
 
-    spread = 1.96 * told["deviation"]
+    spread = 1.96 * fitted["deviation"]
     omega = 2 * np.pi * seen.frequencies[0]
     return plain({
         "young_pa": level, "young_interval_pa": [level * np.exp(-spread), level * np.exp(spread)],
-        "young_factor": told["young_factor"], "young_deviation": told["deviation"],
+        "young_factor": fitted["young_factor"], "young_deviation": fitted["deviation"],
         "frequencies_hz": seen.frequencies, "frequency_deviations_hz": seen.frequency_deviations,
         "damping_ratios": seen.damping, "damping_ratio_deviations": seen.damping_deviations,
         "damping_ratio_intervals": seen.damping_intervals,
-        "model_frequencies_hz": told["model_frequencies_hz"], "left_over": seen.left_over,
+        "model_frequencies_hz": fitted["model_frequencies_hz"], "left_over": seen.left_over,
         "damping_mass_per_s": 0.0, "damping_stiffness_s": float(2 * seen.damping[0] / omega),
         "start_s": seen.start, "duration_s": seen.duration})
 

@@ -78,17 +78,17 @@ class LoadSettings(Settings):
 
     @field_validator("wind")
     @classmethod
-    def _possible_wind(cls, given: _Place | None) -> _Place | None:
-        if given is not None and (speed := math.hypot(*given)) > _FASTEST_WIND:
+    def _possible_wind(cls, value: _Place | None) -> _Place | None:
+        if value is not None and (speed := math.hypot(*value)) > _FASTEST_WIND:
             raise ValueError(f"no wind has {speed:g} m/s; {speed / 3.6:g} m/s would be {speed:g} "
                              "km/h")
-        return given
+        return value
 
     @field_validator("fruit")
     @classmethod
-    def _possible_fruit(cls, given: tuple[_Fruit, ...]) -> tuple[_Fruit, ...]:
-        possible_force(tuple(fruit[3] * STANDARD_GRAVITY for fruit in given))
-        return given
+    def _possible_fruit(cls, values: tuple[_Fruit, ...]) -> tuple[_Fruit, ...]:
+        possible_force(tuple(fruit[3] * STANDARD_GRAVITY for fruit in values))
+        return values
 
 
 def load(folder: Path, settings: LoadSettings, *, force: bool = False,
@@ -137,15 +137,15 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     loads = Outdoors(wind, settings.drag, settings.snow, tuple(
         PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
     outdoors = LoadedOutdoors(prestress, skeleton, loads)
-    told = None
+    peak = None
     if gusts is not None:
         progress(0.1, "gusts")
-        outdoors, told = with_peak(outdoors, gusts, known_damping(branch, progress))
+        outdoors, peak = with_peak(outdoors, gusts, known_damping(branch, progress))
     bent, result = load_effects(
         outdoors, strain_limit=settings.strain_limit, deviation=young_deviation(branch),
         most=settings.most if settings.limit_load else None, progress=progress.part(0.2, 1.0))
     result |= {"frequencies_before_hz": lowest_modes(prestress, len(bent.frequencies)).frequencies,
-               "gusts": told}
+               "gusts": peak}
     if settings.name is not None:
         _keep(branch, settings, inputs, prestress, bent, result)
     return result
@@ -156,10 +156,11 @@ def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
     reads = [file for file in ("mesh.vtu", "skeleton.swc", "skeleton.csv", "point_masses.json",
                                "targets.json", "estimate.json") if branch.has(file)]
     # Damping and the interval may come from a swing's result alone.
-    told = {key: hashlib.sha256(branch.manifest.stages[key].model_dump_json().encode()).hexdigest()
-            for key in ("estimate", "swing", "vibration") if key in branch.manifest.stages}
+    digests = {key:
+               hashlib.sha256(branch.manifest.stages[key].model_dump_json().encode()).hexdigest()
+               for key in ("estimate", "swing", "vibration") if key in branch.manifest.stages}
     record = settings.gust_record
-    return {"reads": reads, "digests": told | (
+    return {"reads": reads, "digests": digests | (
         {} if record is None else {"gust_record": file_digest(record)})}
 
 
@@ -173,15 +174,15 @@ def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], prestr
     from limber.results.motion_files import surface_fields, surface_nodes, write_pc2
 
     nodes, name = surface_nodes(prestress.mesh), f"frames/load-{settings.name}"
-    ways = np.stack([np.zeros_like(bent.displacement), bent.displacement])
-    states = [strain_state(prestress, way) for way in ways]
+    displacements = np.stack([np.zeros_like(bent.displacement), bent.displacement])
+    states = [strain_state(prestress, displacement) for displacement in displacements]
     with branch.stage(f"load:{settings.name}", settings, **inputs) as stage:
         stage.path(f"loads/{settings.name}.json").write_text(
             json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        write_pc2(stage.path(f"{name}.pc2"), prestress.mesh.nodes[nodes] + ways[:, nodes])
+        write_pc2(stage.path(f"{name}.pc2"), prestress.mesh.nodes[nodes] + displacements[:, nodes])
         np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(prestress.mesh, states))
         stage.path(f"{name}.json").write_text(json.dumps({
-            "frame_count": len(ways), "rate": 1.0,
+            "frame_count": len(displacements), "rate": 1.0,
             "largest_principal_strains": [float(state.principal_strain[:, -1].max())
                                           for state in states]}), encoding="utf-8")
         stage.result.update({key: value for key, value in plain(result).items()
@@ -202,11 +203,11 @@ def _gusts(settings: LoadSettings) -> Gusts | None:
         settings.gust, settings.gust_length, settings.gust_time)
 
 
-def _require_near(nodes: np.ndarray, places: list[_Place]) -> None:
-    for place in places:
-        distance = float(np.linalg.norm(nodes - np.array(place), axis=1).min())
+def _require_near(nodes: np.ndarray, points: list[_Place]) -> None:
+    for point in points:
+        distance = float(np.linalg.norm(nodes - np.array(point), axis=1).min())
         if not distance < 0.1:
-            raise InputError(f"A fruit at {place} m is {distance:.3g} m away from the branch.",
+            raise InputError(f"A fruit at {point} m is {distance:.3g} m away from the branch.",
                              "A fruit must hang on the branch.", "Check frame and unit.")
 
 

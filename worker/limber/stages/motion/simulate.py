@@ -198,15 +198,15 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
     if pull.entry.motion == "swing":
         raise InputError(f"{inputs.pull} is a free swing.", "A free swing has no gripper.",
                          "`limber swing` fits it.")
-    grasp, way = pull.entry.grasp, PoseTable(pull.times, pull.poses)
+    grasp, path = pull.entry.grasp, PoseTable(pull.times, pull.poses)
     is_static = pull.entry.motion == "quasi_static"
-    told = {"name": inputs.pull, "kind": "static" if is_static else "dynamic", "hold": 0.0,
-            "grasp_point": grasp.point_m, "grasp_radius": grasp.radius_m,
-            "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None}
+    summary = {"name": inputs.pull, "kind": "static" if is_static else "dynamic", "hold": 0.0,
+               "grasp_point": grasp.point_m, "grasp_radius": grasp.radius_m,
+               "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None}
     if is_static:
         # Each frame is a separate equilibrium, and a recording may last for minutes.
-        told["frame_rate"] = min(settings.frame_rate, _MOST_REPLAYED / way.duration)
-    return settings.model_copy(update=told), way
+        summary["frame_rate"] = min(settings.frame_rate, _MOST_REPLAYED / path.duration)
+    return settings.model_copy(update=summary), path
 
 
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
@@ -223,7 +223,7 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
         progress.warn(message)
     poses = with_columns(stream, POSE_COLUMNS).values
     if np.isnan(poses[:, 3:]).all():
-        poses[:, 3:] = 0.0  # a table of positions alone
+        poses[:, 3:] = 0.0  # a table of positions only
     known = np.isfinite(poses).all(axis=1)
     return PoseTable(stream.times[known], poses[known])
 

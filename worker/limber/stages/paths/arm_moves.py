@@ -11,13 +11,13 @@ from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
-from limber.robot.motion.joint_planner import joint_way
+from limber.robot.motion.joint_planner import joint_space_path
 from limber.robot.motion.trajectory import Trajectory, along, along_bounded, densely
 from limber.stages.paths.arm_surroundings import ArmSurroundings
 
-_NEAR_M = 0.15  # from the branch: from there on the arm is slower
+_NEAR_M = 0.15  # m from the branch: nearer, the arm is slower
 _SLOWEST = 0.25
-_JOINT_SPEED = 0.4  # rad/s: an elbow is as fast as a gripper, and nobody looks at it
+_JOINT_SPEED = 0.4  # rad/s: an elbow is as fast as a gripper, and nobody watches it
 
 
 def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurroundings,
@@ -32,15 +32,15 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
     _require_limits(cell, goal)
     if np.abs(goal - start).max() < 1e-3:
         raise NoPathError("The arm is there already.", "", "")
-    joints = joint_way(start, goal, cell.joint_limits, around.free)
+    joints = joint_space_path(start, goal, cell.joint_limits, around.free)
     poses = pose_vectors(cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose)))
     limits, fastest = cell.limits, speed_within(cell, cell.limits.speed_m_s)
-    ways = np.array([max(length(second[:3] - first[:3]), fastest * max(
+    lengths = np.array([max(length(second[:3] - first[:3]), fastest * max(
         length(turn_between(first, second)) / (0.8 * limits.turn_speed_rad_s),
         float(np.abs(turned).max()) / _JOINT_SPEED))
         for (first, second), turned in zip(pairwise(poses), np.diff(joints, axis=0), strict=True)])
     share = np.clip(around.from_branch(joints) / _NEAR_M, _SLOWEST, 1.0)
-    times = along_bounded(ways, share * fastest, limits.acceleration_m_s2)
+    times = along_bounded(lengths, share * fastest, limits.acceleration_m_s2)
     return Trajectory(times, poses, ExpectedWrench.nothing(poses), joints, by_joints=True)
 
 

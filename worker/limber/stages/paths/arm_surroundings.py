@@ -9,8 +9,8 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.constraints.obstacles import Obstacle
 from limber.robot.cell.cell import Cell
 
-_CLEAR_M = 0.02  # kept between the arm and everything
-_SPACING_M = 0.03  # of points along a rod
+_CLEAR_M = 0.02  # m kept between the arm and everything else
+_SPACING_M = 0.03  # m between points along a rod
 
 
 class ArmSurroundings:
@@ -72,7 +72,7 @@ class ArmSurroundings:
 
     def _from_obstacles(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
         found = np.full(len(rods[0]), np.inf)
-        places, radii = self._places(rods)
+        places, radii = self._rod_points(rods)
         for obstacle in self._obstacles:
             far = obstacle.clearance(places.reshape(-1, 3)).reshape(len(found), -1) - radii
             found = np.minimum(found, far.min(axis=1))
@@ -82,8 +82,8 @@ class ArmSurroundings:
         """Return the smallest distance to the branch at joint angles [n, joints] [m], shape [n]."""
         if self._branch is None:
             return np.full(len(joints), np.inf)
-        places, radii = self._places(self._rods(joints))
-        far = self._branch.clearance(places.reshape(-1, 3)).reshape(len(joints), -1) - radii
+        points, radii = self._rod_points(self._rods(joints))
+        far = self._branch.clearance(points.reshape(-1, 3)).reshape(len(joints), -1) - radii
         return far.min(axis=1)
 
     def _rods(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -91,22 +91,22 @@ class ArmSurroundings:
         arm, flange = self._cell.arm.rods(joints), self._cell.arm.forward(joints)
         starts, ends, radii = [arm.starts], [arm.ends], [np.asarray(arm.radii, float)]
         for part in self._cell.tool.parts:
-            for found, place in ((starts, part.start_m), (ends, part.end_m)):
-                found.append((flange[:, :3, :3] @ np.array(place) + flange[:, :3, 3])[:, None])
+            for found, end in ((starts, part.start_m), (ends, part.end_m)):
+                found.append((flange[:, :3, :3] @ np.array(end) + flange[:, :3, 3])[:, None])
             radii.append(np.array([part.radius_m]))
         return np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), np.concatenate(radii)
 
-    def _places(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray],
-                ) -> tuple[np.ndarray, np.ndarray]:
+    def _rod_points(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray],
+                    ) -> tuple[np.ndarray, np.ndarray]:
         """Points along the rods, branch frame, shape [n, k, 3], and the radius at each, [k]."""
         starts, ends, radii = rods
-        places, thick = [], []
+        points, thick = [], []
         for k, radius in enumerate(radii):
             length = float(np.linalg.norm(ends[0, k] - starts[0, k]))
             share = np.linspace(0.0, 1.0, int(np.ceil(length / _SPACING_M)) + 1)[:, None]
-            places.append(starts[:, None, k] + share * (ends[:, None, k] - starts[:, None, k]))
+            points.append(starts[:, None, k] + share * (ends[:, None, k] - starts[:, None, k]))
             thick.append(np.full(len(share), radius + 0.5 * _SPACING_M))
-        found = np.concatenate(places, axis=1) @ self._base[:3, :3].T + self._base[:3, 3]
+        found = np.concatenate(points, axis=1) @ self._base[:3, :3].T + self._base[:3, 3]
         return found, np.concatenate(thick)
 
 
@@ -116,8 +116,8 @@ class Limbs:
     name = "the branch"
 
     def __init__(self, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray):
-        self._starts, self._ways, self._radii = starts, ends - starts, radii
-        self._squares = np.maximum((self._ways**2).sum(axis=1), 1e-18)
+        self._starts, self._vectors, self._radii = starts, ends - starts, radii
+        self._squares = np.maximum((self._vectors**2).sum(axis=1), 1e-18)
 
     @classmethod
     def of(cls, skeleton: Skeleton) -> "Limbs":
@@ -130,22 +130,22 @@ class Limbs:
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of ``points`` [n, 3] outside the surface [m], shape [n]."""
         found = np.full(len(points), np.inf)
-        for start, way, square, radius in zip(self._starts, self._ways, self._squares,
-                                              self._radii, strict=True):
+        for start, vector, square, radius in zip(self._starts, self._vectors, self._squares,
+                                                 self._radii, strict=True):
             off = points - start
-            part = np.clip(off @ way / square, 0.0, 1.0)
-            found = np.minimum(found, np.linalg.norm(off - part[:, None] * way, axis=1) - radius)
+            part = np.clip(off @ vector / square, 0.0, 1.0)
+            found = np.minimum(found, np.linalg.norm(off - part[:, None] * vector, axis=1) - radius)
         return found
 
 
 def _apart(rods: tuple[np.ndarray, np.ndarray, np.ndarray], first: int, second: int) -> np.ndarray:
     """Distance of two rods [m], shape [n], from points along one to the other."""
     starts, ends, radii = rods
-    way = ends[:, second] - starts[:, second]
-    square = np.maximum((way**2).sum(axis=1), 1e-18)
-    found = np.full(len(way), np.inf)
+    vectors = ends[:, second] - starts[:, second]
+    square = np.maximum((vectors**2).sum(axis=1), 1e-18)
+    found = np.full(len(vectors), np.inf)
     for share in np.linspace(0.0, 1.0, 9):
         off = (starts[:, first] + share * (ends[:, first] - starts[:, first])) - starts[:, second]
-        part = np.clip((off * way).sum(axis=1) / square, 0.0, 1.0)
-        found = np.minimum(found, np.linalg.norm(off - part[:, None] * way, axis=1))
+        part = np.clip((off * vectors).sum(axis=1) / square, 0.0, 1.0)
+        found = np.minimum(found, np.linalg.norm(off - part[:, None] * vectors, axis=1))
     return found - radii[first] - radii[second]

@@ -12,7 +12,7 @@ from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
-_MOST_TIMES = 4  # the samples asked for, that --field-error may take
+_MOST_TIMES = 4  # multiple of the requested samples that --field-error may take
 
 
 def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int | None = None,

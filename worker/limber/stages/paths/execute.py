@@ -113,7 +113,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     Raises:
         InputError, NoPathError: as :func:`execute`.
     """
-    branch, cell, settings, told = _plan_of_cell(folder, name, cell_file, settings, progress)
+    branch, cell, settings, stated = _plan_of_cell(folder, name, cell_file, settings, progress)
     if is_to_move:
         from limber.robot.cell.compatibility import require_payload
 
@@ -128,20 +128,21 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
 
     progress(0.02, "inverse kinematics")
     model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
-    clear = KeptClear.of(cell, Path(cell_file).parent, model, told.get("clearance_m"))
+    clear = KeptClear.of(cell, Path(cell_file).parent, model, stated.get("clearance_m"))
     # The plan's own rotation of the gripper is the one checked against obstacles.
-    rotation = settings.gripper_rotation or (told.get("robot") or {}).get("gripper_rotation")
+    rotation = settings.gripper_rotation or (stated.get("robot") or {}).get("gripper_rotation")
     asked = {"speed": present(settings.speed, "speed"), "rotation": rotation,
              "blocked": blocked_by(cell, clear.obstacles, clear.clearance)}
     planned = planned_poses(branch, name, model.rest_position)
-    offsets = offsets_along(told.get("turning"), planned[:, :3])
+    offsets = offsets_along(stated.get("turning"), planned[:, :3])
     planned = turned(planned, offsets) if offsets.any() else planned
     if np.isfinite(planned).all():
         # With the plan's own poses: whether the arm reaches them is known at once, forces are not.
         at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
         robot_motion(cell, at_once, model.reach.axis, **asked)
     progress(0.05, "forces along the path")
-    predicted = predicted_along(branch, model, planned[:, :3], told.get("turning"), clear, progress)
+    predicted = predicted_along(branch, model, planned[:, :3], stated.get("turning"), clear,
+                                progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
     result = _summary(cell, motion) | clear.describe() | {"legs": legs_in_cell(
@@ -162,15 +163,15 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
         progress.warn(warning)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
-    told = _told(branch, name)
-    if warning := check_plan(told.get("robot"), cell):
+    stated = _stated_by_plan(branch, name)
+    if warning := check_plan(stated.get("robot"), cell):
         progress.warn(warning)
-    settings = _as_planned(told, settings, cell)
-    settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
-    return branch, cell, settings, told
+    settings = _as_planned(stated, settings, cell)
+    settings, cell = _as_slow_as_checked(stated.get("in_motion"), settings, cell, progress)
+    return branch, cell, settings, stated
 
 
-def _told(branch: Branch, name: str) -> dict[str, Any]:
+def _stated_by_plan(branch: Branch, name: str) -> dict[str, Any]:
     """Robot, clearance, pace, legs and the check in motion that a plan's file states, if in this
     program's format.
     """
@@ -231,8 +232,8 @@ def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
     if box is not None:
         outside = np.any((poses[:, :3] < box.low_m) | (poses[:, :3] > box.high_m), axis=1)
         if outside.any():
-            place = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
-            raise InputError(f"The path leaves the workspace at ({place}) m.",
+            position = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
+            raise InputError(f"The path leaves the workspace at ({position}) m.",
                              "The guard would stop there.", "Plan inside it, or correct the cell "
                                                             "file.")
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
 
 
-_FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
+_FRAME_RATE = 24.0  # frames per second of the played motion; a pose is a frame
 
 
 class PlanInputs(BranchInputs):
@@ -141,7 +141,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
             grasp_model,
             settings,
             limits=limits,
-            cell=None if in_cell is None else in_cell.places,
+            cell=None if in_cell is None else in_cell.positions,
             uncertainty=uncertainty,
             pace=pace,
             workers=workers,
@@ -192,7 +192,7 @@ class _InCell:
     cell: Cell
     obstacles: tuple[Obstacle, ...]
     limits: Limits
-    places: dict[str, CellPlace]
+    positions: dict[str, CellPlace]
     clearance: float
 
     @classmethod
@@ -201,9 +201,9 @@ class _InCell:
         from limber.stages.paths.plan_cell import (
             cell_for,
             cell_obstacles,
+            cell_positions,
             clearance_in,
             limits_in,
-            places_in,
         )
 
         cell = cell_for(branch, path, progress)
@@ -212,7 +212,7 @@ class _InCell:
             cell, settings.clearance, obstacles, grasp_model.rest_position,
             grasp_model.mesh.nodes + grasp_model.rest.displacement)
         return cls(cell, obstacles, limits_in(cell, limits, obstacles, clearance),
-                   places_in(cell, obstacles), clearance)
+                   cell_positions(cell, obstacles), clearance)
 
     def taken(self, motion: Way, grasp_model: GraspModel, found: PlannedMotion,
               settings: PlanSettings, progress: Progress) -> dict[str, Any]:
@@ -258,9 +258,10 @@ class _InCell:
         from limber.planning.constraints.obstacles import closest
         from limber.planning.goals.goal_kinds import asked_kinds
 
-        places = [getattr(settings, kind.name) for kind in asked_kinds(settings) if kind.is_place]
-        for place in places:
-            hit = closest(self.obstacles, np.array([place], float), self.clearance)
+        requested = [getattr(settings, kind.name) for kind in asked_kinds(settings)
+                     if kind.is_place]
+        for name in requested:
+            hit = closest(self.obstacles, np.array([name], float), self.clearance)
             if hit:
                 inside = hit[1] - self.clearance
                 raise NoPathError(
@@ -292,13 +293,13 @@ def _stiffer(branch: Branch) -> float:
 def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
            grasp_model: GraspModel, found: PlannedMotion) -> None:
     from limber.mechanics.strain import strain_state
-    from limber.planning.plan_file import limits_of_motion, plan_text, way_of
+    from limber.planning.plan_file import limits_of_motion, path_record, plan_text
     from limber.results.motion_files import surface_fields, write_pc2
     from limber.stages.paths.plan_tables import motion_table, path_table, trees_table
 
     names = tuple(target.name for target in grasp_model.branch.targets)
-    baseline, plan = (way_of(path.solved, names, pace=pace,
-                             field_energies=found.field.energy(path.solved.poses[:, :3]))
+    baseline, plan = (path_record(path.solved, names, pace=pace,
+                                  field_energies=found.field.energy(path.solved.poses[:, :3]))
                       for path in (found.baseline, found.plan))
     stage.path(f"plans/{name}.json").write_text(plan_text(
         found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace),

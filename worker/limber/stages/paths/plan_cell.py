@@ -31,15 +31,15 @@ from limber.stages.paths.plan_legs import surface_points
 from limber.store import Branch
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_TURNS = 200  # directions from which a second arm may take a target
-_ROD_SPACING = 0.02  # [m] of points along a part of gripper or arm
-_POSE_SPACING = 0.01  # [m] that a part goes at most between poses that are looked at
-_BETWEEN = 0.006  # [m] by which parts are thicker for what lies between both
-_SIGHT_SPACING = 0.005  # [m] of points on a line of sight
-_DEVIATIONS = 2.0  # of where the robot holds the branch, that a clearance covers
-_AT_REST = 0.9  # of the branch's clearance at rest, that is kept at most where none was asked for
+_TURNS = 200  # directions from which a second arm may approach a target
+_ROD_SPACING = 0.02  # [m] between points along a part of gripper or arm
+_POSE_SPACING = 0.01  # [m] largest step of a part between checked poses
+_BETWEEN = 0.006  # [m] added to the parts' radii for the motion between poses
+_SIGHT_SPACING = 0.005  # [m] between points on a line of sight
+_DEVIATIONS = 2.0  # standard deviations of the branch's position that a clearance covers
+_AT_REST = 0.9  # fraction of the clearance at rest that is kept at most if none was requested
 _CLAMPED = 0.001  # [m] by which a piece that is clamped, not only held, moves the branch at most
-_LARGE = 20.0  # [m] an obstacle that is larger is in another unit
+_LARGE = 20.0  # [m] a larger obstacle is in another unit
 
 
 def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
@@ -78,7 +78,7 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
     return tuple(found)
 
 
-def places_in(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str, CellPlace]:
+def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str, CellPlace]:
     """Return the cell's constraints on goals: its camera's view and its second arm's reach."""
     found = {}
     if (view := _view_of(cell)) is not None:
@@ -100,21 +100,21 @@ def _outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
     the tool's length.
     """
     joints = np.array(arm.home, float)
-    places = np.vstack([arm.shoulder, arm.link_frames(joints)[:, :3, 3],
+    points = np.vstack([arm.shoulder, arm.link_frames(joints)[:, :3, 3],
                         arm.forward(joints)[:3, 3]])
-    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
                  + np.linalg.norm(entry.grasp_pose[:3]))
 
 
-def require_seen(view: View, obstacles: tuple[Obstacle, ...], what: str, place: np.ndarray,
+def require_seen(view: View, obstacles: tuple[Obstacle, ...], what: str, point: np.ndarray,
                  surface: np.ndarray | None) -> None:
-    """Raise NoPathError if the branch's surface or an obstacle hides ``what`` at ``place`` [3].
+    """Raise NoPathError if the branch's surface or an obstacle hides ``what`` at ``point`` [3].
     """
     if surface is not None:
-        view.require_seen(what, place, surface)
+        view.require_seen(what, point, surface)
     eye = view.frame[:3, 3]
-    count = int(np.ceil(np.linalg.norm(place - eye) / _SIGHT_SPACING)) + 1
-    hit = closest(obstacles, eye + np.linspace(0.0, 1.0, count)[:, None] * (place - eye))
+    count = int(np.ceil(np.linalg.norm(point - eye) / _SIGHT_SPACING)) + 1
+    hit = closest(obstacles, eye + np.linspace(0.0, 1.0, count)[:, None] * (point - eye))
     if hit:
         raise NoPathError(f"{hit[0]} hides {what} from the camera at the end of the path.",
                           "It lies between them.",
@@ -255,12 +255,12 @@ def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...], clearance: float = 0
     """Return a test of whether gripper or arm is nearer to an obstacle than ``clearance`` [m].
     """
     def blocked(flange: np.ndarray, joints: np.ndarray) -> NoPathError | None:
-        return None if not obstacles else _in_the_way(cell, obstacles, flange, joints, clearance)
+        return None if not obstacles else _obstructing(cell, obstacles, flange, joints, clearance)
     return blocked
 
 
-def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
-                joints: np.ndarray, clearance: float) -> NoPathError | None:
+def _obstructing(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
+                 joints: np.ndarray, clearance: float) -> NoPathError | None:
     """Return the error for the deepest point in an obstacle or its ``clearance`` [m], or None.
 
     Args:
@@ -274,14 +274,14 @@ def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
     parts += [("The gripper", *(flange[:, :3, :3] @ np.array(end) + flange[:, :3, 3]
                                 for end in (part.start_m, part.end_m)), part.radius_m)
               for part in cell.tool.parts]
-    looked = _apart(np.stack([end for part in parts for end in part[1:3]], axis=1))
+    looked = _distances(np.stack([end for part in parts for end in part[1:3]], axis=1))
     worst: tuple[float, str, str, np.ndarray] | None = None
     for what, starts, ends, radius in parts:
         length = float(np.linalg.norm(ends[0] - starts[0]))
         share = np.linspace(0.0, 1.0, int(np.ceil(length / _ROD_SPACING)) + 1)[:, None]
-        places = starts[looked, None] + share * (ends - starts)[looked, None]
-        places = places.reshape(-1, 3) @ base[:3, :3].T + base[:3, 3]
-        hit = closest(obstacles, places, radius + _BETWEEN + clearance)
+        points = starts[looked, None] + share * (ends - starts)[looked, None]
+        points = points.reshape(-1, 3) @ base[:3, :3].T + base[:3, 3]
+        hit = closest(obstacles, points, radius + _BETWEEN + clearance)
         if hit and (worst is None or hit[1] > worst[0]):
             worst = hit[1], what, hit[0], hit[2]
     if worst is None:
@@ -299,9 +299,9 @@ def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
         "the cell file.")
 
 
-def _apart(places: np.ndarray) -> np.ndarray:
+def _distances(points: np.ndarray) -> np.ndarray:
     """Return indices of poses between which points [n, k, 3] move at most the spacing."""
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1)
     gone = np.r_[0.0, np.cumsum(steps)]
     chosen = np.searchsorted(gone, np.arange(0.0, gone[-1], _POSE_SPACING))
-    return np.unique(np.r_[0, chosen, len(places) - 1])
+    return np.unique(np.r_[0, chosen, len(points) - 1])

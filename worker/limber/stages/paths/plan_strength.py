@@ -47,15 +47,17 @@ def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
     peak = float(states.strains[at])
     moving = ((in_motion or {}).get("peaks") or {}).get("strain")
     peak = max(peak, float(moving["moving"])) if moving else peak
-    told = assumed(peak) if strength is None else strength.describe(peak)
-    told |= {"place_m": states.strain_places[at], "grasp_m": states.poses[at, :3],
-             "over": peak > told["median_strain"]}
-    if told["over"] and strength is not None:
+    assessment = assumed(peak) if strength is None else strength.describe(peak)
+    assessment |= {"place_m": states.strain_places[at], "grasp_m": states.poses[at, :3],
+                   "over": peak > assessment["median_strain"]}
+    if assessment["over"] and strength is not None:
         progress.warn(
             f"The largest strain along the plan is {peak:.2g}, "
-            f"{peak / told['median_strain']:.1f} times that at which half of such branches break "
-            f"({told['median_strain']:.2g}, {told['source']}). Lower it with --max-damage.")
-    return told
+            f"{peak / assessment['median_strain']:.1f} times that at which half of such branches "
+            "break "
+            f"({assessment['median_strain']:.2g}, {assessment['source']}). Lower it with "
+            "--max-damage.")
+    return assessment
 
 
 def _radius_deviation(branch: Branch) -> float:

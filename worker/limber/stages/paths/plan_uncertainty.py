@@ -10,7 +10,7 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.field.grasp_model import GraspModel
 from limber.store import Branch
 
-_INTERVAL = 2 * 1.96  # standard deviations in an interval of 95 %
+_INTERVAL = 2 * 1.96  # standard deviations in a 95 % interval
 
 
 def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungUncertainty:

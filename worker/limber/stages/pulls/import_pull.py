@@ -90,15 +90,15 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     from limber.robot.recorder import known_errors, known_noise
 
     cell = read_cell(Path(settings.cell))
-    wanted = cell.arm.ros_joints
+    joint_names = cell.arm.ros_joints
     tool = matrices(np.array(cell.tool.grasp_pose))
 
     def joint_poses(names: tuple[str, ...], angles: np.ndarray) -> np.ndarray:
         # ROS sends joints in any order, UR's with names like left_shoulder_pan_joint.
-        order = [[k for k, name in enumerate(names) if part in name] for part in wanted]
+        order = [[k for k, name in enumerate(names) if part in name] for part in joint_names]
         if any(len(found) != 1 for found in order):
             raise InputError(f"The joints are named {', '.join(names)}.",
-                             f"A {cell.arm.name}'s are {', '.join(wanted)}.",
+                             f"A {cell.arm.name}'s are {', '.join(joint_names)}.",
                              "Record poses or TF, or rename the joints.")
         return pose_vectors(cell.arm.forward(angles[:, [found[0] for found in order]]) @ tool)
 
@@ -134,9 +134,9 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
         # The load is unknown: the frequencies determine the modulus, positions do not.
         from limber.stages.moduli.vibration import VibrationSettings, vibration
 
-        told = vibration(inputs.branch_folder, inputs.source, VibrationSettings(),
-                         force=options.force, progress=progress)
-        return told | {"kind": "ringing"}
+        vibration_result = vibration(inputs.branch_folder, inputs.source, VibrationSettings(),
+                                     force=options.force, progress=progress)
+        return vibration_result | {"kind": "ringing"}
     if inputs.swing:
         settings = settings.model_copy(update={"motion": "swing"})
     return import_pull(inputs.branch_folder, inputs.source, inputs.name, settings,

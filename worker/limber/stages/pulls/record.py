@@ -230,8 +230,8 @@ def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder
                           progress: Progress) -> None:
     """Warn of a remaining force once the gripper is back at its start."""
     if doubts and recorder.last is not None and (
-            told := doubts[0].left_at_end(recorder.last[None])):
-        progress.warn(f"{told}.")
+            warning := doubts[0].left_at_end(recorder.last[None])):
+        progress.warn(f"{warning}.")
 
 
 def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None,
@@ -270,10 +270,10 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
     """The motion of the gripper from its position in a sample of the robot."""
     from limber.core.numerics.rigid import matrices
     from limber.stages.pulls.record_path import (
+        arc_path,
         suggested_pull,
         there_and_back,
-        way_on_arc,
-        way_through,
+        waypoint_path,
     )
 
     direction, distance = np.array(settings.direction, float), settings.distance
@@ -289,9 +289,9 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
     gripper, joints = sample[1:7], sample[19:25]
     here = matrices(gripper)
     if settings.waypoints is not None:
-        frames = way_through(Path(settings.waypoints), gripper)
+        frames = waypoint_path(Path(settings.waypoints), gripper)
     elif settings.shape == "arc":
-        frames = way_on_arc(branch, point, direction, distance, progress) @ here
+        frames = arc_path(branch, point, direction, distance, progress) @ here
     else:
         frames = np.array([here, here])
         frames[1, :3, 3] += distance * direction / length
@@ -309,11 +309,11 @@ def _grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float
     for child, parent in enumerate(skeleton.parent):
         if parent < 0:
             continue
-        start, way = skeleton.nodes[parent], skeleton.nodes[child] - skeleton.nodes[parent]
-        part = np.clip((gripper - start) @ way / max(way @ way, 1e-18), 0, 1)
-        off = float(np.linalg.norm(gripper - start - part * way))
+        start, vectors = skeleton.nodes[parent], skeleton.nodes[child] - skeleton.nodes[parent]
+        part = np.clip((gripper - start) @ vectors / max(vectors @ vectors, 1e-18), 0, 1)
+        off = float(np.linalg.norm(gripper - start - part * vectors))
         if off < distance:
-            nearest, distance = start + part * way, off
+            nearest, distance = start + part * vectors, off
     if distance > 0.03:
         raise InputError(f"The gripper is {1000 * distance:.0f} mm away from the branch's axis.",
                          "It would close on nothing, or the calibration is wrong.",

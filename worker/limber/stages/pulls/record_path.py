@@ -22,9 +22,9 @@ from limber.store import Branch
 GRASP_RADIUS_M = 0.012
 """Half the length that a gripper holds along the branch."""
 
-_SAME_PLACE_M = 0.01  # from where a suggested pull holds the branch
+_SAME_PLACE_M = 0.01  # from the position where a suggested pull holds the branch
 _STATES = 12  # of an arc: a chord of 4 mm on a bend of 0.3 m stretches a branch by 7 micrometres
-_NEAR_M = 0.005  # from the gripper, where given places begin
+_NEAR_M = 0.005  # from the gripper to the first given pose
 
 
 _Vector = tuple[float, float, float]
@@ -40,8 +40,8 @@ class _Suggested(FileContent):
     best: _Pull
 
 
-def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
-               progress: Progress) -> np.ndarray:
+def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
+             progress: Progress) -> np.ndarray:
     """Return frames [n, 4, 4] that move the held piece from its position along its arc.
 
     The arc is the path and rotation of the branch's model under a growing force along
@@ -66,11 +66,11 @@ def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distanc
     progress(0.0, "the arc of the branch")
     model = load_branch(branch, progress=progress).model
     grasp = Grasp.at(model.mesh, point, GRASP_RADIUS_M, "pinned")
-    way = np.asarray(direction, float) / np.linalg.norm(direction)
-    size = force_for_travel(model, grasp, way, distance)
+    unit = np.asarray(direction, float) / np.linalg.norm(direction)
+    size = force_for_travel(model, grasp, unit, distance)
     poses, state = [grasp.rest_pose], None
     for number, part in enumerate(np.linspace(0, 1, _STATES + 1)[1:]):
-        state = solve_static(model, grasp=grasp, grasp_force=part * size * way,
+        state = solve_static(model, grasp=grasp, grasp_force=part * size * unit,
                              start=state).require()
         poses.append(grasp.pose_of(model.mesh.nodes, state.displacement))
         progress((number + 1) / _STATES, "the arc of the branch")
@@ -90,19 +90,19 @@ def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float
     """
     path = branch.require("suggested_pull.json", "suggest-pull")
     found = read_json_as(path, _Suggested, "a suggested pull").best
-    place = np.array(found.grasp_point_m)
-    away = float(np.linalg.norm(place - point))
+    grasp = np.array(found.grasp_point_m)
+    away = float(np.linalg.norm(grasp - point))
     if away > _SAME_PLACE_M:
         raise InputError(
             f"The gripper is {1000 * away:.0f} mm from where the suggested pull holds the branch, "
-            f"({', '.join(f'{x:.3f}' for x in place)}) m.", "The same motion at another grasp "
+            f"({', '.join(f'{x:.3f}' for x in grasp)}) m.", "The same motion at another grasp "
             "gives other information and other strains.", "Move the gripper there.")
     # The end is on the arc, closer to the root, which is the origin: the pull is across.
-    way, out = np.array(found.end_m) - place, place / max(float(np.linalg.norm(place)), 1e-9)
-    return way - (way @ out) * out, found.travel_m
+    travel, out = np.array(found.end_m) - grasp, grasp / max(float(np.linalg.norm(grasp)), 1e-9)
+    return travel - (travel @ out) * out, found.travel_m
 
 
-def way_through(path: Path, gripper: np.ndarray) -> np.ndarray:
+def waypoint_path(path: Path, gripper: np.ndarray) -> np.ndarray:
     """Return frames [n, 4, 4] of the gripper through the positions of a CSV file, branch frame.
 
     Without columns of rotation the gripper is not rotated.
@@ -146,10 +146,11 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
     taken = joint_path(cell.arm, flange, start=start, joint_limits=cell.joint_limits,
                        singularity_margin=cell.limits.singularity,
                        joint_margin=cell.limits.joint_margin_rad)
-    told = [] if start is None else different_joints(start, taken.joints[0], cell.arm.joint_names)
-    if told:
+    differences = [] if start is None else different_joints(start, taken.joints[0],
+                                                            cell.arm.joint_names)
+    if differences:
         raise SafetyStop("The arm cannot follow this path from its configuration: "
-                         f"{'; '.join(told)}.",
+                         f"{'; '.join(differences)}.",
                          "In this configuration it would reach a joint limit or a singularity.",
                          f"Move the joints to {in_degrees(taken.joints[0])} degrees, or choose "
                          "another path.")

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from limber.estimation.parameters import Values
 
 FILE = "suggested_pull.json"
-_CONFIDENCE = 0.95  # of plans that were made without one
-_MATTERS = 1.05  # so much more of a limit may be used: then a pull changes what a plan may do
-_USED = 0.95  # of a limit, with the confidence: a plan that comes nearer is held back by it
+_CONFIDENCE = 0.95  # of plans made without one
+_MATTERS = 1.05  # factor on the usable part of a limit above which a pull changes a plan
+_USED = 0.95  # fraction of a limit with the confidence: a nearer plan is held back by it
 
 
 class SuggestPullInputs(BranchInputs):
@@ -96,7 +96,7 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
         found = suggest(subject, values, known, cell, settings.fractions, max_force=most,
                         max_strain=settings.max_strain, workers=workers,
                         progress=progress.part(0.0, 0.8))
-        stage.result.update(_told(found, known) | {"instead": _instead(branch)})
+        stage.result.update(_summary(found, known) | {"instead": _instead(branch)})
         if plan is not None:
             progress(0.8, "the plan under other moduli")
             stage.result["plan"] = {"name": plan} | _for_plan(
@@ -149,7 +149,7 @@ def _cell(branch: Branch) -> Cell:
     return Cell.of(read_pull(branch.path(f"pulls/{names[-1]}")) if names else None)
 
 
-def _told(found: Suggested, known: Known) -> dict[str, Any]:
+def _summary(found: Suggested, known: Known) -> dict[str, Any]:
     best, *others = [_entry(pull, known) for pull in found.pulls]
     most = max(range(len(found.pulls)), key=lambda k: found.pulls[k].bits)
     return {"best": best, "others": others, "most_telling": [best, *others][most],
@@ -187,9 +187,10 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
         return {"worth": True, "why": "There is no estimate, so it is unknown whether the plan "
                 "keeps its limits."}
     phases = np.array(plan.motion.phases)
-    there = plan.motion.poses[:, :3]
-    path = resolve_path(grasp_model, there[phases == "path"],
-                        np.vstack([there[phases == "approach"], there[phases == "path"][:1]]),
+    positions = plan.motion.poses[:, :3]
+    path = resolve_path(grasp_model, positions[phases == "path"],
+                        np.vstack([positions[phases == "approach"],
+                                   positions[phases == "path"][:1]]),
                         progress.part(0.0, 0.4)).require()
     exposure = uncertainty.exposure(grasp_model, path, limits, progress.part(0.4, 1.0))
     before, then = (exposure.risk(each.total, confidence) for each in (now, after))

@@ -85,8 +85,8 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     known: dict[str, Any] = {}
     where = "skeleton.swc"
     if branch.has("truth/truth.json"):
-        told = read_truth(branch.path("truth/truth.json"))
-        known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
+        truth = read_truth(branch.path("truth/truth.json"))
+        known = {"fractions": tuple(truth["fractions"]), "young": truth["young_pa"]}
         where = "truth/skeleton.swc"
     body = load_mesh(branch) if _is_meshed_body(branch) else None
     found = true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,

@@ -58,12 +58,12 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
     from limber.core.files.atomic import write_atomically
 
     branch, chosen = Branch.read(folder), _format_of(output, settings.columns)
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place, f"branch{output.suffix.lower()}")
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch, f"branch{output.suffix.lower()}")
         if chosen in SKELETONS.writers():
-            told = _write_skeleton(branch, path, chosen)
+            written = _write_skeleton(branch, path, chosen)
         else:
-            told = EXPORTS.write_as(chosen, branch, path, settings, progress)
+            written = EXPORTS.write_as(chosen, branch, path, settings, progress)
         content = path.read_bytes()
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
     except OSError as error:
         raise InputError(f"{output} cannot be written ({error.strerror}).",
                          "The export goes there.", "Choose another location.") from error
-    return {"output": output, "format": output.suffix.lower(), **told}
+    return {"output": output, "format": output.suffix.lower(), **written}
 
 
 def _format_of(output: Path, columns: str) -> Format:

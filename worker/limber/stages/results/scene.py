@@ -127,12 +127,12 @@ def _write_moving(path: Path, pictures: list[Path]) -> None:
     if not pictures:
         raise WorkError("Blender ended without an error but rendered nothing.", "",
                         "`limber doctor` states which Blender was used.")
-    shown = [Image.open(picture).convert("RGB") for picture in pictures]
+    images = [Image.open(picture).convert("RGB") for picture in pictures]
     beside = path.with_name(f".{path.name}.part")
     try:
-        shown[0].save(beside, format="PNG" if path.suffix.lower() == ".png" else path.suffix[1:],
-                      save_all=True, append_images=shown[1:], loop=0,
-                      duration=round(1000 * _TURN_SECONDS / len(shown)))
+        images[0].save(beside, format="PNG" if path.suffix.lower() == ".png" else path.suffix[1:],
+                       save_all=True, append_images=images[1:], loop=0,
+                       duration=round(1000 * _TURN_SECONDS / len(images)))
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)

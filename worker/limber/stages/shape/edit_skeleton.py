@@ -92,7 +92,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
 
     if edits_path is not None:
         branch = Branch.open(folder)
-        _remade(branch, _wanted(branch, edits_path, frame, append), progress)
+        _remade(branch, _requested_edits(branch, edits_path, frame, append), progress)
     branch = Branch.read(folder)
     skeleton, alignment, mesh = _latest(branch)
     if mesh == "out of date":
@@ -103,7 +103,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
     applied = _applied(branch)
     return {
         "doubtful": [
-            _told(uncertain_part, alignment) for uncertain_part in doubtful_parts(skeleton)
+            _part_entry(uncertain_part, alignment) for uncertain_part in doubtful_parts(skeleton)
         ],
         "node_count": skeleton.node_count,
         "branch_count": skeleton.branch_count,
@@ -115,7 +115,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
     }
 
 
-def _wanted(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
+def _requested_edits(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
     """The resulting edits of the branch, in the coordinates of the scan's file."""
     from limber.geometry.skeleton.edits import read_edits
 
@@ -228,7 +228,7 @@ def _write(skeleton: Skeleton, path: Path, unit: str) -> None:
                          "The skeleton goes there.", "Choose another location.") from error
 
 
-def _told(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str, Any]:
+def _part_entry(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str, Any]:
     return {
         "kind": uncertain_part.kind,
         "branch": uncertain_part.branch,

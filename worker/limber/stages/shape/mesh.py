@@ -88,7 +88,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         made.surface.write_ply(stage.path("surface.ply"))
         made.mesh.write(stage.path("mesh.vtu"))
         for name in ("point_masses.json", "skeleton.csv"):
-            stage.remove(name)  # of an earlier scan in this folder
+            stage.remove(name)  # from an earlier scan in this folder
         if has_cylinders:
             write_cylinders(made.skeleton, stage.path("skeleton.csv"))
         if masses:

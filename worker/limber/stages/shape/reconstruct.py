@@ -113,10 +113,10 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
         if path is not None:
             digests[name] = file_digest(require_file(path, f"A {name} file"))
-    given = None if edits_path is None else read_edits(edits_path)
+    entered = None if edits_path is None else read_edits(edits_path)
     branch = Branch.create(folder)
-    if given is not None:
-        edits = given
+    if entered is not None:
+        edits = entered
     else:
         edits = [] if skeleton_path is not None else load_edits(branch)
     digests |= edits_digest(edits)
@@ -259,7 +259,7 @@ def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
     if meshed.masses:
         stage.path("point_masses.json").write_text(json.dumps(meshed.masses, indent=1) + "\n")
     else:
-        stage.remove("point_masses.json")  # of an earlier run: its twigs are in the mesh now
+        stage.remove("point_masses.json")  # from an earlier run: its twigs are in the mesh now
 
 
 def load_edits(branch: Branch) -> list[Edit]:

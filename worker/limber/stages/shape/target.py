@@ -69,8 +69,9 @@ def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, forc
     branch.require("mesh.vtu", "reconstruct")
     key, known = f"target:{name}", load_targets(branch)
     others = [target for target in known if target.name != name]
-    wished = [] if settings.at is None else [(name, settings.at, settings.mass)]
-    is_there = wished == [(one.name, one.position, one.mass) for one in known if one.name == name]
+    requested = [] if settings.at is None else [(name, settings.at, settings.mass)]
+    is_there = requested == [(one.name, one.position, one.mass) for one in known
+                             if one.name == name]
     if not force and is_there and branch.is_current(key, settings, reads=["mesh.vtu"]):
         return branch.manifest.stages[key].result | {
             "targets": sorted(target.name for target in known)}
@@ -97,8 +98,8 @@ def _check_request(name: str, settings: TargetSettings) -> None:
                          "Names appear in files and tables of other programs.",
                          "Use letters, digits, dash and underscore, 64 at most.")
     if settings.remove == (settings.at is not None):
-        given = "Both --at and --remove" if settings.remove else "Neither --at nor --remove"
-        raise InputError(f"{given} for target {name}.", "A target is either set at a position or "
+        seen = "Both --at and --remove" if settings.remove else "Neither --at nor --remove"
+        raise InputError(f"{seen} for target {name}.", "A target is either set at a position or "
                                                         "removed.",
                          "Give --at X Y Z, or --remove.")
     if settings.at is not None and not np.isfinite(settings.at).all():
@@ -113,9 +114,9 @@ def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: Targ
     from limber.mechanics.loads.loaded_branch import NamedTarget
     from limber.mechanics.points import nearest_inside
 
-    place = np.array(at)
-    foot = nearest_inside(mesh, place[None])[0]
-    distance = float(np.linalg.norm(place - foot))
+    position = np.array(at)
+    foot = nearest_inside(mesh, position[None])[0]
+    distance = float(np.linalg.norm(position - foot))
     if not distance <= settings.farthest:
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
         raise InputError(
@@ -123,7 +124,7 @@ def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: Targ
             f"The branch extends from ({_numbers(low)}) to ({_numbers(high)}) m. Its nearest "
             f"point is ({_numbers(foot)}) m, and {settings.farthest:g} m are allowed.",
             "Check the frame and the unit (metres, branch frame), or widen --farthest.")
-    return {"target": NamedTarget(name, at, settings.mass), "position_m": place,
+    return {"target": NamedTarget(name, at, settings.mass), "position_m": position,
             "mass_kg": settings.mass, "branch_point_m": foot, "distance_m": distance}
 
 

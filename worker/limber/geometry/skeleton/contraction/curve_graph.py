@@ -105,8 +105,8 @@ def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
         own[near], 0.5 * spacing))
     near_enough = (distance <= limit)
     near_enough[:, 0] = False
-    first, place = np.nonzero(near_enough)
-    return np.stack([first, near[first, place]], axis=1), spacing
+    first, column = np.nonzero(near_enough)
+    return np.stack([first, near[first, column]], axis=1), spacing
 
 
 def rooted(nodes: np.ndarray, edges: np.ndarray, root: int) -> np.ndarray:
@@ -166,10 +166,10 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
     for a, b in extra:
         if seen[a] or seen[b]:
             continue
-        way = dijkstra(graph, directed=False, indices=int(a), limit=1e3)[b]
+        distance = dijkstra(graph, directed=False, indices=int(a), limit=1e3)[b]
         around = 12.0 * max(radius[a], radius[b], float(np.median(length)))
-        if way > around:
-            loops.append(float(way + np.linalg.norm(nodes[a] - nodes[b])))
+        if distance > around:
+            loops.append(float(distance + np.linalg.norm(nodes[a] - nodes[b])))
             near = np.linalg.norm(nodes - nodes[a], axis=1) < around
             seen |= near
     return kept, loops

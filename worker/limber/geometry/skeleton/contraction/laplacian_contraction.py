@@ -33,11 +33,11 @@ NEIGHBOURS = 12
 """Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""
 
 _LINE_NEIGHBOURS = 20
-_MOST_ATTRACTION = 1e3  # chosen: beyond it the linear system loses digits
+_MOST_ATTRACTION = 1e3  # chosen: the linear system loses digits above it
 _SOLVES = 12  # at most
-_LINEAR, _FEW_LEFT = 0.95, 0.03  # when a point counts as contracted; fraction of others at the end
+_LINEAR, _FEW_LEFT = 0.95, 0.03  # when a point is contracted; fraction of others at the end
 _GROWTH = 3.0
-_STILL_THICK = 0.6  # fraction of points not yet on a line, down to which the weights grow
+_STILL_THICK = 0.6  # fraction of points not yet on a line down to which the weights grow
 
 
 class ContractionStatus(StrEnum):

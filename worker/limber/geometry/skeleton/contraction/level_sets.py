@@ -24,8 +24,8 @@ from limber.geometry.skeleton.joining.pieces import edge_matrix, labels
 POINT_LIMIT = 30_000
 """Most points from which levels are made. More take longer and separate no finer twigs."""
 
-_WIDTH = 3.0  # of a level, in median distances to the nearest point
-_SPARSE = 0.65  # how far points are drawn, in their own spacing
+_WIDTH = 3.0  # width of a level, in median distances to the nearest point
+_SPARSE = 0.65  # displacement of points, in their own spacing
 _SPARSE_QUANTILE = 0.1
 
 
@@ -99,10 +99,10 @@ def _along_plant(points: np.ndarray, links: np.ndarray, source: np.ndarray,
     # gave more spurs.
     starts = np.array([np.argmin(np.linalg.norm(points - source, axis=1))])
     while True:
-        way, previous, _ = dijkstra(graph, directed=False, indices=starts, min_only=True,
-                                    return_predecessors=True)
-        fresh = np.isfinite(way)
-        distance[fresh], before[fresh] = way[fresh], previous[fresh]
+        from_start, previous, _ = dijkstra(graph, directed=False, indices=starts, min_only=True,
+                                           return_predecessors=True)
+        fresh = np.isfinite(from_start)
+        distance[fresh], before[fresh] = from_start[fresh], previous[fresh]
         rest = np.flatnonzero(np.isinf(distance))
         if len(rest) == 0:
             return distance, np.where(before < 0, -1, before)

@@ -8,15 +8,15 @@ axis, whichever part of it was seen. The centre of that circle is the right posi
 import numpy as np
 from scipy.spatial import cKDTree
 
-_WANTED = 48  # points a circle is fitted to
+_WANTED = 48  # points to which a circle is fitted
 _LEAST = 11
 _CHUNK = 4096
-_SITES = 6000  # points that get a circle of their own; the others take their neighbours' line
+_SITES = 6000  # points with a circle of their own; the others take their neighbours' axis
 _LINE = 30
-_ROUND_ENOUGH = 0.5  # residual over radius up to which points count as a circle
-_LARGEST = 4.0  # radius over how far points were drawn: a half circle is drawn by 0.4 radii
-_STRAIGHT = 0.8  # fraction of variance along one line, under which there is no axis to speak of
-_FARTHEST = 1.5  # how far a point may be put off its line, in how far it was drawn
+_ROUND_ENOUGH = 0.5  # residual over radius below which points count as a circle
+_LARGEST = 4.0  # radius over the displacement; a half circle is displaced by 0.4 radii
+_STRAIGHT = 0.8  # fraction of variance along one line below which there is no axis
+_FARTHEST = 1.5  # largest offset of a point from its line, over its displacement
 
 
 def recentred(points: np.ndarray, contracted: np.ndarray) -> np.ndarray:

@@ -5,12 +5,12 @@ import numpy as np
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, rooted
 from limber.geometry.skeleton.repair.spurs import prune_spurs
 
-_ROOT_SHARE = 0.45  # of the thickest end, from which an end may be the root
-_ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and fraction of height, that tell
-_END_POINTS, _END_REACHES = 30, 4  # that tell how thick an end is; over so many times its reach
+_ROOT_SHARE = 0.45  # fraction of the thickest end above which an end may be the root
+_ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and fraction of height
+_END_POINTS, _END_REACHES = 30, 4  # points that show an end's thickness; its length
 # Radii of its carrier up to which a side arm may be a strand around the rim of a ragged foot.
 _STRAND = 5.0
-_ROOT_EVEN = 1.0  # by which two ends may differ, in these, and be as likely
+_ROOT_EVEN = 1.0  # difference in these at which two ends are equally likely
 
 
 def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
@@ -63,11 +63,11 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
     """Thickness of each end [m], shape [tips]; 0 for spurs."""
     reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
     thick = np.zeros(len(tips))
-    for place, tip in enumerate(tips):
+    for k, tip in enumerate(tips):
         # Contraction may draw a few points of an end far beyond it. A few points of a ragged foot
         # give little evidence, so the walk continues until there are enough.
-        for way in reach * np.arange(1, _END_REACHES + 1) + graph.thickness[tip]:
-            chain = _end_chain(neighbours, graph.nodes, int(tip), way)
+        for distance in reach * np.arange(1, _END_REACHES + 1) + graph.thickness[tip]:
+            chain = _end_chain(neighbours, graph.nodes, int(tip), distance)
             mine = points[np.isin(graph.owner, chain)]
             if len(mine) >= _END_POINTS:
                 break
@@ -78,7 +78,7 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
         drawn = float(np.median(np.repeat(graph.thickness[chain], graph.support[chain])))
         if length > 2 * drawn:
             least = np.sqrt(max(np.linalg.eigvalsh(np.cov(mine.T))[0], 0.0))
-            thick[place] = np.sqrt(least * drawn)
+            thick[k] = np.sqrt(least * drawn)
     return thick
 
 

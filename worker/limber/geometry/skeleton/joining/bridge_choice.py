@@ -10,14 +10,14 @@ from limber.geometry.skeleton.joining.free_ends import UNSURE, Ends
 from limber.geometry.skeleton.joining.pieces import Joined, Rules
 from limber.geometry.skeleton.joining.plants import PLANT_SHARE, are_plants
 
-_SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any size
+_SHORT = 0.5  # fraction of the longest bridge below which a piece may have any size
 # Longest bridge beyond, in reaches of the smaller piece; the same if straight; price per length of
 # a straight one.
 _REACH, _REACH_STRAIGHT, _STRAIGHT_ON = 5.0, 10.0, 1.5
 # Largest turn at which an end points at its target, and the angle within which its piece is
 # straight behind it: an end that is straight for such a length reaches as far.
 _AHEAD, _BEHIND = np.deg2rad(10.0), np.deg2rad(15.0)
-_AT_ONCE = 1024  # hypotheses that are looked through together
+_AT_ONCE = 1024  # hypotheses evaluated together
 
 
 def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rules: Rules,
@@ -42,59 +42,59 @@ def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rul
     decisive: set[tuple[int, int]] = set()
     allowed = _Allowed(found, state, ends, weight, rules, alone)
 
-    def decide(place: int) -> None:
-        one, other = sorted(state.piece[[found.one[place], found.other[place]]].tolist())
+    def decide(index: int) -> None:
+        one, other = sorted(state.piece[[found.one[index], found.other[index]]].tolist())
         decisive.add((one, other))
 
-    for place, a, b in _unsettled(pairs, allowed.likely, best, len(weight)):
-        if not allowed.holds(place):
+    for index, a, b in _unsettled(pairs, allowed.likely, best, len(weight)):
+        if not allowed.holds(index):
             continue
-        decide(place)
+        decide(index)
         fresh = [piece for piece in (a, b) if piece not in best]
-        if len(fresh) == 2 or (made.has(a, b) and made.is_clear(found, place, fresh[0])):
+        if len(fresh) == 2 or (made.has(a, b) and made.is_clear(found, index, fresh[0])):
             same = np.flatnonzero((pairs[0] == a) & (pairs[1] == b) & allowed.likely)
-            place = next(other for other in same[np.argsort(own_price[same], kind="stable")]
+            index = next(other for other in same[np.argsort(own_price[same], kind="stable")]
                          if allowed.holds(other))
-            decide(place)
-            if len(fresh) == 2 or made.is_clear(found, place, fresh[0]):
-                made.add(found, place, a, b)
-        best.setdefault(a, place)
-        best.setdefault(b, place)
-    return made.places, decisive
+            decide(index)
+            if len(fresh) == 2 or made.is_clear(found, index, fresh[0]):
+                made.add(found, index, a, b)
+        best.setdefault(a, index)
+        best.setdefault(b, index)
+    return made.indices, decisive
 
 
 class _Made:
     """The bridges of a round so far."""
 
     def __init__(self, state: Joined) -> None:
-        self.places: list[int] = []
+        self.indices: list[int] = []
         self._state = state
         self._joined: set[int] = set()
         self._middles: list[np.ndarray] = []
         self._halves: list[float] = []
 
-    def add(self, found: Hypotheses, place: int, a: int, b: int) -> None:
+    def add(self, found: Hypotheses, index: int, a: int, b: int) -> None:
         """Take a hypothesis between pieces ``a`` and ``b``."""
-        self.places.append(int(place))
+        self.indices.append(int(index))
         self._joined |= {a, b}
-        nodes = self._state.nodes[[found.one[place], found.other[place]]]
+        nodes = self._state.nodes[[found.one[index], found.other[index]]]
         self._middles.append(nodes.mean(axis=0))
-        self._halves.append(float(found.length[place]) / 2)
+        self._halves.append(float(found.length[index]) / 2)
 
     def has(self, a: int, b: int) -> bool:
         """Whether one of two pieces has a bridge."""
         return a in self._joined or b in self._joined
 
-    def is_clear(self, found: Hypotheses, place: int, piece: int) -> bool:
+    def is_clear(self, found: Hypotheses, index: int, piece: int) -> bool:
         """Whether all bridges are farther from a piece than its hypothesis costs.
 
         No path to their added nodes is cheaper then. Blind paths are compared with blind ones.
         """
         own = self._state.nodes[self._state.label == piece]
-        apart = np.linalg.norm(own[:, None] - np.array(self._middles), axis=2).min(axis=0)
-        blind = found.turn[place] == np.pi
-        cost = found.length[place] if blind else found.price[place]
-        return bool((apart - np.array(self._halves) > cost).all())
+        gap = np.linalg.norm(own[:, None] - np.array(self._middles), axis=2).min(axis=0)
+        blind = found.turn[index] == np.pi
+        cost = found.length[index] if blind else found.price[index]
+        return bool((gap - np.array(self._halves) > cost).all())
 
 
 def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], count: int,
@@ -113,10 +113,10 @@ def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], coun
             return
         has[list(best)] = True
         part = pairs[:, start:start + _AT_ONCE]
-        places = np.flatnonzero(likely[start:start + _AT_ONCE] & ~has[part].all(axis=0))
-        for place, a, b in zip((start + places).tolist(), *part[:, places].tolist(), strict=True):
+        rows = np.flatnonzero(likely[start:start + _AT_ONCE] & ~has[part].all(axis=0))
+        for index, a, b in zip((start + rows).tolist(), *part[:, rows].tolist(), strict=True):
             if a not in best or b not in best:
-                yield place, a, b
+                yield index, a, b
 
 
 class _Allowed:
@@ -146,14 +146,14 @@ class _Allowed:
         self._large = (np.minimum(weight[a], weight[b]) > PLANT_SHARE * state.support.sum()) & (
             found.length > rules.gap) & (not rules.join_plants)
 
-    def holds(self, place: int) -> bool:
+    def holds(self, index: int) -> bool:
         """Whether a likely hypothesis is allowed."""
-        pair = int(self._found.one[place]), int(self._found.other[place])
+        pair = int(self._found.one[index]), int(self._found.other[index])
         state = self._state
-        if not self._near[place] and self._found.length[place] > _straight_behind(
+        if not self._near[index] and self._found.length[index] > _straight_behind(
                 state, self._ends, pair[0]):
             return False
-        return not (self._large[place] and are_plants(state.nodes, state.thickness, state.label,
+        return not (self._large[index] and are_plants(state.nodes, state.thickness, state.label,
                                                       pair, self._rules.up))
 
 

@@ -5,22 +5,22 @@ import math
 import numpy as np
 from numba import njit
 
-_TURN = math.radians(35.0)  # a turn that doubles the price
-_SIDE = 0.25  # what a fork costs against going on
+_TURN = math.radians(35.0)  # turn that doubles the price
+_SIDE = 0.25  # price of a fork over that of a continuation
 # Usual angle of twigs to their carrier, and the deviation from it that doubles the price.
 _STAND, _STAND_DOUBLES = math.radians(45.0), math.radians(60.0)
-_RATIO = 0.7  # price of a radius e times another
-_FARTHER = 2.0  # an end may reach that times the limit, if it points at what it reaches
+_RATIO = 0.7  # price of a radius ratio of e
+_FARTHER = 2.0  # an end may reach this many limits if it points at its target
 _POINTS_AT = math.radians(25.0)
 _LEAST = 1e-12
 
 
 @njit(cache=True)
-def _turned(direction: np.ndarray, way: np.ndarray, radius: float) -> float:
+def _turned(direction: np.ndarray, vector: np.ndarray, radius: float) -> float:
     """Angle [rad] from a direction to a path; an offset of up to a radius is no turn."""
-    along = way[0] * direction[0] + way[1] * direction[1] + way[2] * direction[2]
-    x, y, z = (way[0] - along * direction[0], way[1] - along * direction[1],
-               way[2] - along * direction[2])
+    along = vector[0] * direction[0] + vector[1] * direction[1] + vector[2] * direction[2]
+    x, y, z = (vector[0] - along * direction[0], vector[1] - along * direction[1],
+               vector[2] - along * direction[2])
     return math.atan2(max(math.sqrt(x * x + y * y + z * z) - radius, 0.0), along)
 
 
@@ -50,7 +50,7 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
     length, price, turn = ([0.0 for _ in range(0)], [0.0 for _ in range(0)],
                            [0.0 for _ in range(0)])
     meets = [0 for _ in range(0)]
-    way = np.empty(3)
+    vector = np.empty(3)
     for k in range(len(end_node)):
         own, out, radius = end_node[k], end_direction[k], end_radius[k]
         if out[0] == 0 and out[1] == 0 and out[2] == 0:
@@ -60,18 +60,18 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
                 continue
             square = 0.0
             for j in range(3):
-                way[j] = nodes[node, j] - nodes[own, j]
-                square += way[j] * way[j]
+                vector[j] = nodes[node, j] - nodes[own, j]
+                square += vector[j] * vector[j]
             far = max(math.sqrt(square), _LEAST)
             if far > _FARTHER * limit:
                 continue
-            turned = _turned(out, way, radius)
+            turned = _turned(out, vector, radius)
             if far > (_FARTHER if turned < _POINTS_AT else 1.0) * limit:
                 continue
             stand = _STAND
             if axis[node, 0] != 0 or axis[node, 1] != 0 or axis[node, 2] != 0:
-                along = abs(way[0] * axis[node, 0] + way[1] * axis[node, 1]
-                            + way[2] * axis[node, 2])
+                along = abs(vector[0] * axis[node, 0] + vector[1] * axis[node, 1]
+                            + vector[2] * axis[node, 2])
                 stand = math.acos(min(along / far, 1.0))
             # For a single patch of skin, the contraction gives no thickness.
             thicker = 0.0 if single[node] else math.log(radius / max(thickness[node], _LEAST))
@@ -80,7 +80,7 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
             comes, end = np.inf, end_of[node]
             if end >= 0 and (end_direction[end, 0] != 0 or end_direction[end, 1] != 0
                              or end_direction[end, 2] != 0):
-                angle = _turned(end_direction[end], -way, end_radius[end])
+                angle = _turned(end_direction[end], -vector, end_radius[end])
                 comes = ((angle / _TURN)**2
                          + _RATIO * abs(math.log(radius / end_radius[end])))
             one.append(own)
@@ -113,8 +113,8 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
     order = np.argsort(nodes[:, 0], kind="mergesort")
     rank = np.empty(len(nodes), np.int64)
     rank[order] = np.arange(len(nodes))
-    for place in range(len(own)):
-        node = own[place]
+    for k in range(len(own)):
+        node = own[k]
         for step in (-1, 1):
             # To both sides, as far as a node can still be nearer.
             at = rank[node] + step
@@ -123,18 +123,18 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
                 at += step
                 x, y, z = (nodes[other, 0] - nodes[node, 0], nodes[other, 1] - nodes[node, 1],
                            nodes[other, 2] - nodes[node, 2])
-                if abs(x) >= distance[place, count - 1]:
+                if abs(x) >= distance[k, count - 1]:
                     break
                 if label[other] == label[node]:
                     continue
                 far, worse = math.sqrt(x * x + y * y + z * z), count - 1
-                if far >= distance[place, worse]:
+                if far >= distance[k, worse]:
                     continue
-                while worse > 0 and distance[place, worse - 1] > far:
-                    distance[place, worse] = distance[place, worse - 1]
-                    near[place, worse] = near[place, worse - 1]
+                while worse > 0 and distance[k, worse - 1] > far:
+                    distance[k, worse] = distance[k, worse - 1]
+                    near[k, worse] = near[k, worse - 1]
                     worse -= 1
-                distance[place, worse], near[place, worse] = far, other
+                distance[k, worse], near[k, worse] = far, other
     return near, distance
 
 
@@ -153,13 +153,13 @@ def far_sides(nodes: np.ndarray, spread: np.ndarray, label: np.ndarray, own: np.
     start = np.searchsorted(label[order], np.arange(label.max() + 2))
     known = np.full(len(nodes), -1.0)
     far = np.empty(len(own))
-    for place in range(len(own)):
-        node = own[place]
+    for k in range(len(own)):
+        node = own[k]
         if known[node] < 0:
             for at in range(start[label[node]], start[label[node] + 1]):
                 other = order[at]
                 x, y, z = (nodes[other, 0] - nodes[node, 0], nodes[other, 1] - nodes[node, 1],
                            nodes[other, 2] - nodes[node, 2])
                 known[node] = max(known[node], math.sqrt(x * x + y * y + z * z) + spread[other])
-        far[place] = known[node]
+        far[k] = known[node]
     return far

@@ -14,9 +14,9 @@ import numpy as np
 from limber.geometry.skeleton.joining.bridge_kernels import nearest_others, priced
 from limber.geometry.skeleton.joining.free_ends import UNSURE, Ends, Known
 
-_BLIND = 5.0  # price of a bridge that no direction speaks for
-_BLIND_NEAR = 3  # nodes of other pieces that each node is tried with
-_STRAIGHT = np.deg2rad(45.0)  # ends that turn more tell no direction to a bridge
+_BLIND = 5.0  # price factor of a bridge without a direction
+_BLIND_NEAR = 3  # nodes of other pieces tried for each node
+_STRAIGHT = np.deg2rad(45.0)  # ends that turn more give a bridge no direction
 
 
 @dataclass(frozen=True)
@@ -85,21 +85,21 @@ def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other
     in that direction, and its arrival is free.
     """
     start, stop = nodes[one], nodes[other]
-    way = stop - start
-    length = float(np.linalg.norm(way))
+    vector = stop - start
+    length = float(np.linalg.norm(vector))
     count = int(length / max(step, 1e-12)) - 1
     if count < 1:
         return np.empty((0, 3)), np.empty(0)
-    leave = _lead(ends, one, way)
-    arrive = _lead(ends, other, -way)
+    leave = _lead(ends, one, vector)
+    arrive = _lead(ends, other, -vector)
     leave = None if leave is None else leave * length
     arrive = None if arrive is None else -arrive * length
     if leave is None and arrive is None:
-        leave = arrive = way
+        leave = arrive = vector
     elif leave is None:
-        leave = (3 * way - arrive) / 2
+        leave = (3 * vector - arrive) / 2
     elif arrive is None:
-        arrive = (3 * way - leave) / 2
+        arrive = (3 * vector - leave) / 2
     t = (np.arange(count) + 1)[:, None] / (count + 1)
     curve = ((2 * t**3 - 3 * t**2 + 1) * start + (t**3 - 2 * t**2 + t) * leave
              + (3 * t**2 - 2 * t**3) * stop + (t**3 - t**2) * arrive)
@@ -110,8 +110,8 @@ def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other
 def _axes(nodes: np.ndarray, edges: np.ndarray, known: Known) -> np.ndarray:
     """Direction of the axis at each node, without sign; zero at single nodes, shape [n, 3]."""
     sums = np.zeros((len(nodes), 3, 3))
-    way = nodes[edges[:, 1]] - nodes[edges[:, 0]]
-    square = way[:, :, None] * way[:, None, :]
+    vector = nodes[edges[:, 1]] - nodes[edges[:, 0]]
+    square = vector[:, :, None] * vector[:, None, :]
     np.add.at(sums, edges[:, 0], square)
     np.add.at(sums, edges[:, 1], square)
     axes = np.zeros((len(nodes), 3))
@@ -129,17 +129,17 @@ def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,
     own = np.argsort(label, kind="stable")
     own = own[label[own] != largest]
     near, distance = nearest_others(nodes, label, own, float(limit), _BLIND_NEAR)
-    place, which = np.nonzero(near >= 0)
-    length = distance[place, which]
-    return (own[place], near[place, which], length, (1 + _BLIND) * length,
+    row, which = np.nonzero(near >= 0)
+    length = distance[row, which]
+    return (own[row], near[row, which], length, (1 + _BLIND) * length,
             np.full(len(length), np.pi), np.zeros(len(length), np.int64))
 
 
-def _lead(ends: Ends, node: int, way: np.ndarray) -> np.ndarray | None:
-    """Direction of an end for a bridge along ``way``; None if there is none or it turns much."""
-    place = np.flatnonzero(ends.node == node)
-    if len(place) == 0 or not ends.direction[place[0]].any():
+def _lead(ends: Ends, node: int, vector: np.ndarray) -> np.ndarray | None:
+    """Direction of an end for a bridge along ``vector``; None if there is none or it turns much."""
+    rows = np.flatnonzero(ends.node == node)
+    if len(rows) == 0 or not ends.direction[rows[0]].any():
         return None
-    direction = ends.direction[place[0]]
-    cosine = direction @ way / max(float(np.linalg.norm(way)), 1e-300)
+    direction = ends.direction[rows[0]]
+    cosine = direction @ vector / max(float(np.linalg.norm(vector)), 1e-300)
     return direction if cosine > np.cos(_STRAIGHT) else None

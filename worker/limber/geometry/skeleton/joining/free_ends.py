@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-_CHAIN = 6.0  # radii of an end that tell its direction
-_CHAIN_NODES = 4  # and so many nodes at least
+_CHAIN = 6.0  # radii of an end over which its direction is measured
+_CHAIN_NODES = 4  # and at least this many nodes
 UNSURE = 2
 """Number of nodes up to which a piece has no reliable direction."""
-_BEYOND, _LONG = 3, 0.9  # nodes past a fork that tell how its axis comes; of a length as long
+_BEYOND, _LONG = 3, 0.9  # nodes past a fork that show the axis's direction; ratio of equal lengths
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ def _straight_chain(nodes: np.ndarray, near: _Neighbours, end: int, reach: float
             break
         if len(ahead) > 1 and len(chain) > 1:
             line = nodes[chain[-1]] - nodes[chain[0]]
-            way = nodes[ahead] - nodes[chain[-1]]
-            cosine = way @ line / np.maximum(np.linalg.norm(way, axis=1), 1e-300)
+            vector = nodes[ahead] - nodes[chain[-1]]
+            cosine = vector @ line / np.maximum(np.linalg.norm(vector, axis=1), 1e-300)
             ahead = [ahead[int(np.argmax(cosine))]]
         before = chain[-1]
         length += float(np.linalg.norm(nodes[ahead[0]] - nodes[before]))
@@ -143,20 +143,20 @@ def _beside(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, chain: 
     turns less.
     """
     length = 0.0
-    for place in range(1, len(chain) - 1):
-        fork, ahead = chain[place], chain[place + 1]
+    for k in range(1, len(chain) - 1):
+        fork, ahead = chain[k], chain[k + 1]
         stub = nodes[chain[0]] - nodes[fork]
-        length += float(np.linalg.norm(nodes[fork] - nodes[chain[place - 1]]))
-        inwards = nodes[chain[min(place + _BEYOND, len(chain) - 1)]] - nodes[fork]
+        length += float(np.linalg.norm(nodes[fork] - nodes[chain[k - 1]]))
+        inwards = nodes[chain[min(k + _BEYOND, len(chain) - 1)]] - nodes[fork]
         for other in near[fork]:
-            if other in (chain[place - 1], ahead):
+            if other in (chain[k - 1], ahead):
                 continue
             reach = max(length, _CHAIN * float(thickness[fork]))
             arm = _straight_chain(nodes, near, other, reach, before=fork)
             goes_on = nodes[arm[-1]] - nodes[fork]
             if float(np.linalg.norm(goes_on)) > _LONG * reach and (
                     _cosine(inwards, goes_on) < _cosine(inwards, stub)):
-                return place
+                return k
     return len(chain)
 
 

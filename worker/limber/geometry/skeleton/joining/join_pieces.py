@@ -9,10 +9,10 @@ from limber.geometry.skeleton.joining.bridges import Hypotheses, hypotheses
 from limber.geometry.skeleton.joining.pieces import Joined, Round, Rules, labels
 from limber.geometry.skeleton.joining.plants import plants_apart
 
-_ODD = 1.9  # price of a bridge over its length, from which those around it are tried without
-_AROUND = 2.0  # lengths of such a bridge
-_CLEARLY = 0.98  # of what all bridges cost, under which others are better
-_MOST_WAYS = 150_000_000  # between ends and nodes, that all trials go through: some seconds
+_ODD = 1.9  # price of a bridge over its length above which its neighbours are tried without it
+_AROUND = 2.0  # neighbourhood, in lengths of that bridge
+_CLEARLY = 0.98  # fraction of the price of all bridges below which others are better
+_MOST_WAYS = 150_000_000  # paths between ends and nodes in all trials: some seconds
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
@@ -71,8 +71,8 @@ def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = f
             continue
         if not chosen:
             break
-        for place in chosen:
-            state.bridge(ends, found, place, rules.gap / 3)
+        for index in chosen:
+            state.bridge(ends, found, index, rules.gap / 3)
         state.label = labels(len(state.nodes), state.edges)
     return state
 
@@ -108,7 +108,7 @@ def _reconsidered(state: Joined, rules: Rules) -> Joined:
         best, without = state, refused
         for pair in _doubted(state, rules.gap):
             # As many as there were with that bridge.
-            ways = sum(past.ways for past in state.rounds[_start(state, pair):])
+            ways = sum(past.path_count for past in state.rounds[_start(state, pair):])
             if pair in vain or gone_through + ways > _MOST_WAYS:
                 continue
             gone_through += ways
@@ -136,9 +136,9 @@ def _doubted(state: Joined, gap: float) -> list[tuple[int, int]]:
     ends, length = state.nodes[state.bridges], state.lengths()
     doubted: dict[tuple[int, int], None] = {}
     odd = np.flatnonzero((state.prices > _ODD) & (length > gap))
-    for place in odd[np.argsort(-(state.prices * length)[odd], kind="stable")]:
-        apart = np.linalg.norm(ends[:, :, None] - ends[place], axis=3).min(axis=(1, 2))
-        near = np.flatnonzero((apart <= _AROUND * length[place]) & (length > gap))
+    for index in odd[np.argsort(-(state.prices * length)[odd], kind="stable")]:
+        separation = np.linalg.norm(ends[:, :, None] - ends[index], axis=3).min(axis=(1, 2))
+        near = np.flatnonzero((separation <= _AROUND * length[index]) & (length > gap))
         pairs = np.sort(state.piece[state.bridges[near]], axis=1)
         doubted |= dict.fromkeys(map(tuple, pairs[pairs[:, 0] >= 0].tolist()))
     return list(doubted)

@@ -58,13 +58,13 @@ class Joined:
         """The free ends of the pieces."""
         return free_ends(self.nodes, self.edges, self.thickness, self.joints, self.known)
 
-    def bridge(self, ends: Ends, found: Hypotheses, place: int, step: float) -> None:
+    def bridge(self, ends: Ends, found: Hypotheses, index: int, step: float) -> None:
         """Add a bridge, with nodes along it that others may be joined to."""
-        one, other = int(found.one[place]), int(found.other[place])
+        one, other = int(found.one[index]), int(found.other[index])
         curve, thick = filled(self.nodes, self.thickness, ends, one, other, step)
         chain = np.concatenate([[one], len(self.nodes) + np.arange(len(curve)), [other]])
         self.edges = np.vstack([self.edges, np.stack([chain[:-1], chain[1:]], axis=1)])
-        if not found.meets[place]:
+        if not found.meets[index]:
             own, met = (_pointing(ends, node) for node in (one, other))
             if met > 0:
                 # Of two ends side by side, the thicker one continues.
@@ -76,7 +76,7 @@ class Joined:
         self.spread = np.concatenate([self.spread, np.zeros(len(curve))])
         self.bridges = np.vstack([self.bridges, [one, other]])
         self.piece = np.concatenate([self.piece, np.full(len(curve), -1)])
-        self.prices = np.append(self.prices, found.price[place] / found.length[place])
+        self.prices = np.append(self.prices, found.price[index] / found.length[index])
 
     def lengths(self) -> np.ndarray:
         """Length of each bridge [m], shape [b]."""
@@ -97,13 +97,13 @@ class Round:
         alone: Whether pieces without a direction had to wait.
         decisive: The pairs of given pieces between which a hypothesis mattered. Without the
             hypotheses of any other pair, the round is the same.
-        ways: Paths between ends and nodes that could have been hypotheses.
+        path_count: Paths between ends and nodes that could have been hypotheses.
     """
 
     before: Joined
     alone: bool
     decisive: set[tuple[int, int]]
-    ways: int
+    path_count: int
 
 
 @dataclass(frozen=True)

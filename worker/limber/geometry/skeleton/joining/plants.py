@@ -7,10 +7,10 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 PLANT_SHARE = 0.2
 """Fraction of all points from which a piece may be a separate plant."""
-_BASE_SHARE = 0.12  # of a piece's reach, up to which a bridge starts at its base
-_FAR_SHARE = 0.3  # from which it starts far from its base
-_THICK = 0.45  # of a piece's thickest part, from which the base may be there
-_GROUND = 0.2  # of the scan's height, up to which a base stands on the ground
+_BASE_SHARE = 0.12  # fraction of a piece's extent within which a bridge starts at its base
+_FAR_SHARE = 0.3  # fraction from which it starts far from the base
+_THICK = 0.45  # fraction of a piece's largest thickness above which the base may be there
+_GROUND = 0.2  # fraction of the scan's height below which a base stands on the ground
 
 
 def are_plants(nodes: np.ndarray, thickness: np.ndarray, label: np.ndarray,
@@ -40,8 +40,8 @@ def plants_apart(nodes: np.ndarray, thickness: np.ndarray, support: np.ndarray,
     for piece in np.setdiff1d(large, np.argmax(weight)):
         own = np.flatnonzero(label == piece)
         distance, near = cKDTree(nodes[main]).query(nodes[own])
-        place = int(np.argmin(distance))
-        bridge = (int(own[place]), int(main[near[place]]))
+        k = int(np.argmin(distance))
+        bridge = (int(own[k]), int(main[near[k]]))
         if are_plants(nodes, thickness, label, bridge, up):
             found.append(bridge)
     return found

@@ -17,7 +17,7 @@ from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, ma
 from limber.geometry.skeleton.radii.noisy_rings import (
     Aims,
     held_across,
-    mean_places,
+    mean_positions,
     position_uncertainty,
     weighted_aims,
 )
@@ -33,8 +33,8 @@ from limber.geometry.skeleton.radii.sides_seen import (
     SeenSides,
     across_sight,
     evenly_seen,
+    fit_seen_side,
     seen_sides,
-    side_told,
     side_uncertainty,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
@@ -42,10 +42,10 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 # Grid from which each round starts, as a fraction of the median radius. It is a fifth of the step
 # that ends a fit, and far coarser than rounding differences between libraries.
 _GRID = 1e-5
-_MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
-_REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
-_MEDIAN_OF = 24  # points that make one of the paper's radii
-_HELD = 2  # trusted rounds in which the limit stays that of most sensors
+_MOVED = 0.2  # fraction of the radius; nodes that moved less keep their points' cylinders
+_REACH = 2.0  # largest distance of an axis from its contracted position, in radii
+_MEDIAN_OF = 24  # points for one of the paper's radii
+_HELD = 2  # trusted rounds in which the limit keeps that of most sensors
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ class _Rounds:
         self._near: np.ndarray | None = None
         self._found_at = nodes
         self._even: np.ndarray | None = None
-        self._told: SeenSides | None = None
-        self._told_rounds = 0
+        self._fitted_side: SeenSides | None = None
+        self._side_fit_count = 0
         self.noise = 0.0
 
     def step(self, number: int) -> float:
@@ -150,8 +150,8 @@ class _Rounds:
         noise = robust_sigma(match.residual, match.thick)
         weight = settled_weights(match.residual, noise)
         seen, *_ = self._sides(match, weight, noise)
-        if self._told is not None and seen.one_sided:
-            seen = self._told
+        if self._fitted_side is not None and seen.one_sided:
+            seen = self._fitted_side
         sigma, state = start.radius_sigma, start.radius_state
         if uncertainty:
             sigma, pooled = radius_deviations(start, nodes, radius, match, weight,
@@ -197,12 +197,12 @@ class _Rounds:
         """
         now, axis, sharpness, stout = self._sides(match, weight, self.noise)
         if now.one_sided and self._known is None:
-            shown = weight if self._even is None else weight * self._even[match.segment]
-            self._told = now = side_told(
-                match.normal, axis, sharpness, shown, now.view, self._told or now,
-                limit_free=self._told_rounds >= _HELD)
-            self._told_rounds += 1
-        place, aims = mean_places(match.normal, axis, sharpness, stout, now), Aims(
+            shown_weight = weight if self._even is None else weight * self._even[match.segment]
+            self._fitted_side = now = fit_seen_side(
+                match.normal, axis, sharpness, shown_weight, now.view, self._fitted_side or now,
+                limit_free=self._side_fit_count >= _HELD)
+            self._side_fit_count += 1
+        positions, aims = mean_positions(match.normal, axis, sharpness, stout, now), Aims(
             match.thick, match.thick)
         if not now.along_sight:
             aims, nearest = weighted_aims(match.thick, self.noise, limit)
@@ -213,11 +213,11 @@ class _Rounds:
                 self._even = evenly_seen(self._start, self._nodes, self._radius, match, weight,
                                          across_sight(match.normal, axis, now), self.noise)
             whole = self._even[match.segment]
-            place = np.where(whole[:, None], place, match.normal)
+            positions = np.where(whole[:, None], positions, match.normal)
             aims = Aims(np.where(whole, aims.axis, nearest.axis),
                         np.where(whole, aims.radius, nearest.radius))
-        return place, aims, None if now.along_sight else held_across(
-            match.normal, axis, place, stout)
+        return positions, aims, None if now.along_sight else held_across(
+            match.normal, axis, positions, stout)
 
     def _move(self, step: np.ndarray, size: np.ndarray) -> None:
         """Take a round's step [n, 4], limited for lengths ``size`` [n]."""

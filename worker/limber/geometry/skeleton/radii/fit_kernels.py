@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 
 _EVEN = 1e-9  # of a radius
-_WIDE, _FINE = 60.0, 150  # sharpness: 7 degrees; places around
-_NORMAL, _TERMS = 30.0, 30  # sharpness from which; of the series below
-_TOLD = 14.0  # logarithm of a place's weight, under the best one's, from which it counts
+_WIDE, _FINE = 60.0, 150  # concentration (7 degrees); positions on the circle
+_NORMAL, _TERMS = 30.0, 30  # concentration of the normal approximation; terms of the series
+_TOLD = 14.0  # log weight below the best position's at which a position still counts
 
 
 @njit(cache=True)
@@ -117,30 +117,30 @@ def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
     Returns:
         Shape [m, 2].
     """
-    places = len(density)
-    angle = 2 * np.pi * (np.arange(places) + 0.5) / places
+    step_count = len(density)
+    angle = 2 * np.pi * (np.arange(step_count) + 0.5) / step_count
     across, up, log = np.cos(angle), np.sin(angle), np.log(density)
-    power = np.empty(places)
+    power = np.empty(step_count)
     mean = np.empty((len(cosine), 2))
     for i in range(len(cosine)):
         # Positions farther away have no weight.
-        reach = places
+        reach = step_count
         if sharpness[i] > _TOLD / 2:
-            reach = int(np.ceil(np.arccos(1 - _TOLD / sharpness[i]) * places / (2 * np.pi))) + 1
-        own = int(np.arctan2(sine[i], cosine[i]) % (2 * np.pi) * places / (2 * np.pi))
-        first, count = (own - reach, 2 * reach + 1) if 2 * reach < places else (0, places)
+            reach = int(np.ceil(np.arccos(1 - _TOLD / sharpness[i]) * step_count / (2 * np.pi))) + 1
+        own = int(np.arctan2(sine[i], cosine[i]) % (2 * np.pi) * step_count / (2 * np.pi))
+        first, count = (own - reach, 2 * reach + 1) if 2 * reach < step_count else (0, step_count)
         # If it is wide enough, intervals three times as wide, each by its middle, sum it as well.
-        step = 3 if sharpness[i] < _WIDE and places % 3 == 0 and places >= _FINE else 1
+        step = 3 if sharpness[i] < _WIDE and step_count % 3 == 0 and step_count >= _FINE else 1
         if step == 3:
             first -= (first - 1) % 3
         most = -np.inf
         for j in range(0, count, step):
-            k = (first + j) % places
+            k = (first + j) % step_count
             power[k] = sharpness[i] * (cosine[i] * across[k] + sine[i] * up[k] - 1) + log[k]
             most = max(most, power[k])
         total, x, y = 0.0, 0.0, 0.0
         for j in range(0, count, step):
-            k = (first + j) % places
+            k = (first + j) % step_count
             weight = np.exp(power[k] - most)
             total += weight
             x += weight * across[k]

@@ -24,8 +24,8 @@ _SIGHT_LEAST = 0.75
 # Factor c in 1 + c (noise / radius)^2: the variance of a circle's fitted radius over that from
 # sharp points. From Fisher's information of points with open positions, at 0.3 to 3 noises a
 # radius, all around a circle and on half of one.
-_OPEN_PLACES, _OPEN_SIDE = 1.0, 2.2
-_RADII = np.geomspace(0.05, 12.0, 48)  # in standard deviations of the noise, up to where it tells
+_OPEN_PART, _OPEN_SIDE = 1.0, 2.2
+_RADII = np.geomspace(0.05, 12.0, 48)  # radii in standard deviations of the noise
 _DISTANCES = 300
 
 
@@ -33,8 +33,8 @@ def position_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> n
     """Factor on a radius's standard deviation against points with known positions, shape [n]."""
     if seen.along_sight:
         return np.ones_like(radius)
-    open_places = _OPEN_SIDE if seen.one_sided else _OPEN_PLACES
-    return np.sqrt(1 + open_places * (noise / np.maximum(radius, 1e-300))**2)
+    open_part = _OPEN_SIDE if seen.one_sided else _OPEN_PART
+    return np.sqrt(1 + open_part * (noise / np.maximum(radius, 1e-300))**2)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def weighted_aims(radius: np.ndarray, noise: float,
     distance = np.maximum(thick + residual, 0.0)
     bessel = i0e(distance * thick)
     share = (1 - (residual / reach)**2)**2 * distance * bessel * np.exp(-residual**2 / 2)
-    toward = i1e(distance * thick) / bessel  # mean cosine of the angle to the true place
+    toward = i1e(distance * thick) / bessel  # mean cosine of the angle to the true position
     outward = (share * toward * distance).sum(axis=1)
     total = share.sum(axis=1)
     mean, near = outward / total, (share * distance).sum(axis=1) / total
@@ -88,7 +88,7 @@ def weighted_aims(radius: np.ndarray, noise: float,
     return Aims(of(mean), of(mean)), Aims(of(along), of(near))
 
 
-def held_across(out: np.ndarray, axis: np.ndarray, place: np.ndarray, stout: np.ndarray,
+def held_across(out: np.ndarray, axis: np.ndarray, positions: np.ndarray, stout: np.ndarray,
                 ) -> np.ndarray:
     """How firmly points hold the axis across their own direction, as vectors, shape [m, 3].
 
@@ -99,17 +99,17 @@ def held_across(out: np.ndarray, axis: np.ndarray, place: np.ndarray, stout: np.
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
-        place: Mean direction of each point's true position, shape [m, 3].
+        positions: Mean direction of each point's true position, shape [m, 3].
         stout: Square of radius over noise, shape [m].
     """
-    known = np.clip(1 - stout * (1 - np.einsum("mj,mj->m", place, place)), 0.0, 1.0)
+    known = np.clip(1 - stout * (1 - np.einsum("mj,mj->m", positions, positions)), 0.0, 1.0)
     # A position that is taken as certain is not searched for.
-    known[np.einsum("mj,mj->m", place, out) >= 1 - 1e-12] = 0.0
+    known[np.einsum("mj,mj->m", positions, out) >= 1 - 1e-12] = 0.0
     return np.sqrt(known)[:, None] * np.cross(axis, out)
 
 
-def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
-                seen: SeenSides) -> np.ndarray:
+def mean_positions(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
+                   seen: SeenSides) -> np.ndarray:
     """Return the mean direction from the axis to each point's true position, shape [m, 3].
 
     It is the shorter, below 1, the less certain the position is.
@@ -129,8 +129,8 @@ def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout:
     # ones.
     blurred = np.flatnonzero(stout < (_SHARP_SIDE if seen.one_sided else _SHARP))
     side, cross = sides_of(axis[blurred], seen.view)
-    cosine, sine = (np.einsum("mj,mj->m", out[blurred], way) for way in (side, cross))
+    cosine, sine = (np.einsum("mj,mj->m", out[blurred], axis_part) for axis_part in (side, cross))
     size = np.maximum(np.hypot(cosine, sine), 1e-300)
-    place = mean_on_circle(cosine / size, sine / size, sharpness[blurred], seen.share)
-    mean[blurred] = place[:, :1] * side + place[:, 1:] * cross
+    circle_mean = mean_on_circle(cosine / size, sine / size, sharpness[blurred], seen.share)
+    mean[blurred] = circle_mean[:, :1] * side + circle_mean[:, 1:] * cross
     return mean

@@ -14,7 +14,7 @@ from limber.geometry.skeleton.radii.smoothness import smoothness
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import tangents
 
-_PROBE = 128  # nodes between two whose radii are taken as independent of each other
+_PROBE = 128  # distance in nodes at which radii count as independent
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class NormalEquations:
 
 
 def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
-                     weight: np.ndarray, noise: float, place: np.ndarray | None = None,
+                     weight: np.ndarray, noise: float, positions: np.ndarray | None = None,
                      aims: Aims | None = None, across: np.ndarray | None = None,
                      ) -> NormalEquations:
     """Set up a round: terms of the points, smoothness of runs, and constraints on bare nodes.
@@ -53,13 +53,14 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
         match: The cylinder of each point.
         weight: Weight of each point, shape [m].
         noise: Standard deviation of the points [m].
-        place: Mean direction of each point's true position (:mod:`noisy_rings`), shape [m, 3];
+        positions: Mean direction of each point's true position (:mod:`noisy_rings`), shape [m, 3];
             None: the nearest position on the circle is the true one.
         aims: Distances at which the points should lie; None: at the radius.
         across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not
         at all.
     """
-    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place, aims, across)
+    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, positions, aims,
+                                        across)
     smooth = smoothness(skeleton, nodes, radius, per_node, noise)
     state = np.column_stack([nodes, radius]).ravel()
     matrix = (data + smooth + _anchor(skeleton, nodes, per_node)).tocsc()
@@ -99,18 +100,18 @@ def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
-                place: np.ndarray | None, aims: Aims | None, across: np.ndarray | None,
+                positions: np.ndarray | None, aims: Aims | None, across: np.ndarray | None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
     """Normal equations of the residuals in (x, y, z, r) of both ends, and weight per node."""
     count = len(nodes)
     aims = Aims(match.thick, match.thick) if aims is None else aims
     across = np.zeros_like(match.normal) if across is None else across
-    place = match.normal if place is None else place
+    positions = match.normal if positions is None else positions
     low = np.where(match.own_radius, 0.0, 1 - match.share)
     high = np.where(match.own_radius, 1.0, match.share)
     distance = match.residual + match.thick
-    pull = distance[:, None] * match.normal - aims.axis[:, None] * place
-    grow = distance * np.einsum("mj,mj->m", match.normal, place) - aims.radius
+    pull = distance[:, None] * match.normal - aims.axis[:, None] * positions
+    grow = distance * np.einsum("mj,mj->m", match.normal, positions) - aims.radius
     gradient = np.column_stack([
         (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
     block, right = normal_blocks(match.segment, match.share, low, high, match.normal, across,

@@ -3,7 +3,7 @@
 import numpy as np
 
 _TUKEY = 4.685  # 95 % efficiency for normal noise
-_ENOUGH = 200  # points that tell the noise
+_ENOUGH = 200  # points that determine the noise
 # Distances of points scattered around a circle by noise s follow Rice's law. _MEASURED: estimate
 # from points within a radius of the circle, over that radius. _TRUE: s over that estimate.
 _MEASURED = (0.1655, 0.2461, 0.3234, 0.3802, 0.4506, 0.4810, 0.5102, 0.5360)
@@ -23,9 +23,9 @@ def robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
     if thick.sum() >= _ENOUGH:
         near = thick
     middle = np.median(residual[near])
-    told = 1.4826 * np.median(np.abs(residual[near] - middle))
-    share = told / max(float(np.median(radius[near])), 1e-300)
-    return float(told * np.interp(share, _MEASURED, _TRUE))
+    sigma = 1.4826 * np.median(np.abs(residual[near] - middle))
+    share = sigma / max(float(np.median(radius[near])), 1e-300)
+    return float(sigma * np.interp(share, _MEASURED, _TRUE))
 
 
 def tukey(residual: np.ndarray, limit: np.ndarray | float) -> np.ndarray:

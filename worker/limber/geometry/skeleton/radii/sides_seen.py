@@ -9,41 +9,41 @@ from limber.geometry.skeleton.radii.cylinders import Match
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
 
-PLACES = 180  # on the circle, of which each is weighed
-_CLEAR = 12.0  # concentration from which a point tells which sides were seen
-_ONE_SIDED = 0.3  # length of the mean normal, from which one side may be all that was seen
-_BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not seen
-_FEW = 0.12  # fraction of points there that noise can put
+PLACES = 180  # positions on the circle, each with a weight
+_CLEAR = 12.0  # concentration from which a point shows the sides that were seen
+_ONE_SIDED = 0.3  # length of the mean normal above which only one side may have been seen
+_BEHIND = np.deg2rad(115.0)  # angle to the viewer above which a side was not seen
+_FEW = 0.12  # fraction of points that noise can put there
 _FRONT, _EDGE = np.deg2rad(40.0), np.deg2rad(65.0)
-_ALONG = 0.65  # scatter at the edges over that in front, under which it is along the sight alone
+_ALONG = 0.65  # scatter at the edges over that in front below which it is along the line of sight
 # Beyond about this angle, no sensor sees a surface. Its exact value affects a radius where noise
 # hides the arc's ends. Fitted circles with a limit 4 to 19 degrees off came out 0.8 to 1.1 % off
 # per degree for noise over 0.12 of the radius, and proportionally less below.
 _GRAZING, _GRAZING_SIGMA = np.deg2rad(81.0), np.deg2rad(4.0)
-_GRAZING_MOVES, _ARC_HIDDEN = 0.55, 0.12  # fraction of the radius a radian; noise over radius
+_GRAZING_MOVES, _ARC_HIDDEN = 0.55, 0.12  # fraction of the radius per radian; noise over radius
 _LEAST_SEEN = 0.01
-_RING_LOST = 12.0  # square of radius over noise, under which a ring's middle is not seen empty
-_FLAT = 0.10  # relative difference of scatter across and along the sight that is one side's
+_RING_LOST = 12.0  # square of radius over noise below which a ring's centre is not seen as empty
+_FLAT = 0.10  # relative difference of scatter across and along the line of sight of one side
 _FLAT_SURE = 4.0  # standard deviations
 # Third moment of an arc, of cos over its half-angle with sin squared, in cubes of the radius. Half
 # of it distinguishes an arc from a shape that is flat but not bent, such as an elliptic stem.
 _BENT, _BENT_LEAST, _BENT_SURE = 0.0913, 0.5, 2.0
 _DIRECTIONS, _SAMPLE = 120, 2000
 _ANGLE = 2 * np.pi * (np.arange(PLACES) + 0.5) / PLACES
-_TELL = 20_000  # points that tell the viewer's direction and the limit: more say no more
-_ASIDE = 0.5  # sine of the angle between axis and sight, from which a point tells them
-_VIEW_SIGMA = np.deg2rad(12.0)  # of the mean normal from the sight
-_TURNS, _TURN = 4, 0.15  # steps of the direction a round; each at most so many radians
-_EASE = 0.6  # of a step of the limit: the next round's axes and radii follow it
-_FURTHER = np.deg2rad(3.0)  # and no more: past the last point, few scores say how far it may be
+_TELL = 20_000  # points used for the viewer's direction and the limit; more add nothing
+_ASIDE = 0.5  # sine of the angle between axis and line of sight above which a point is used
+_VIEW_SIGMA = np.deg2rad(12.0)  # standard deviation of the mean normal from the line of sight
+_TURNS, _TURN = 4, 0.15  # direction steps in a round; largest step [rad]
+_EASE = 0.6  # fraction of a step of the limit; axes and radii of the next round follow it
+_FURTHER = np.deg2rad(3.0)  # largest extension: beyond the last point few scores limit it
 # The points' angles fit the model worse than by chance, and their errors are correlated: this many
 # of them carry as much information as one independent point.
 _MISFIT = 3.0
 # Radii to either side whose points show how evenly a side is seen; a radius counts as at least this
 # many noises.
 _WINDOW, _NOISY_WINDOW = 4.0, 2.0
-_TELLING = 80  # points there that tell
-_ASKEW, _NARROW = 0.25, 0.33  # mean of the sine from the sight, and of its square: half a circle's
+_TELLING = 80  # points that must lie there
+_ASKEW, _NARROW = 0.25, 0.33  # mean sine from the line of sight, and its square
 
 
 @dataclass(frozen=True)
@@ -152,23 +152,23 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
     view, along, across = best
     # An arc's ends lie back from the viewer.
     bent = (along - along.mean()) * (across**2 - np.mean(across**2))
-    wanted = _BENT_LEAST * _BENT * float(np.mean(stout[thick]**1.5))
-    if abs(bent.mean()) + _BENT_SURE * bent.std() / np.sqrt(len(bent)) < wanted:
+    least = _BENT_LEAST * _BENT * float(np.mean(stout[thick]**1.5))
+    if abs(bent.mean()) + _BENT_SURE * bent.std() / np.sqrt(len(bent)) < least:
         return None
     return _one_side(view if bent.mean() < 0 else -view)
 
 
 def _half_sphere() -> np.ndarray:
     """Directions evenly over half a sphere (Fibonacci's lattice), shape [directions, 3]."""
-    place = np.arange(_DIRECTIONS) + 0.5
-    height = place / _DIRECTIONS
-    turn = np.pi * (1 + np.sqrt(5)) * place
+    index = np.arange(_DIRECTIONS) + 0.5
+    height = index / _DIRECTIONS
+    turn = np.pi * (1 + np.sqrt(5)) * index
     flat = np.sqrt(1 - height**2)
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
 
 
-def side_told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: np.ndarray,
-              mean: np.ndarray, first: SeenSides, limit_free: bool = True) -> SeenSides:
+def fit_seen_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: np.ndarray,
+                  mean: np.ndarray, first: SeenSides, limit_free: bool = True) -> SeenSides:
     """Estimate the direction of view and the limit of one seen side from the points' angles.
 
     The mean normal of the points is off where a scan has holes or branches lean (by 23 degrees at
@@ -197,7 +197,8 @@ def side_told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: 
     bessel, view = i0e(sharpness), first.view
     prior = _VIEW_SIGMA**-2 * np.eye(2)
     for _ in range(_TURNS):
-        score, information = _told(out, axis, sharpness, bessel, weight, view, first.limit)
+        score, information = _score_and_information(out, axis, sharpness, bessel, weight, view,
+                                                    first.limit)
         score[:2] += _across(view).T @ mean / _VIEW_SIGMA**2
         turns = np.linalg.solve(information[:2, :2] + prior, score[:2])
         turns *= min(1.0, _TURN / max(float(np.linalg.norm(turns)), 1e-300))
@@ -205,7 +206,8 @@ def side_told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: 
         view /= np.linalg.norm(view)
     if not limit_free:
         return _one_side(view, first.limit, first.limit_sigma)
-    score, information = _told(out, axis, sharpness, bessel, weight, view, first.limit)
+    score, information = _score_and_information(out, axis, sharpness, bessel, weight, view,
+                                                first.limit)
     held = np.linalg.solve(information[:2, :2] + prior, information[:2, 2])
     known = max(float(information[2, 2] - information[:2, 2] @ held), 0.0)
     precision = known + _GRAZING_SIGMA**-2
@@ -215,8 +217,10 @@ def side_told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: 
     return _one_side(view, limit, precision**-0.5)
 
 
-def _told(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray,
-          weight: np.ndarray, view: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+def _score_and_information(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray,
+                           bessel: np.ndarray,
+                           weight: np.ndarray, view: np.ndarray, limit: float) -> tuple[np.ndarray,
+                                                                                        np.ndarray]:
     """Score and information of the points in the two turns of the view and the limit."""
     side, cross = sides_of(axis, view)
     aside = np.einsum("mj,mj->m", side, np.broadcast_to(view, side.shape))
@@ -283,7 +287,7 @@ def evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match
         step = np.linalg.norm(nodes[own] - nodes[np.maximum(skeleton.parent[own], 0)], axis=1)
         along, total = np.cumsum(step), np.vstack([np.zeros(3), np.cumsum(sums[own], axis=0)])
         reach = _WINDOW * np.maximum(radius[own], _NOISY_WINDOW * noise)
-        first, last = (np.searchsorted(along, along + way, side) for way, side in (
+        first, last = (np.searchsorted(along, along + offset, side) for offset, side in (
             (-reach, "left"), (reach, "right")))
         count, mean, square = (total[last] - total[first]).T
         even[own] = (count > _TELLING) & (np.abs(mean) < _ASKEW * count) & (

@@ -13,15 +13,15 @@ from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import LIMITED, MEASURED, UNRESOLVED, Skeleton
 
-_ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouette tells the width
-_WINDOW = 3  # nodes to each side whose silhouette is taken together
-_SLACK = 1.2  # times as thick as its silhouette a branch may be
-_LEAST = 8  # pixels that make a silhouette
-_WIDE = 0.35  # of a radius that a silhouette tells: leaves and crossing branches are in it too
+_ASIDE = 0.5  # sine of the smallest angle to the sight at which a silhouette shows the width
+_WINDOW = 3  # nodes on each side whose silhouettes are combined
+_SLACK = 1.2  # largest thickness over that of the silhouette
+_LEAST = 8  # fewest pixels of a silhouette
+_WIDE = 0.35  # deviation of a silhouette's radius; leaves and crossing branches are in it too
 # Pixels that a silhouette is wider to each side: images that assign a pixel to the branch if any
 # part of it is on the branch are half a pixel wider, those that decide by its middle are not.
 _FATTER = 0.25
-_EDGE = 0.3  # pixels that a radius may be off, whatever its fit says: each edge is known to one
+_EDGE = 0.3  # pixels; smallest deviation of a radius: each edge is known to one pixel
 
 
 def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
@@ -96,8 +96,8 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
         seen, aside = _seen_lengths(step, skeleton.nodes[members[1:]], view)
         own = members[1:]
         seen = np.where(count[own] > 0, seen, 0.0)
-        for place, node in enumerate(own):
-            near = slice(max(place - _WINDOW, 0), place + _WINDOW + 1)
+        for k, node in enumerate(own):
+            near = slice(max(k - _WINDOW, 0), k + _WINDOW + 1)
             total = float(seen[near].sum())
             if count[own[near]].sum() < _LEAST or total <= 0 or aside[near].min() < _ASIDE:
                 continue
@@ -140,10 +140,10 @@ def _rays(points: np.ndarray, view: View) -> np.ndarray:
     return offset / np.linalg.norm(offset, axis=1)[:, None]
 
 
-def _seen_lengths(step: np.ndarray, place: np.ndarray, view: View,
+def _seen_lengths(step: np.ndarray, points: np.ndarray, view: View,
                   ) -> tuple[np.ndarray, np.ndarray]:
     """Lengths of steps [m] as the camera sees them, and the sine of their angle to its sight."""
-    ray = _rays(place, view)
+    ray = _rays(points, view)
     along = np.einsum("nj,nj->n", step, ray)
     seen = np.linalg.norm(step - along[:, None] * ray, axis=1)
     return seen, seen / np.maximum(np.linalg.norm(step, axis=1), 1e-300)

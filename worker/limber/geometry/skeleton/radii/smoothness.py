@@ -72,9 +72,9 @@ def _second_differences(chains: list[np.ndarray], steps: list[np.ndarray], size:
 
 def _straightness(nodes: np.ndarray) -> np.ndarray:
     """1 where the contracted axis is straight, down to 0.3 at its kinks, shape [n - 2]."""
-    place = np.arange(1, len(nodes) - 1)
-    before = nodes[place] - nodes[np.maximum(place - 2, 0)]
-    after = nodes[np.minimum(place + 2, len(nodes) - 1)] - nodes[place]
+    index = np.arange(1, len(nodes) - 1)
+    before = nodes[index] - nodes[np.maximum(index - 2, 0)]
+    after = nodes[np.minimum(index + 2, len(nodes) - 1)] - nodes[index]
     cosine = np.einsum("ij,ij->i", before, after) / np.maximum(
         np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1), 1e-300)
     return np.clip(1.3 - np.arccos(np.clip(cosine, -1, 1)), 0.3, 1.0)

@@ -14,18 +14,18 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, UNRESOLVED,
 
 SPACINGS = 1.0
 """Diameter in point spacings, under which a radius is not resolved: too few points around it."""
-_BESIDE = 4  # nodes to each side whose points tell the spacing
-_NOISES = 1.0  # radius in standard deviations of the noise, likewise
-_TWIG, _TAPER = 0.65, 0.4  # a twig's radius over its carrier's, and its loss to the tip
+_BESIDE = 4  # nodes on each side whose points show the spacing
+_NOISES = 1.0  # the same, in standard deviations of the noise
+_TWIG, _TAPER = 0.65, 0.4  # a twig's radius over its carrier's; its decrease to the tip
 # Standard deviations of the radius's logarithm: prior, points too far apart, noise alone.
 _PRIOR, _FIT, _FIT_NOISE = 0.35, 0.5, 0.25
 # Fraction of the radius, over (noise / radius)^2: the noise itself is known to 4 %, and the radius
 # of one side changes by 3.7 times that (of half a circle, the scatter is twice the square of the
 # noise and 0.54 of the radius's).
 _BIAS = 0.15
-_MODEL = 0.012  # of the radius: branches are not quite round
-_ROUGH_SIGMA = 0.25  # of a radius that was filled in or limited
-_UNRESOLVED_SIGMA = 0.5  # at least, of a radius
+_MODEL = 0.012  # fraction of the radius; branches are not quite round
+_ROUGH_SIGMA = 0.25  # fraction of a radius that was interpolated or limited
+_UNRESOLVED_SIGMA = 0.5  # smallest fraction of an unresolved radius
 # Standard deviation of the logarithm of an unresolved radius that came out below the expected one:
 # such fits collapse. On generated scans they were 0.3 to 0.7 too thin.
 _COLLAPSED = 1.2
@@ -86,9 +86,9 @@ def _blend(radius: np.ndarray, sigma: np.ndarray, state: np.ndarray, own: np.nda
 def _expected(radius: np.ndarray, own: np.ndarray, carrier: int, vague: np.ndarray) -> np.ndarray:
     """Radius expected from an even taper from the next resolved node, or from the carrier [m]."""
     clear = np.flatnonzero(~vague)
-    place = np.arange(len(own))
+    index = np.arange(len(own))
     if len(clear) == 0:
         start = _TWIG * radius[carrier] if carrier >= 0 else float(np.median(radius[own]))
-        return start * (1 - _TAPER * place / len(own))
-    before = clear[np.maximum(np.searchsorted(clear, place, side="right") - 1, 0)]
-    return radius[own[before]] * (1 - _TAPER * (place - before) / len(own))
+        return start * (1 - _TAPER * index / len(own))
+    before = clear[np.maximum(np.searchsorted(clear, index, side="right") - 1, 0)]
+    return radius[own[before]] * (1 - _TAPER * (index - before) / len(own))

@@ -5,11 +5,11 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and that tell where
+_HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may mislead; nodes that show its direction
 _KINK = np.deg2rad(50.0)
 # Longest start of a twig, in radii of its carrier; least kink at its end; nodes to each side.
 _HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
-_LINE = 2.0  # radii of its carrier that a twig's start is long, which tells where that leads
+_LINE = 2.0  # length of a twig's start in carrier radii over which its direction is measured
 
 
 def attached(skeleton: Skeleton) -> Skeleton:
@@ -54,25 +54,25 @@ def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
     nodes = skeleton.nodes
     last = min(first + _HOOK, len(members) - _AHEAD)
     start = max(first, last)
-    for place in range(first, last):
-        step = nodes[members[place + 1]] - nodes[members[place]]
-        ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place + 1]]
+    for k in range(first, last):
+        step = nodes[members[k + 1]] - nodes[members[k]]
+        ahead = nodes[members[k + _AHEAD - 1]] - nodes[members[k + 1]]
         size = np.linalg.norm(step) * np.linalg.norm(ahead)
         if size > 0 and step @ ahead > np.cos(_KINK) * size:
-            start = place
+            start = k
             break
     reach = _HOOK_REACH * skeleton.radius[skeleton.parent[members[0]]]
     length = 0.0
-    for place in range(start + 1, len(members) - _AHEAD):
-        step = nodes[members[place]] - nodes[members[place - 1]]
+    for k in range(start + 1, len(members) - _AHEAD):
+        step = nodes[members[k]] - nodes[members[k - 1]]
         length += float(np.linalg.norm(step))
         if length > reach:
             break
-        before = nodes[members[place]] - nodes[members[max(place - _BESIDE, start)]]
-        ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place]]
+        before = nodes[members[k]] - nodes[members[max(k - _BESIDE, start)]]
+        ahead = nodes[members[k + _AHEAD - 1]] - nodes[members[k]]
         size = np.linalg.norm(before) * np.linalg.norm(ahead)
         if size > 0 and before @ ahead < np.cos(_SHARP_KINK) * size:
-            start = place
+            start = k
     return start
 
 

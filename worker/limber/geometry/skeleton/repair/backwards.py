@@ -11,11 +11,11 @@ import numpy as np
 from limber.geometry.skeleton.doubtful_parts import start_angle
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_BACKWARDS = np.deg2rad(80.0)  # angle to its carrier, from which a twig is looked at
-_FORWARDS = np.deg2rad(75.0)  # that it may have where it is led to
-_SKIPPED, _LED = 6.0, 10.0  # carrier's radii along its start, and straight back to the carrier
-_AHEAD, _LEAST = 8, 4  # nodes that tell its own line
-_NEAR = 1.2  # carrier's radii by which that may miss the carrier's axis
+_BACKWARDS = np.deg2rad(80.0)  # angle to the carrier above which a twig is examined
+_FORWARDS = np.deg2rad(75.0)  # largest angle after the repair
+_SKIPPED, _LED = 6.0, 10.0  # carrier radii skipped at its start, and led straight
+_AHEAD, _LEAST = 8, 4  # nodes that show its own direction; fewest
+_NEAR = 1.2  # carrier radii by which that line may miss the carrier's axis
 
 
 def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
@@ -29,11 +29,11 @@ def without_backward_starts(skeleton: Skeleton) -> tuple[Skeleton, int]:
         found = _straight_back(skeleton, members, runs[int(skeleton.branch[members[0]])])
         if found is None:
             continue
-        place, fork = found
+        start, fork = found
         # If other runs are attached to the start that would be dropped, it stays.
-        if carried.isdisjoint(members[1:place].tolist()):
-            keep[members[1:place]] = False
-            parent[members[place]] = fork
+        if carried.isdisjoint(members[1:start].tolist()):
+            keep[members[1:start]] = False
+            parent[members[start]] = fork
             count += 1
     return (skeleton.subset(keep, parent) if count else skeleton), count
 
@@ -46,20 +46,20 @@ def _straight_back(skeleton: Skeleton, members: np.ndarray, carrier: np.ndarray,
     outwards = nodes[inner] - nodes[skeleton.parent[inner]]
     start, length = float(radius[members[0]]), 0.0
     best, least = None, _NEAR
-    for place in range(1, len(members) - _LEAST):
-        length += float(np.linalg.norm(nodes[members[place]] - nodes[members[place - 1]]))
-        if place > 1 and length > _SKIPPED * start:
+    for k in range(1, len(members) - _LEAST):
+        length += float(np.linalg.norm(nodes[members[k]] - nodes[members[k - 1]]))
+        if k > 1 and length > _SKIPPED * start:
             break
-        first = nodes[members[place]]
-        way = nodes[members[min(place + _AHEAD, len(members) - 1)]] - first
-        way /= max(float(np.linalg.norm(way)), 1e-300)
+        first = nodes[members[k]]
+        vector = nodes[members[min(k + _AHEAD, len(members) - 1)]] - first
+        vector /= max(float(np.linalg.norm(vector)), 1e-300)
         to_twig = first - nodes[inner]
-        back = to_twig @ way
-        missed = np.linalg.norm(to_twig - back[:, None] * way, axis=1) / radius[inner]
+        back = to_twig @ vector
+        missed = np.linalg.norm(to_twig - back[:, None] * vector, axis=1) / radius[inner]
         size = np.linalg.norm(outwards, axis=1) * np.linalg.norm(to_twig, axis=1)
         cosine = np.einsum("kj,kj->k", outwards, to_twig) / np.maximum(size, 1e-300)
         able = (back > 0) & (back < _LED * start) & (cosine > np.cos(_FORWARDS))
         near = int(np.argmin(np.where(able, missed, np.inf)))
         if able[near] and missed[near] < least:
-            best, least = (place, int(inner[near])), float(missed[near])
+            best, least = (k, int(inner[near])), float(missed[near])
     return best

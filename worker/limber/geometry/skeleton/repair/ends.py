@@ -5,7 +5,7 @@ import numpy as np
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders, point_counts
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_REACHED = 0.98  # quantile of the points along an end that tells where it is
+_REACHED = 0.98  # quantile of the points along an end at which it ends
 
 
 def without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
@@ -61,7 +61,7 @@ def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skel
     inner = int(np.flatnonzero(skeleton.parent == 0)[0])
     for end, before in [*((int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()),
                         (0, inner)]:
-        direction = nodes[end] - skeleton.nodes[_told_from(skeleton, end, before)]
+        direction = nodes[end] - skeleton.nodes[_direction_node(skeleton, end, before)]
         length = np.linalg.norm(direction)
         if length == 0:
             continue
@@ -78,7 +78,7 @@ def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skel
     return skeleton.moved(nodes)
 
 
-def _told_from(skeleton: Skeleton, end: int, before: int) -> int:
+def _direction_node(skeleton: Skeleton, end: int, before: int) -> int:
     """The node that gives an end's direction: up to three before a tip."""
     for _ in range(2):
         if end and skeleton.parent[before] > 0:

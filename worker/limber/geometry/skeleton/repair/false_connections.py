@@ -9,11 +9,11 @@ carrier's end like a hook, by a long step aside.
 
 import numpy as np
 
-_ARM = 6.0  # radii of each side that tell its direction
-_LEAVE = 1.0  # radii beside the turn that do not
-_LEAST_NODES = 3  # of a side
+_ARM = 6.0  # radii on each side over which the direction is measured
+_LEAVE = 1.0  # radii next to the turn that are skipped
+_LEAST_NODES = 3  # fewest nodes of a side
 _TURN = np.deg2rad(110.0)
-_HOOK, _ASIDE, _STEP = 4.0, np.deg2rad(55.0), 1.5  # radii of a hook; its turn; radii of that step
+_HOOK, _ASIDE, _STEP = 4.0, np.deg2rad(55.0), 1.5  # hook's radii; its turn; step's radii
 
 
 def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.ndarray:
@@ -29,9 +29,9 @@ def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.nd
         near[a].append(b)
         near[b].append(a)
     turning = []
-    for place, (a, b) in enumerate(edges.tolist()):
+    for k, (a, b) in enumerate(edges.tolist()):
         if _is_hook(nodes, near, thickness, a, b) or _is_hook(nodes, near, thickness, b, a):
-            turning.append((np.inf, place))
+            turning.append((np.inf, k))
         if len(near[a]) != 2 or len(near[b]) != 2:
             continue
         thick = max(thickness[a], thickness[b])
@@ -40,13 +40,13 @@ def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.nd
             continue
         cosine = float(arms[0] @ arms[1])
         if cosine > -np.cos(_TURN):
-            turning.append((float(np.linalg.norm(nodes[a] - nodes[b])) / thick, place))
+            turning.append((float(np.linalg.norm(nodes[a] - nodes[b])) / thick, k))
     # Of the edges around one turn, the longest is removed: nothing was scanned beside it.
     keep, cut = np.ones(len(edges), bool), []
-    for _, place in sorted(turning, reverse=True):
-        middle, thick = nodes[edges[place]].mean(axis=0), float(thickness[edges[place]].max())
+    for _, k in sorted(turning, reverse=True):
+        middle, thick = nodes[edges[k]].mean(axis=0), float(thickness[edges[k]].max())
         if all(np.linalg.norm(middle - other) > _ARM * thick for other in cut):
-            keep[place] = False
+            keep[k] = False
             cut.append(middle)
     return edges[keep]
 
@@ -83,6 +83,6 @@ def _arm(nodes: np.ndarray, near: list[list[int]], start: int, before: int, thic
         before, node = node, ahead[0]
     if len(chain) < _LEAST_NODES or length < 0.6 * _ARM * thick:
         return None
-    way = nodes[chain[-1]] - nodes[chain[0]]
-    size = float(np.linalg.norm(way))
-    return way / size if size > 0 else None
+    vector = nodes[chain[-1]] - nodes[chain[0]]
+    size = float(np.linalg.norm(vector))
+    return vector / size if size > 0 else None

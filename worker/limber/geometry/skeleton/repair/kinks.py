@@ -8,8 +8,8 @@ from limber.geometry.skeleton.doubtful_parts import KINK, turns
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths
 
-_END = 8.0  # radii from a kink to the tip, up to which what lies beyond is a folded end
-_ROUNDED = 4.0  # radii to each side of a kink that are evened out
+_END = 8.0  # radii from a kink to the tip below which the rest is a folded end
+_ROUNDED = 4.0  # radii on each side of a kink that are smoothed
 _ROUNDS = 60
 
 
@@ -44,10 +44,10 @@ def _folded(skeleton: Skeleton) -> np.ndarray:
     """Nodes of one folded end beyond its kink; none if there is none."""
     children = skeleton.child_counts()
     for members in skeleton.runs():
-        for place in np.flatnonzero(turns(skeleton, members) > KINK):
-            rest = members[place:]
+        for k in np.flatnonzero(turns(skeleton, members) > KINK):
+            rest = members[k:]
             step = np.linalg.norm(np.diff(skeleton.nodes[rest], axis=0), axis=1)
-            if place > 1 and len(rest) > 1 and (children[rest] < 2).all() and (
+            if k > 1 and len(rest) > 1 and (children[rest] < 2).all() and (
                     step.sum() < _END * skeleton.radius[rest[0]]):
                 return rest[1:]
     return np.empty(0, np.int64)

@@ -32,8 +32,8 @@ LEAF_SHARE = 0.5
 """Fraction of points over two radii off their axis from which a scan shows leaves, not branches."""
 
 _COARSE = 1.5  # local radii between the nodes of the first fit
-_NOISY = 0.2  # of the median radius
-_ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # of the last fit
+_NOISY = 0.2  # fraction of the median radius
+_ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # rounds of the last fit
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ def resampled(skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
             hang = np.arange(len(new_points)) - 1
         else:
             carrier = made[int(skeleton.branch[members[0]])]
-            place = carrier[int(np.argmin(np.linalg.norm(
+            node = carrier[int(np.argmin(np.linalg.norm(
                 np.vstack(nodes)[carrier] - points[0], axis=1)))]
             new_points, new_radius = new_points[1:], new_radius[1:]
-            hang = np.concatenate([[place], count + np.arange(len(new_points) - 1)])
+            hang = np.concatenate([[node], count + np.arange(len(new_points) - 1)])
         made[run] = count + np.arange(len(new_points))
         count += len(new_points)
         nodes.append(new_points)

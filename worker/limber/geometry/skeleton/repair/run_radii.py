@@ -8,11 +8,11 @@ from limber.geometry.skeleton.radii.cylinders import point_counts
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths
 
-_RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
-_STEADY = 40  # points whose nodes' radii make a steady one
+_RAG = 0.25  # fraction of a run's median radius (by length) below which a part is ignored
+_STEADY = 40  # points that make a reliable radius
 _SURE = 1.96  # standard deviations
-_GROWTH = 1.25  # of a radius along a run, over the median of what was measured of it so far
-_SPEAK = 1 / 8  # of a run's nodes, and of its points, that speak for what follows
+_GROWTH = 1.25  # largest growth of a radius along a run, over the median measured so far
+_SPEAK = 1 / 8  # fraction of a run's nodes, and of its points, that decide for what follows
 
 
 def filled_in(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
@@ -42,12 +42,12 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
         if len(speak) == 0:
             continue
         along = arc_lengths(skeleton.nodes[members])
-        there = along[np.searchsorted(members, speak)]
+        arc = along[np.searchsorted(members, speak)]
         for node, here in zip(own, along[-len(own):], strict=True):
             # Each has a point or more: no more nodes than that to either side.
-            middle = int(np.searchsorted(there, here))
+            middle = int(np.searchsorted(arc, here))
             around = slice(max(middle - _STEADY, 0), middle + _STEADY)
-            order = np.argsort(np.abs(there[around] - here), kind="stable")
+            order = np.argsort(np.abs(arc[around] - here), kind="stable")
             near = speak[around][order]
             near = near[:int(np.searchsorted(np.cumsum(count[near]), _STEADY)) + 1]
             radius[node] = _middle(skeleton.radius[near], count[near])
@@ -66,8 +66,8 @@ def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
     """
     count, radius = point_counts(skeleton, points), skeleton.radius.copy()
     for own in skeleton.own_runs():
-        for place, node in enumerate(own):
-            beyond = own[place:][count[own[place:]] > 0]
+        for k, node in enumerate(own):
+            beyond = own[k:][count[own[k:]] > 0]
             if len(beyond):
                 radius[node] = max(radius[node], _middle(skeleton.radius[beyond], count[beyond]))
     return replace(skeleton, radius=radius)
@@ -106,13 +106,13 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
         speaks = (state[own] == MEASURED) & (count[own] > 0)
         if speaks.any():
             speaks &= radius[own] > _RAG * _middle(radius[own[speaks]], step[own[speaks]])
-        told, total = np.cumsum(count[own] * speaks), float(count[own].sum())
-        for place, node in enumerate(own):
-            before = own[:place][speaks[:place]]
+        counted, total = np.cumsum(count[own] * speaks), float(count[own].sum())
+        for k, node in enumerate(own):
+            before = own[:k][speaks[:k]]
             # The first few are too few to represent the run: a cut stem starts with a ragged end.
             if len(before) >= max(6, int(_SPEAK * len(own))) and (
-                    told[place - 1] >= _SPEAK * total):
-                allowed = _GROWTH + (1 - _GROWTH) * place / len(own)
+                    counted[k - 1] >= _SPEAK * total):
+                allowed = _GROWTH + (1 - _GROWTH) * k / len(own)
                 cap = min(cap, allowed * _middle(at_most[before], count[before]))
             if radius[node] > cap:
                 radius[node], at_most[node], state[node] = cap, cap, LIMITED
