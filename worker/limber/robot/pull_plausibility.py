@@ -239,7 +239,7 @@ class PullPlausibility:
         if slip is None:
             return None
         share, way = slip
-        return ("the force stopped to grow as it did before: the branch slips slowly in the "
+        return ("the force no longer grows as it did before: the branch slips slowly in the "
                 f"gripper, or gives way (over the last {1000 * way:.0f} mm it grew by "
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
 
