@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.addon.test_panels import _draw_step
 
-pytestmark = pytest.mark.usefixtures("worker_here")
+pytestmark = pytest.mark.usefixtures("worker_here", "whole_texts")
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 

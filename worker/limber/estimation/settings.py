@@ -53,7 +53,7 @@ class EstimateSettings(Settings):
             "main path.")
     free_frame: bool = Field(
         False, description="Fit the frame of the observed points freely, to 10 cm and 17 degrees, "
-        "instead of within the pull's [calibration]. The result states what that costs.")
+        "instead of within the pull's calibration. The result states what that costs.")
     young: float | None = Field(
         None, gt=0, description="Initial Young's modulus [Pa]. Default: from the measured force.")
     poisson: float | None = Field(

@@ -45,7 +45,7 @@ class ImportSettings(Settings):
         "rest. A rigid transform fits the recording's first frames to them.")
     pull_toml: str | None = Field(
         None, description="TOML file whose entries replace those that the import writes to the "
-        "pull's pull.toml, such as [calibration], or tared of [sensor].")
+        "pull's pull.toml, such as the table calibration, or tared in the table sensor.")
     coordinates: Literal["branch", "scan"] = Field(
         "branch", description="Coordinates of --nominal, --grasp-point and --load: the branch "
         "folder's, or those of the scan's file.")

@@ -9,7 +9,7 @@ points by their distance from it comes out up to half too thin.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
@@ -134,7 +134,7 @@ def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleto
         told = np.stack([np.interp(here, here[known], column[within][known]) for column in told.T],
                         axis=1)
         # Where a twig hides part of its carrier, a few widths are of strips.
-        told = median_filter(told, size=(_STRIPS, 1), mode="nearest")
+        told = scipy.ndimage.median_filter(told, size=(_STRIPS, 1), mode="nearest")
         sight = field.at(skeleton.nodes[own])
         side = np.cross(axis[own], sight)
         side /= np.maximum(np.linalg.norm(side, axis=1), 1e-300)[:, None]
