@@ -69,5 +69,5 @@ def test_clocks_that_do_not_overlap(plain_pull):
     """Streams hours apart are refused with both ranges."""
     seen = plain_pull.observations
     pull = replace(plain_pull, observations=Observations(seen.times + 3600, seen.positions))
-    with pytest.raises(InputError, match="time_offset"):
+    with pytest.raises(InputError, match="--time-offset"):
         frames_of(pull)

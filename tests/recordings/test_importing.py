@@ -76,6 +76,19 @@ def test_entries_of_the_users_file_replace_the_imports(bare_folder, source, tmp_
         import_pull(bare_folder, source / "markers.csv", "m", settings)
 
 
+def test_tables_with_the_same_stamps_have_one_clock(bare_folder, source, plain_pull):
+    """No offset is estimated from noise where both tables have each other's stamps."""
+    seen = plain_pull.observations
+    times = plain_pull.times[::3]
+    at = np.stack([np.interp(times, seen.times, column)
+                   for column in seen.positions.reshape(60, -1).T], axis=1)
+    write_stream(source / "same.csv", Stream(times, at, tuple(
+        f"tip{k}_{axis}_m" for k in range(2) for axis in "xyz")))
+    result = import_pull(bare_folder, source / "same.csv", "s", ImportSettings(
+        robot=str(source / "robot.csv"), force_unit="gf"))
+    assert result["time_offset_s"] == 0.0
+
+
 def test_markers_in_another_frame_are_refused(branch_folder, source, small):
     """Without their nominal positions they would count as displacements."""
     write_stream(source / "robot.csv", Stream(

@@ -13,7 +13,7 @@ from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.constraints.obstacles import Box
-from limber.robot.cell.cell import Cell
+from limber.robot.cell.cell import Cell, WorkspaceEntry
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_planner import joint_space_path
 from limber.robot.motion.trajectory import along_bounded
@@ -57,6 +57,10 @@ def test_a_goal_inside_something_is_refused_and_so_is_a_wall_all_around():
                   ArmSurroundings(CELL, (a_box(0.08),), None))
     with pytest.raises(NoPathError, match="beyond its limit"):
         to_joints(CELL, HOME, HOME + [7.0, 0, 0, 0, 0, 0], ArmSurroundings(CELL, (), None))
+    low, high = tip(HOME) - 0.1, tip(HOME) + 0.1
+    narrow = CELL.model_copy(update={"workspace": WorkspaceEntry(low_m=low, high_m=high)})
+    with pytest.raises(NoPathError, match="outside the workspace"):
+        to_joints(narrow, HOME, ASIDE, ArmSurroundings(narrow, (), None))
     with pytest.raises(NoPathError, match="No free way"):
         joint_space_path(np.zeros(2), np.ones(2), np.array([[-1.0, 2.0]] * 2),
                          lambda angles: np.abs(angles.sum(axis=1) - 1.0) > 0.1)

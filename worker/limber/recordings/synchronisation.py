@@ -69,7 +69,7 @@ def frames_of(pull: Pull) -> Frames:
             f"{pull.name}: the robot's recording covers {pull.times[0]:.2f} to "
             f"{pull.times[-1]:.2f} s, the observations {times[0]:.2f} to {times[-1]:.2f} s.",
             "Fewer than two observations lie within the robot's recording.",
-            "Set time_offset_s in pull.toml, or import with --time-offset auto.")
+            "Import it again with the right --time-offset.")
     warnings = () if usable.all() else (
         f"{pull.name}: {np.sum(~usable)} of {len(times)} observed frames lie outside the robot's "
         "recording or in a gap in it. They are not used.",)

@@ -109,6 +109,11 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
         seen: Times of the observations [s].
     """
     offset = 0.0
+    if np.isin(np.round(seen, 6), np.round(pull.times, 6)).all():
+        request.progress.warn(
+            f"{pull.name}: gripper and observations have the same time stamps, so one clock is "
+            "assumed. If there were two, state --time-offset.")
+        return pull.entry
     if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
         offset = float(pull.times[0] - seen[0])
         request.progress.warn(

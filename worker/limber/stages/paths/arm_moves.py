@@ -27,13 +27,15 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
     It keeps clear of cell, branch and the arm itself, and is slow near the branch.
 
     Raises:
-        NoPathError: there is no such path, or start or goal collide.
+        NoPathError: there is no such path, start or goal collide, or the gripper would leave the
+        workspace.
     """
     _require_limits(cell, goal)
     if np.abs(goal - start).max() < 1e-3:
         raise NoPathError("The arm is there already.", "", "")
     joints = joint_space_path(start, goal, cell.joint_limits, around.free)
     poses = pose_vectors(cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose)))
+    _require_workspace(cell, poses)
     limits, fastest = cell.limits, speed_within(cell, cell.limits.speed_m_s)
     lengths = np.array([max(length(second[:3] - first[:3]), fastest * max(
         length(turn_between(first, second)) / (0.8 * limits.turn_speed_rad_s),
@@ -65,6 +67,22 @@ def away_from_branch(cell: Cell, joints: np.ndarray, pose: np.ndarray) -> Trajec
     speed = speed_within(cell, _SLOWEST * cell.limits.speed_m_s)
     times = along(poses, speed, cell.limits.acceleration_m_s2)
     return Trajectory(times, poses, ExpectedWrench.nothing(poses), taken.joints)
+
+
+def _require_workspace(cell: Cell, poses: np.ndarray) -> None:
+    """Refuse poses [n, 6] of the gripper, base frame, at which the guard would stop the arm."""
+    if cell.workspace is None:
+        return
+    grasp = (matrices(np.array(cell.base.pose)) @ matrices(poses))[:, :3, 3]
+    outside = np.maximum(np.array(cell.workspace.low_m) - grasp,
+                         grasp - np.array(cell.workspace.high_m)).max(axis=1)
+    if outside.max() > 1e-3:
+        position = ", ".join(f"{value:.3f}" for value in grasp[int(outside.argmax())])
+        raise NoPathError(
+            f"The gripper would be at ({position}) m in the branch's frame, "
+            f"{1e3 * outside.max():.0f} mm outside the workspace.", "The guard would stop it.",
+            "Widen [workspace] in the cell file, correct base.pose, or jog the arm inside first. "
+            "`limber robot draw` shows both.")
 
 
 def _require_limits(cell: Cell, goal: np.ndarray) -> None:
