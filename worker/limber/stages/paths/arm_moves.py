@@ -81,8 +81,7 @@ def _require_workspace(cell: Cell, poses: np.ndarray) -> None:
         raise NoPathError(
             f"The gripper would be at ({position}) m in the branch's frame, "
             f"{1e3 * outside.max():.0f} mm outside the workspace.", "The guard would stop it.",
-            "Widen [workspace] in the cell file, correct base.pose, or jog the arm inside first. "
-            "`limber robot draw` shows both.")
+            "Widen [workspace] in the cell file, correct base.pose, or jog the arm inside first.")
 
 
 def _require_limits(cell: Cell, goal: np.ndarray) -> None:
