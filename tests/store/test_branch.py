@@ -34,6 +34,14 @@ def test_stage_enters_folder_and_manifest(branch: Branch):
     assert not list(branch.folder.glob(".first*"))
 
 
+def test_what_no_reader_takes_is_not_written(branch: Branch):
+    """The end of an open interval may be any number: beyond all quantities it is unknown."""
+    with branch.stage("wide") as stage:
+        stage.result["interval"] = [1.0, 5.9e44, float("inf")]
+    again = Branch.open(branch.folder)
+    assert again.manifest.stages["wide"].result == {"interval": [1.0, None, None]}
+
+
 @pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
 def test_a_branch_that_failed_to_begin_leaves_no_folder(tmp_path: Path, failure, branch: Branch):
     """One with a result, or with a file of somebody's own, stays as it is."""

@@ -11,11 +11,17 @@ from pydantic_core import InitErrorDetails
 
 Content = TypeVar("Content")
 
+LARGEST_NUMBER = 1e18
+"""Largest size of a number in a file. No quantity in SI units comes near it, and squares of it are
+still finite in single precision.
+"""
+
 
 def plain(value: Any) -> Any:
     """Return ``value`` in JSON form: models, numpy and paths become dicts, lists, numbers.
 
-    A number that is not finite becomes None: JSON has no NaN.
+    A number that is not finite, or beyond ``LARGEST_NUMBER``, becomes None: JSON has no NaN, and no
+    reader would take the other, such as the end of an interval that is open.
     """
     if isinstance(value, BaseModel):
         return plain(value.model_dump())
@@ -27,7 +33,7 @@ def plain(value: Any) -> Any:
         return plain(value.item())
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, float) and not np.isfinite(value):
+    if isinstance(value, float) and not abs(value) <= LARGEST_NUMBER:
         return None
     return value
 

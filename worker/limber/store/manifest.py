@@ -15,7 +15,7 @@ from limber.core.alignment import Alignment
 from limber.core.errors import BranchFolderError, InputError
 from limber.core.files.reading import read_json
 from limber.core.files.safe_names import relative_name
-from limber.core.json_values import validated
+from limber.core.json_values import plain, validated
 from limber.core.machine_errors import machine_error
 from limber.version import VERSION
 
@@ -74,7 +74,7 @@ class Manifest(BaseModel):
         """Return the manifest as it is written: in this format, with a UUID."""
         self.format_version = FORMAT_VERSION
         self.uuid = self.uuid or str(uuid.uuid4())
-        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+        return json.dumps(plain(self.model_dump(mode="json")), indent=1, allow_nan=False) + "\n"
 
     def content_digest(self) -> str:
         """Return a sha256 of all contents of the branch except its report."""

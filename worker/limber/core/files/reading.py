@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import require_no_pipe
-from limber.core.json_values import validated
+from limber.core.json_values import LARGEST_NUMBER, validated
 
 Content = TypeVar("Content")
 
@@ -34,10 +34,6 @@ LARGEST_EXPANSION = 100.0
 measurements compress tenfold at best.
 """
 HARMLESS_BYTES = 256e6
-LARGEST_NUMBER = 1e18
-"""Largest size of a number in a file. No quantity in SI units comes near it, and squares of it are
-still finite in single precision.
-"""
 _MOST_DIGITS = 40
 """Of an integer: a seed has up to 39."""
 MOST_TOML_BYTES = 2 << 20

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from limber.core.errors import InputError, WorkError
 from limber.core.files.atomic import file_digest
+from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, by_name
@@ -109,7 +110,7 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
         result = _summary(seen, fitted, float(young.mean()))
         with branch.stage("vibration", settings, digests=digests) as stage:
             stage.path("vibration.json").write_text(
-                json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+                json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
             mesh.with_data(cell_data={"young": young, "poisson": model.poisson,
                                       "density": model.density}).write(stage.path("mesh.vtu"))
             stage.result.update(result)
@@ -168,8 +169,6 @@ def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel
 
 
 def _summary(seen: Ringing, fitted: dict[str, Any], level: float) -> dict[str, Any]:
-    from limber.core.json_values import plain
-
     spread = 1.96 * fitted["deviation"]
     omega = 2 * np.pi * seen.frequencies[0]
     return plain({
