@@ -35,6 +35,8 @@ def test_a_branch_that_dries_stiffens_by_what_it_did():
 def test_one_day_tells_no_change():
     steps = [ScaleStep(k, 0.1 * k, 1e-4) for k in range(3)]
     assert drift(steps, ["2026-05-01", None, "2026-05-01"], 0.0) is None
+    minutes = ["2026-05-01T14:00", None, "2026-05-01T14:03"]
+    assert drift(steps, minutes, 0.02) is None, "three minutes tell nothing about a day"
     found = drift(steps, ["2026-05-01", None, "2026-05-03"], 0.0)
     assert found["per_day"] == pytest.approx(np.expm1(0.1))
 

@@ -14,6 +14,7 @@ import numpy as np
 from limber.estimation.fitting.objective import Evaluation, Objective
 
 _DAY_S = 86400.0
+_WIDEST = 1.0  # half width of the interval of a stated rate: a factor of e a day
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,8 @@ def pull_moduli(steps: Sequence[ScaleStep], objective: Objective) -> list[PullMo
 
 def drift(steps: Sequence[ScaleStep], recorded: Sequence[str | None], spread: float,
           ) -> Drift | None:
-    """Return the change per day by weighted regression; None without two times.
+    """Return the change per day by weighted regression; None without two times, or if the pulls
+    do not determine it: those of one hour say nothing about days.
 
     Args:
         steps: Of the pulls.
@@ -103,5 +105,7 @@ def drift(steps: Sequence[ScaleStep], recorded: Sequence[str | None], spread: fl
     rate = float(np.linalg.lstsq(rows, np.array([step.step for step, _ in known]) / deviation,
                                  rcond=None)[0][1])
     wide = 1.96 * float(np.sqrt(np.linalg.inv(rows.T @ rows)[1, 1]))
+    if wide > _WIDEST:
+        return None
     return {"per_day": float(np.expm1(rate)),
             "interval": (float(np.expm1(rate - wide)), float(np.expm1(rate + wide)))}
