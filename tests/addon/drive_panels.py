@@ -137,7 +137,7 @@ def fail():
     jobs = part("jobs")
     job = jobs.start("Sample the Energy", [sys.executable, "-c", (
         "import sys; print('A line of the log that is longer than the sidebar is wide, with a '"
-        "'path: /home/somebody/branches/an-apple-tree/the-scan-of-a-branch.ply',"
+        "'path: /data/somebody/branches/an-apple-tree/the-scan-of-a-branch.ply',"
         " file=sys.stderr); sys.exit(3)")])
     job.wait()
     return True

@@ -13,7 +13,7 @@ def lines(addon):
 
 def test_no_line_is_wider_than_there_is_room(lines):
     """Words stay whole where they fit; one that is too wide is broken; nothing is lost."""
-    text = "The path /home/somebody/branches/an-apple-tree/the-scan-of-a-branch.ply is none."
+    text = "The path /data/somebody/branches/an-apple-tree/the-scan-of-a-branch.ply is none."
     found = lines.wrapped(text, 120.0)
     assert all(lines.width(line) <= 120.0 for line in found)
     assert "".join(found).replace(" ", "") == text.replace(" ", "")

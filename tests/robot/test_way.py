@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 from tests.robot.test_start import ARM, POSE, led, line, sample_at
 
+from limber.core.errors import InputError
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.trajectory import Trajectory, along
-from limber.robot.motion.way_file import FollowedPathFile, followed_path_file, read_followed_path
+from limber.robot.motion.way_file import (
+    FollowedPathFile,
+    followed_path,
+    followed_path_file,
+    read_followed_path,
+)
 
 CELL = Cell(robot={"model": "ur5e", "address": "127.0.0.9"}, base={"pose": (0,) * 6})
 
@@ -62,6 +68,8 @@ def test_a_torn_line_is_left_out_and_nonsense_is_no_way():
         assert read_followed_path(CELL) is None
     path.unlink()
     assert read_followed_path(CELL) is None
+    with pytest.raises(InputError, match=r"No path that the robot at .*by hand"):
+        followed_path(CELL, "Free the branch by hand.")
 
 
 def test_the_way_of_another_arm_or_tool_is_none():

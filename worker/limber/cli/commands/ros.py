@@ -187,14 +187,10 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     """
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
-    from limber.robot.motion.way_file import read_followed_path
+    from limber.robot.motion.way_file import followed_path
 
     cell = read_cell(cell_file)
-    way = read_followed_path(cell)
-    if way is None:
-        raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
-                         "known.", "It has followed none from this account, or the cell has "
-                         "changed since.", "Open the gripper, and free the branch by hand.")
+    way = followed_path(cell, "Open the gripper, and free the branch by hand.")
     result: dict[str, Any] = {"armed": armed, "tare_known": way.bias is not None,
                               "places": len(way.poses)}
     if not armed:

@@ -81,19 +81,15 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     The path is on disk, so this works after a crash of the program that followed it. Exit code 4 if
     a force over the soft limit remains.
     """
-    from limber.core.errors import InputError, SafetyStop
+    from limber.core.errors import SafetyStop
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.motion.retreat import RetreatPath
-    from limber.robot.motion.way_file import read_followed_path
+    from limber.robot.motion.way_file import followed_path
     from limber.robot.operator_decisions import require_confirmation, retreat_if_chosen
 
     cell = read_cell(cell_file)
-    followed = read_followed_path(cell)
-    if followed is None:
-        raise InputError(f"No way of the robot at {cell.robot.address} with this arm and tool is "
-                         "known.", "It has followed none from this account, or the cell has "
-                         "changed since.", "Free the branch: limber robot release.")
+    followed = followed_path(cell, "Free the branch: limber robot release.")
     sample, pose = stands(cell)
     back = RetreatPath(cell.arm.joint_names, followed).from_here(
         _with_pose(sample, pose), cell.limits.acceleration_m_s2)

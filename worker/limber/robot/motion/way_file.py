@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import platformdirs
 
+from limber.core.errors import InputError
 from limber.core.json_lines import json_objects
 from limber.core.json_values import plain
 from limber.robot.cell.cell import Cell
@@ -85,6 +86,23 @@ def read_followed_path(cell: Cell) -> FollowedPath | None:
                 in (followed.poses, followed.joints, followed.speeds))
     return followed if whole and (followed.bias is None
                                   or np.isfinite(followed.bias).all()) else None
+
+
+def followed_path(cell: Cell, otherwise: str) -> FollowedPath:
+    """Return the path that the cell's robot followed last.
+
+    Args:
+        otherwise: What to do instead, for the message.
+
+    Raises:
+        InputError: none is known.
+    """
+    followed = read_followed_path(cell)
+    if followed is None:
+        raise InputError(f"No path that the robot at {cell.robot.address} followed with this arm "
+                         "and tool is known.", "It followed none from this account, or the cell "
+                         "has changed since.", otherwise)
+    return followed
 
 
 class FollowedPathFile:
