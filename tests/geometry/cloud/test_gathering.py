@@ -10,7 +10,7 @@ from limber.geometry.cloud import gathering
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.gathering import gathered
 from limber.geometry.cloud.preparation import prepare
-from limber.geometry.io import clouds, las, ply
+from limber.geometry.io import clouds, las, pcd, ply
 from limber.geometry.io.clouds import read_points
 
 
@@ -69,13 +69,18 @@ def test_points_that_are_not_finite_make_no_cells():
     assert some.not_finite == 900 and some.left_out + len(some) == 8100
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".las", ".txt"])
+@pytest.mark.parametrize("suffix", [".ply", ".las", ".txt", ".pcd", ".ascii.pcd"])
 def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
     """As a whole, and thinned, with their attributes; the user is told."""
     points, path = _tube(5000), tmp_path / f"a{suffix}"
     intensity = np.arange(5000, dtype=np.uint16)
     if suffix == ".ply":
         Cloud(points, {"intensity": intensity}).write_ply(path)
+    elif suffix.endswith(".pcd"):
+        pypcd4 = pytest.importorskip("pypcd4")
+        form = pypcd4.Encoding.ASCII if "ascii" in suffix else pypcd4.Encoding.BINARY
+        pypcd4.PointCloud.from_points([*points.T, intensity], ("x", "y", "z", "intensity"),
+                                      (*[np.float64] * 3, np.uint16)).save(path, form)
     elif suffix == ".txt":
         np.savetxt(path, np.column_stack([intensity, points]), "%.8g", header="Intensity Z X Y")
         points = points[:, [1, 2, 0]]
@@ -87,13 +92,13 @@ def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
         content.x, content.y, content.z = points.T
         content.intensity = intensity
         content.write(path)
-    for module in (ply, las):
+    for module in (ply, las, pcd):
         monkeypatch.setattr(module, "PIECE_POINTS", 700)
     monkeypatch.setattr(text_columns, "LINES_AT_ONCE", 700)
     whole = read_points(path)
     np.testing.assert_allclose(whole.points, points, atol=1e-6)
     np.testing.assert_array_equal(whole.attributes["intensity"], intensity)
-    for module in (ply, las, clouds):
+    for module in (ply, las, pcd, clouds):
         monkeypatch.setattr(module, "gathered", lambda pieces: gathered(pieces, 1000))
     some = read_points(path)
     assert len(some) <= 1000 and some.left_out == 5000 - len(some)
